@@ -1,0 +1,40 @@
+"""Exceptions of the package: one base class, each message names the thing, the value got and the value expected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+class PlowTwinError(Exception):
+    """Base of every error that the package raises on purpose."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong with an input: where, what was got, what was expected."""
+
+    key: str
+    got: object
+    expected: str
+
+    def __str__(self) -> str:
+        return f"{self.key}: got {self.got!r}, expected {self.expected}"
+
+
+class SceneError(PlowTwinError, ValueError):
+    """A scene cannot be used; the message lists every problem found, not the first one."""
+
+    def __init__(self, problems: Sequence[Problem], source: str = "scene") -> None:
+        self.problems = tuple(problems)
+        self.source = source
+        lines = "\n".join(f"  {problem}" for problem in self.problems)
+        super().__init__(f"{source}: {len(self.problems)} problem(s)\n{lines}")
+
+
+class SolverError(PlowTwinError, RuntimeError):
+    """The motion could not be continued; the message says when and why."""
+
+
+class RecordingError(PlowTwinError, ValueError):
+    """A recording cannot be written or read; the message names the file and the record."""

@@ -1,0 +1,112 @@
+"""Contact laws: each is one definition with its equation and its source.
+
+All laws but Kelvin-Voigt have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive inward.
+They differ in the damping factor  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch.
+A law is added by one entry in `LAWS`: every solver reads nothing but these numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+from scipy.optimize import brentq
+
+
+#: Largest D = lambda v0 used: a restitution below about 1/1000 would need an unbounded damping.
+DAMPING_FACTOR_CAP: Final = 1e3
+
+
+def exact_damping_factor(restitution: float) -> float:
+    """Return the D that delivers the restitution e exactly:  D (1 + e) = ln((1 + D) / (1 - D e)).
+
+    It holds for F = K d^n (1 + lambda d') whatever K, n and the mass. D is 0 at e = 1 and unbounded as e goes to 0.
+    Source: first integral of the free impact; cf. Hunt and Crossley, J. Appl. Mech. 42 (1975) 440.
+    """
+    if restitution >= 1.0:
+        return 0.0
+    if restitution <= 0.0:
+        return math.inf
+
+    def residual(damping: float) -> float:
+        # (1 + e) - ln(...)/D keeps the trivial root D = 0 out of reach
+        return (1.0 + restitution) - (math.log1p(damping) - math.log1p(-damping * restitution)) / damping
+
+    # the positive root lies below 1/e; near e = 1 it behaves as 3 (1 - e) / 2
+    lower, upper = 0.5 * (1.0 - restitution), (1.0 - 1e-16) / restitution
+    if residual(upper) > 0.0:
+        return upper
+    return float(brentq(residual, lower, upper, xtol=1e-300, rtol=1e-15))
+
+
+@dataclass(frozen=True)
+class ContactLaw:
+    """One law: what it takes, and how the restitution becomes damping."""
+
+    title: str
+    source: str
+    #: D(e) of the law, or None where the law has no restitution form
+    factor: Callable[[float], float] | None = None
+    takes_damping: bool = True
+    #: the only exponent the law admits, or None
+    exponent: float | None = None
+    #: the damping is C d' beside K d^n (Kelvin-Voigt), not a factor of K d^n
+    additive: bool = False
+
+    @property
+    def takes_restitution(self) -> bool:
+        """Whether the law can be asked for a restitution."""
+        return self.factor is not None
+
+    def damping_factor(self, restitution: float) -> float:
+        """Return D = lambda v0 of the law for the restitution asked of it."""
+        if self.factor is None:
+            raise ValueError(f"{self.title} has no restitution form")
+        try:
+            return min(self.factor(restitution), DAMPING_FACTOR_CAP)
+        except ZeroDivisionError:
+            return DAMPING_FACTOR_CAP
+
+
+LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(
+    {
+        "exact_restitution": ContactLaw(
+            "exact restitution", "D (1 + e) = ln((1 + D) / (1 - D e))", exact_damping_factor, takes_damping=False
+        ),
+        "kelvin_voigt": ContactLaw(
+            "Kelvin-Voigt", "F = max(0, K d + C d'); Goldsmith, Impact, 1960", exponent=1.0, additive=True
+        ),
+        "hertz": ContactLaw("Hertz", "F = K d^n; Hertz, J. reine angew. Math. 92 (1881) 156", takes_damping=False),
+        "hunt_crossley": ContactLaw(
+            "Hunt-Crossley", "D = 3 (1 - e) / 2; J. Appl. Mech. 42 (1975) 440", lambda e: 1.5 * (1.0 - e)
+        ),
+        "herbert_mcwhannell": ContactLaw(
+            "Herbert-McWhannell",
+            "D = 6 (1 - e) / ((2 e - 1)^2 + 3); J. Eng. Ind. 99 (1977) 513",
+            lambda e: 6.0 * (1.0 - e) / ((2.0 * e - 1.0) ** 2 + 3.0),
+        ),
+        "lee_wang": ContactLaw(
+            "Lee-Wang", "D = 3 (1 - e) / 4; J. Mech. Transm. Autom. 105 (1983) 534", lambda e: 0.75 * (1.0 - e)
+        ),
+        "lankarani_nikravesh": ContactLaw(
+            "Lankarani-Nikravesh", "D = 3 (1 - e^2) / 4; J. Mech. Des. 112 (1990) 369", lambda e: 0.75 * (1.0 - e * e)
+        ),
+        "gonthier": ContactLaw(
+            "Gonthier et al.", "D = (1 - e^2) / e; Multibody Syst. Dyn. 11 (2004) 209", lambda e: (1.0 - e * e) / e
+        ),
+        "zhiying_qishao": ContactLaw(
+            "Zhiying-Qishao",
+            "D = 3 (1 - e^2) exp(2 (1 - e)) / 4; J. Mech. Strength 28 (2006)",
+            lambda e: 0.75 * (1.0 - e * e) * math.exp(2.0 * (1.0 - e)),
+        ),
+        "flores": ContactLaw(
+            "Flores et al.", "D = 8 (1 - e) / (5 e); Multibody Syst. Dyn. 25 (2011) 357", lambda e: 1.6 * (1.0 - e) / e
+        ),
+        "hu_guo": ContactLaw(
+            "Hu-Guo", "D = 3 (1 - e) / (2 e); Multibody Syst. Dyn. 35 (2015) 303", lambda e: 1.5 * (1.0 - e) / e
+        ),
+    }
+)

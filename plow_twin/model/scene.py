@@ -1,0 +1,322 @@
+"""What the machine is: the constants of one head in one guide, as plain frozen dataclasses in SI units.
+
+The field names are the keys of the scene file. `metadata` of each number holds its unit, its meaning and its admissible
+range; the checks here, the file's schema and the documentation all come from it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import Field, dataclass, field, fields, is_dataclass
+from enum import Enum
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import Problem, SceneError
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
+
+SCENE_VERSION: Final = 1
+DOF_NAMES: Final = ("x", "y", "theta")
+
+
+class Mark(Enum):
+    """Where a number comes from."""
+
+    GIVEN = "given"
+    RECONSTRUCTED = "reconstructed"
+    ASSUMED = "assumed"
+    MEASURED = "measured"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """The mark of one number of a scene and the source that stands behind it."""
+
+    mark: Mark
+    source: str = ""
+
+
+def _quantity(unit: str, doc: str, default: Any = ..., **bounds: float) -> Any:
+    """Declare a number (or a tuple of numbers) with its unit, meaning and range (`gt`, `ge`, `lt`, `le`)."""
+    metadata = {"unit": unit, "doc": doc, **bounds}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+
+
+def _choice(doc: str, choices: tuple[str, ...], default: Any = ...) -> Any:
+    metadata = {"doc": doc, "choices": choices}
+    return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Head:
+    """The plough head: a rigid body with a rectangular cavity."""
+
+    mass_kg: float = _quantity("kg", "mass", gt=0.0)
+    inertia_kg_m2: float = _quantity("kg m^2", "moment of inertia about the centre of mass", gt=0.0)
+    rotation: str = _choice(
+        "paper: the centre of mass is the cavity's centre and gravity adds a constant moment; consistent: rigid body "
+        "with an offset centre of mass",
+        ("paper", "consistent"),
+        "paper",
+    )
+    com_offset_m: tuple[float, float] = _quantity(
+        "m", "centre of mass from the cavity's centre, head axes (rotation: consistent)", (0.0, 0.0)
+    )
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The slide: a fixed rectangle inside the head's cavity."""
+
+    width_m: float = _quantity("m", "horizontal side", gt=0.0)
+    height_m: float = _quantity("m", "vertical side", gt=0.0)
+    labels: Mapping[str, str] = field(
+        default_factory=dict, metadata={"doc": "letters for corners, e.g. a: bottom_right", "choices": CORNER_NAMES}
+    )
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Total clearance: cavity size minus frame size. Negative is interference: both walls touch from the start."""
+
+    horizontal_m: float = _quantity("m", "cavity width minus frame width")
+    vertical_m: float = _quantity("m", "cavity height minus frame height")
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Normal contact of every pair: one law and one uniform set of parameters.
+
+    Exactly one of `damping` and `restitution` is given, or neither for a law without damping.
+    """
+
+    law: str = _choice("contact law", tuple(LAWS))
+    stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", gt=0.0)
+    exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
+    damping: float | None = _quantity(
+        "N s/m or s/m", "kelvin_voigt: C in N s/m; others: constant factor lambda of (1 + lambda d') in s/m", None, ge=0.0
+    )
+    restitution: float | None = _quantity("1", "restitution asked of the law", None, ge=0.0, le=1.0)
+    impact_speed_floor_m_s: float = _quantity(
+        "m/s", "smallest impact speed v0 used in lambda = D(e)/v0, bounds the damping of a touch at rest", 1e-3, gt=0.0
+    )
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """Gravity and, for `rotation: paper`, its constant moment -m g arm about the cavity's centre."""
+
+    acceleration_m_s2: float = _quantity("m/s^2", "acceleration, acts along -y", 9.81)
+    arm_m: float = _quantity("m", "arm of the constant moment, positive to the right", 0.0)
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """A load `amplitude * sin(omega t + phase)` with a constant point of action: M = x Fy - y Fx + moment."""
+
+    name: str
+    force_n: tuple[float, float] = _quantity("N", "amplitude (Fx, Fy)", (0.0, 0.0))
+    omega_rad_s: float = _quantity("rad/s", "angular frequency", 1.0, gt=0.0)
+    phase_rad: float = _quantity("rad", "phase", 0.0)
+    moment_n_m: float = _quantity("N m", "amplitude of a free moment", 0.0)
+    at_m: tuple[float, float] = _quantity("m", "point of action from the cavity's centre, world axes", (0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A load that does not change."""
+
+    name: str
+    force_n: tuple[float, float] = _quantity("N", "(Fx, Fy)", (0.0, 0.0))
+    moment_n_m: float = _quantity("N m", "free moment", 0.0)
+    at_m: tuple[float, float] = _quantity("m", "point of action from the cavity's centre, world axes", (0.0, 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A load given by samples; before the first and after the last one the end value holds.
+
+    `t` has shape (n,) in s, strictly increasing; `wrench` has shape (n, 3): Fx, Fy in N and M in N m.
+    `hold` is `linear` (interpolated) or `zero` (each sample holds until the next).
+    """
+
+    name: str
+    t: NDArray[np.float64]
+    wrench: NDArray[np.float64]
+    hold: str = _choice("between the samples", ("linear", "zero"), "linear")
+    at_m: tuple[float, float] = _quantity("m", "point of action from the cavity's centre, world axes", (0.0, 0.0))
+
+
+Load = Harmonic | Constant | Table
+
+
+@dataclass(frozen=True)
+class Initial:
+    """State at t = 0: pose of the cavity's centre relative to the frame's centre, and its rate."""
+
+    q: tuple[float, float, float] = _quantity("m, m, rad", "x, y, theta", (0.0, 0.0, 0.0))
+    v: tuple[float, float, float] = _quantity("m/s, m/s, rad/s", "rates of q", (0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True)
+class Wear:
+    """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A."""
+
+    coefficient_m2_n: float = _quantity("m^2/N", "k_s = k/H", ge=0.0)
+    pad_area_m2: float = _quantity("m^2", "area A of one pad", gt=0.0)
+    travel_speed_m_s: float = _quantity("m/s", "speed v along the face", ge=0.0)
+    initial_depth_m: tuple[float, ...] = _quantity("m", "wear depth of the eight pads at t = 0", (0.0,) * 8, ge=0.0)
+    prior_m2_n: tuple[float, float] = _quantity("m^2/N", "5 % and 95 % points of what k_s may be", (1e-15, 1e-13), gt=0.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One complete scene; raises `SceneError` listing every problem when it is not usable."""
+
+    head: Head
+    frame: Frame
+    clearance: Clearance
+    contact: Contact
+    gravity: Gravity = Gravity()
+    loads: tuple[Load, ...] = ()
+    initial: Initial = Initial()
+    locked: tuple[str, ...] = field(default=(), metadata={"doc": "degrees of freedom held", "choices": DOF_NAMES})
+    pairs: tuple[str, ...] = field(
+        default=PAIR_NAMES, metadata={"doc": "the pairs that can touch", "choices": PAIR_NAMES}
+    )
+    wear: Wear | None = None
+    marks: Mapping[str, Provenance] = field(default_factory=lambda: MappingProxyType({}), compare=False)
+
+    def __post_init__(self) -> None:
+        problems = list(check(self))
+        if problems:
+            raise SceneError(problems)
+
+
+def check(scene: Scene) -> Iterator[Problem]:
+    """Yield every problem of a scene: types, ranges, choices, then what only shows across fields."""
+    found = list(_check_fields(scene, ""))
+    yield from found
+    if not found:
+        yield from _check_contact(scene.contact)
+        yield from _check_rotation(scene)
+        yield from _check_loads(scene.loads)
+        for key in ("locked", "pairs"):
+            names = getattr(scene, key)
+            if len(set(names)) != len(names):
+                yield Problem(key, names, "each name once")
+
+
+def _check_fields(part: Any, path: str) -> Iterator[Problem]:
+    for spec in fields(part):
+        value = getattr(part, spec.name)
+        key = f"{path}{spec.name}"
+        if is_dataclass(value):
+            yield from _check_fields(value, f"{key}.")
+        elif spec.name == "loads":
+            for index, load in enumerate(value):
+                if not isinstance(load, Load):
+                    yield Problem(f"loads[{index}]", load, "a Harmonic, Constant or Table")
+                else:
+                    yield from _check_fields(load, f"loads[{index}].")
+        elif "unit" in spec.metadata:
+            yield from _check_number(key, value, spec)
+        elif "choices" in spec.metadata:
+            yield from _check_choice(key, value, spec)
+
+
+def _check_number(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
+    if value is None and spec.default is None:
+        return
+    expected = describe(spec)
+    if isinstance(spec.default, tuple) or isinstance(value, (tuple, list, np.ndarray)):
+        length = len(spec.default) if isinstance(spec.default, tuple) else None
+        if not isinstance(value, (tuple, list, np.ndarray)) or length is None or len(value) != length:
+            yield Problem(key, value, f"{length or 1} number(s): {expected}")
+            return
+        for index, item in enumerate(value):
+            if not _admissible(item, spec.metadata):
+                yield Problem(f"{key}[{index}]", item, expected)
+    elif not _admissible(value, spec.metadata):
+        yield Problem(key, value, expected)
+
+
+def _admissible(value: Any, metadata: Mapping[str, Any]) -> bool:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)) or not math.isfinite(value):
+        return False
+    return (
+        value > metadata.get("gt", -math.inf)
+        and value >= metadata.get("ge", -math.inf)
+        and value < metadata.get("lt", math.inf)
+        and value <= metadata.get("le", math.inf)
+    )
+
+
+def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
+    choices = spec.metadata["choices"]
+    values = value.values() if isinstance(value, Mapping) else (value,) if isinstance(value, str) else value
+    for item in values:
+        if item not in choices:
+            yield Problem(key, item, f"one of {', '.join(choices)}")
+
+
+def describe(spec: Field[Any]) -> str:
+    """Say in words what a number must be, e.g. `a finite number > 0 [kg]`."""
+    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+    bounds = [f"{sign} {spec.metadata[name]:g}" for name, sign in signs.items() if name in spec.metadata]
+    return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"
+
+
+def _check_contact(contact: Contact) -> Iterator[Problem]:
+    law = LAWS[contact.law]
+    given = {"damping": contact.damping, "restitution": contact.restitution}
+    names = [name for name, value in given.items() if value is not None]
+    allowed = [name for name, possible in (("damping", law.takes_damping), ("restitution", law.takes_restitution)) if possible]
+    if len(names) > 1:
+        yield Problem("contact", given, "either damping or restitution, not both")
+    for name in names:
+        if name not in allowed:
+            yield Problem(f"contact.{name}", given[name], f"{' or '.join(allowed) or 'no damping at all'} for {contact.law}")
+    if allowed and not names:
+        yield Problem("contact", given, f"{' or '.join(allowed)} for {contact.law}")
+    if law.exponent is not None and contact.exponent != law.exponent:
+        yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
+
+
+def _check_rotation(scene: Scene) -> Iterator[Problem]:
+    offset = any(value != 0.0 for value in scene.head.com_offset_m)
+    if scene.head.rotation == "paper" and offset:
+        yield Problem("head.com_offset_m", scene.head.com_offset_m, "(0, 0) for rotation: paper")
+    if scene.head.rotation == "consistent":
+        if scene.gravity.arm_m != 0.0:
+            yield Problem("gravity.arm_m", scene.gravity.arm_m, "0 for rotation: consistent (gravity acts at com_offset_m)")
+        if offset and {"x", "y"} & set(scene.locked) and "theta" not in scene.locked:
+            yield Problem("locked", scene.locked, "no x or y while theta is free and the centre of mass is offset")
+
+
+def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
+    names = [load.name for load in loads]
+    for index, load in enumerate(loads):
+        if not isinstance(load.name, str) or not load.name or names.count(load.name) > 1:
+            yield Problem(f"loads[{index}].name", load.name, "a name that no other load has")
+        if isinstance(load, Table):
+            yield from _check_table(f"loads[{index}]", load)
+
+
+def _check_table(key: str, table: Table) -> Iterator[Problem]:
+    t, wrench = np.asarray(table.t), np.asarray(table.wrench)
+    if t.ndim != 1 or len(t) < 1:
+        yield Problem(f"{key}.t", t.shape, "shape (n,) with n >= 1")
+    elif wrench.shape != (len(t), 3):
+        yield Problem(f"{key}.wrench", wrench.shape, f"shape ({len(t)}, 3)")
+    elif not (np.isfinite(t).all() and np.isfinite(wrench).all()):
+        row = int(np.flatnonzero(~(np.isfinite(t) & np.isfinite(wrench).all(axis=1)))[0])
+        yield Problem(f"{key} row {row}", (float(t[row]), *map(float, wrench[row])), "finite numbers")
+    elif (np.diff(t) <= 0.0).any():
+        row = int(np.flatnonzero(np.diff(t) <= 0.0)[0]) + 1
+        yield Problem(f"{key}.t[{row}]", float(t[row]), f"more than the time before it, {float(t[row - 1])!r}")
