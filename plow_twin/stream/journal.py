@@ -1,0 +1,79 @@
+"""What the twin accepted, in order of use: all that a second run needs to repeat the first one exactly.
+
+Stamps are integer nanoseconds on the clock of the samples; they are never rounded through a float.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+#: A value that a parameter can take.
+ParameterValue = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Advance to `stamp_ns` with the load linear from the previous sample.
+
+    `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, gravity not included.
+    """
+
+    stamp_ns: int
+    wrench: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Hold:
+    """Advance to `stamp_ns` with the last load held, or with the scene's own loads when these are the excitation."""
+
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class Travel:
+    """Travel at `speed_m_s` along the face from here on."""
+
+    stamp_ns: int
+    speed_m_s: float
+
+
+@dataclass(frozen=True)
+class Reset:
+    """Back to the initial state; the next stamp is the new origin of model time."""
+
+    stamp_ns: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter that the model sees has taken `value`."""
+
+    name: str
+    value: ParameterValue
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The exact state of the session at `stamp_ns`, from which a run can be resumed."""
+
+    stamp_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Digest:
+    """Hash of the exact state at `stamp_ns`."""
+
+    stamp_ns: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class Loss:
+    """`count` entries before this one were lost; a `Snapshot` follows."""
+
+    count: int
+
+
+Entry = Sample | Hold | Travel | Reset | Parameter | Snapshot | Digest | Loss
