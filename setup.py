@@ -1,0 +1,59 @@
+"""Build of the ament_python package; pip, colcon and rosdep read the same metadata from here and package.xml."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = "plow_twin"
+
+# ROS 2 Jazzy as wheels; where a ROS 2 is sourced the extra is not needed
+ROS_WHEELS = '; platform_system == "Linux" and platform_machine == "x86_64"'
+
+EXTRAS = {
+    "ros": [
+        f"ros-jazzy-rclpy[fastrtps]==7.1.6{ROS_WHEELS}",
+        f"ros-jazzy-common-interfaces==5.3.6{ROS_WHEELS}",
+    ],
+    "record": ["mcap>=1.3", "rosbags>=0.11"],
+    "view": ["rerun-sdk>=0.41"],
+    "test": ["pytest>=8", "pytest-timeout", "hypothesis"],
+}
+EXTRAS["dev"] = [
+    *EXTRAS["test"],
+    "ruff",
+    "mypy",
+    "types-PyYAML",
+    "types-jsonschema",
+    "build",
+    "colcon-common-extensions",
+    "psutil",
+]
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Digital twin of a coal plough head: contact-impact motion in its guide, live on ROS 2",
+    long_description="See the README of the repository.",
+    author="plow_twin maintainers",
+    author_email="maintainers@users.noreply.github.com",
+    license="Apache-2.0",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={NAME: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+    ],
+    python_requires=">=3.11",
+    install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11", "numba>=0.59", "click>=8.1", "rich>=13", "PyYAML>=6", "jsonschema>=4.18"],
+    extras_require=EXTRAS,
+    zip_safe=True,
+    entry_points={
+        "console_scripts": [
+            "plow-twin = plow_twin.cli:main",
+            "twin = plow_twin.ros.main:main",
+            "excitation_publisher = plow_twin.ros.excitation_publisher:main",
+        ]
+    },
+)
