@@ -1,0 +1,97 @@
+"""What the node sends and journals, as plain immutable values without ROS.
+
+Each class stands for one ROS 2 message type (`TYPE`); the live node fills real messages from them, the recorder encodes them
+and replay compares them, so that all three speak of the same numbers. Stamps are integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float64s = NDArray[np.float64]
+
+#: Arrays that a message leaves empty.
+EMPTY: Final[Float64s] = np.zeros(0)
+_ZERO36: Final[Float64s] = np.zeros(36)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointState:
+    """Named numbers: `position`, `velocity` and `effort` each have the length of `name` or are empty.
+
+    The arrays belong to the message from then on: the sender must not write to them again.
+    """
+
+    TYPE: ClassVar = "sensor_msgs/msg/JointState"
+
+    stamp_ns: int
+    frame_id: str
+    name: tuple[str, ...]
+    position: Float64s = EMPTY
+    velocity: Float64s = EMPTY
+    effort: Float64s = EMPTY
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Pose in `frame_id`, twist in `child_frame_id`; `orientation` is the quaternion (x, y, z, w).
+
+    Covariances are row-major 6 x 6 over (x, y, z, rotation about x, y, z); all zero means that none is known.
+    """
+
+    TYPE: ClassVar = "nav_msgs/msg/Odometry"
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+    linear: tuple[float, float, float]
+    angular: tuple[float, float, float]
+    pose_covariance: Float64s = _ZERO36
+    twist_covariance: Float64s = _ZERO36
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosticStatus:
+    """Health in words: `level` 0 OK, 1 WARN, 2 ERROR, 3 STALE, and key/value pairs."""
+
+    TYPE: ClassVar = "diagnostic_msgs/msg/DiagnosticStatus"
+
+    level: int
+    name: str
+    message: str
+    hardware_id: str = ""
+    values: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class WrenchStamped:
+    """Force [N] and moment [N m] about the cavity's centre."""
+
+    TYPE: ClassVar = "geometry_msgs/msg/WrenchStamped"
+
+    stamp_ns: int
+    frame_id: str
+    force: tuple[float, float, float]
+    torque: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """One line of text."""
+
+    TYPE: ClassVar = "std_msgs/msg/String"
+
+    data: str
+
+
+Message = JointState | Odometry | DiagnosticStatus | WrenchStamped | Text
+#: Every message class by its ROS 2 type.
+MESSAGE_TYPES: Final[dict[str, type[Message]]] = {
+    kind.TYPE: kind for kind in (JointState, Odometry, DiagnosticStatus, WrenchStamped, Text)
+}
