@@ -1,0 +1,1 @@
+"""Runs to MCAP and back: messages, recorder, reader and replay."""

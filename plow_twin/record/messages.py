@@ -1,12 +1,12 @@
 """What the node sends and journals, as plain immutable values without ROS.
 
-Each class stands for one ROS 2 message type (`TYPE`); the live node fills real messages from them, the recorder encodes them
-and replay compares them, so that all three speak of the same numbers. Stamps are integer nanoseconds.
+Each class stands for one ROS 2 message type (`TYPE`); the live node fills real messages from them, the recorder encodes
+them and replay compares them, so that all three speak of the same numbers. Stamps are integer nanoseconds.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 import numpy as np
@@ -31,9 +31,9 @@ class JointState:
     stamp_ns: int
     frame_id: str
     name: tuple[str, ...]
-    position: Float64s = EMPTY
-    velocity: Float64s = EMPTY
-    effort: Float64s = EMPTY
+    position: Float64s = field(default_factory=lambda: EMPTY)
+    velocity: Float64s = field(default_factory=lambda: EMPTY)
+    effort: Float64s = field(default_factory=lambda: EMPTY)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +52,8 @@ class Odometry:
     orientation: tuple[float, float, float, float]
     linear: tuple[float, float, float]
     angular: tuple[float, float, float]
-    pose_covariance: Float64s = _ZERO36
-    twist_covariance: Float64s = _ZERO36
+    pose_covariance: Float64s = field(default_factory=lambda: _ZERO36)
+    twist_covariance: Float64s = field(default_factory=lambda: _ZERO36)
 
 
 @dataclass(frozen=True, slots=True)

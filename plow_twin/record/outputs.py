@@ -1,4 +1,4 @@
-"""From what the twin computed to what is sent: used by the live node and by replay, so that both do the same arithmetic."""
+"""From what the twin computed to what is sent; the live node and replay share this arithmetic."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.record.messages import JointState, Odometry
+from plow_twin.record.messages import Float64s, JointState, Odometry
 
 if TYPE_CHECKING:
     from plow_twin.twin import Advance
 
 
 def contact_forces(stamp_ns: int, frame_id: str, advance: Advance) -> JointState:
-    """Return the pairs' penetration [m] as position, its rate [m/s] as velocity and the force [N] as effort, at the stamp."""
+    """Return penetration [m] as position, its rate [m/s] as velocity and force [N] as effort, all at the stamp."""
     return JointState(stamp_ns, frame_id, PAIR_NAMES, advance.penetration, advance.rate, advance.force)
 
 
@@ -36,7 +36,7 @@ def head_state(stamp_ns: int, frame_id: str, child_frame_id: str, advance: Advan
 
 
 class PeakWindow:
-    """What happened between two messages on `contact_peaks`: nothing of it is lost when there are many advances per message."""
+    """What happened between two messages on `contact_peaks`, whatever the number of advances between them."""
 
     def __init__(self) -> None:
         self._impacts = np.zeros(PAIR_COUNT)
@@ -55,14 +55,14 @@ class PeakWindow:
     def take(self, stamp_ns: int, frame_id: str) -> JointState:
         """Return the message and start the next window.
 
-        Position is the count of impacts since the start, velocity the impulse [N s] and effort the largest force [N] since
-        the last message.
+        Position is the count of impacts since the start, velocity the impulse [N s] and effort the largest force [N]
+        since the last message.
         """
         message = JointState(stamp_ns, frame_id, PAIR_NAMES, self._impacts.copy(), self._impulse, self._peak)
         self._clear()
         return message
 
-    def restart(self, impacts: np.ndarray | None = None) -> None:
+    def restart(self, impacts: Float64s | None = None) -> None:
         """Begin anew, with the counters at `impacts`, shape (8,), or at zero."""
         self._impacts = np.zeros(PAIR_COUNT) if impacts is None else np.array(impacts, dtype=np.float64)
         self._clear()

@@ -1,0 +1,1 @@
+"""Recordings turned into rerun files: what happened, moving in time."""

@@ -1,0 +1,174 @@
+"""Plain messages to CDR bytes and back, through the type store of rosbags: no ROS installation is needed.
+
+The bytes are canonical: padding is zero and equal messages give equal bytes, so that replay compares bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.messages import (
+    MESSAGE_TYPES,
+    DiagnosticStatus,
+    JointState,
+    Message,
+    Odometry,
+    Text,
+    WrenchStamped,
+)
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+_SECOND_NS = 1_000_000_000
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the message types of ROS 2 Jazzy."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def schema_text(message_type: str) -> str:
+    """Return the `ros2msg` schema of a message type, with those that it uses."""
+    text, _ = typestore().generate_msgdef(message_type, ros_version=2)
+    return text
+
+
+def type_hash(message_type: str) -> str:
+    """Return the REP-2016 hash of a message type."""
+    return typestore().hash_rihs01(message_type)
+
+
+def encode(message: Message) -> bytes:
+    """Return the CDR bytes of a message."""
+    wire = _ENCODERS[type(message)](typestore().types, message)
+    return bytes(typestore().serialize_cdr(wire, message.TYPE))
+
+
+def decode(data: bytes, message_type: str) -> Message:
+    """Return the message in CDR bytes.
+
+    Raises
+    ------
+    RecordingError
+        The type is none of `MESSAGE_TYPES`, or the bytes do not hold one.
+    """
+    kind = MESSAGE_TYPES.get(message_type)
+    if kind is None:
+        raise RecordingError(f"message type: got {message_type!r}, expected one of {', '.join(sorted(MESSAGE_TYPES))}")
+    try:
+        return _DECODERS[kind](typestore().deserialize_cdr(data, message_type))
+    except Exception as error:  # rosbags lets index, struct and assertion errors through
+        raise RecordingError(f"{message_type}: {len(data)} bytes that do not hold one ({error!r})") from error
+
+
+def _header(types: Any, stamp_ns: int, frame_id: str) -> Any:
+    seconds, nanoseconds = divmod(stamp_ns, _SECOND_NS)
+    return types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](seconds, nanoseconds), frame_id)
+
+
+def _stamp_ns(header: Any) -> int:
+    return int(header.stamp.sec) * _SECOND_NS + int(header.stamp.nanosec)
+
+
+def _vector(types: Any, xyz: tuple[float, float, float]) -> Any:
+    return types["geometry_msgs/msg/Vector3"](*xyz)
+
+
+def _xyz(vector: Any) -> tuple[float, float, float]:
+    return (vector.x, vector.y, vector.z)
+
+
+def _encode_joint_state(types: Any, message: JointState) -> Any:
+    return types[JointState.TYPE](
+        _header(types, message.stamp_ns, message.frame_id),
+        message.name,
+        message.position,
+        message.velocity,
+        message.effort,
+    )
+
+
+def _decode_joint_state(wire: Any) -> JointState:
+    stamp, frame_id = _stamp_ns(wire.header), wire.header.frame_id
+    return JointState(stamp, frame_id, tuple(wire.name), wire.position, wire.velocity, wire.effort)
+
+
+def _encode_odometry(types: Any, message: Odometry) -> Any:
+    pose = types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](*message.position),
+        types["geometry_msgs/msg/Quaternion"](*message.orientation),
+    )
+    twist = types["geometry_msgs/msg/Twist"](_vector(types, message.linear), _vector(types, message.angular))
+    return types[Odometry.TYPE](
+        _header(types, message.stamp_ns, message.frame_id),
+        message.child_frame_id,
+        types["geometry_msgs/msg/PoseWithCovariance"](pose, message.pose_covariance),
+        types["geometry_msgs/msg/TwistWithCovariance"](twist, message.twist_covariance),
+    )
+
+
+def _decode_odometry(wire: Any) -> Odometry:
+    pose, twist = wire.pose.pose, wire.twist.twist
+    return Odometry(
+        _stamp_ns(wire.header),
+        wire.header.frame_id,
+        wire.child_frame_id,
+        _xyz(pose.position),
+        (*_xyz(pose.orientation), pose.orientation.w),
+        _xyz(twist.linear),
+        _xyz(twist.angular),
+        wire.pose.covariance,
+        wire.twist.covariance,
+    )
+
+
+def _encode_status(types: Any, message: DiagnosticStatus) -> Any:
+    key_value = types["diagnostic_msgs/msg/KeyValue"]
+    values = [key_value(key, value) for key, value in message.values]
+    return types[DiagnosticStatus.TYPE](message.level, message.name, message.message, message.hardware_id, values)
+
+
+def _decode_status(wire: Any) -> DiagnosticStatus:
+    values = tuple((item.key, item.value) for item in wire.values)
+    return DiagnosticStatus(wire.level, wire.name, wire.message, wire.hardware_id, values)
+
+
+def _encode_wrench(types: Any, message: WrenchStamped) -> Any:
+    wrench = types["geometry_msgs/msg/Wrench"](_vector(types, message.force), _vector(types, message.torque))
+    return types[WrenchStamped.TYPE](_header(types, message.stamp_ns, message.frame_id), wrench)
+
+
+def _decode_wrench(wire: Any) -> WrenchStamped:
+    wrench = wire.wrench
+    return WrenchStamped(_stamp_ns(wire.header), wire.header.frame_id, _xyz(wrench.force), _xyz(wrench.torque))
+
+
+def _encode_text(types: Any, message: Text) -> Any:
+    return types[Text.TYPE](message.data)
+
+
+def _decode_text(wire: Any) -> Text:
+    return Text(wire.data)
+
+
+_ENCODERS: dict[type[Message], Callable[[Any, Any], Any]] = {
+    JointState: _encode_joint_state,
+    Odometry: _encode_odometry,
+    DiagnosticStatus: _encode_status,
+    WrenchStamped: _encode_wrench,
+    Text: _encode_text,
+}
+_DECODERS: dict[type[Message], Callable[[Any], Message]] = {
+    JointState: _decode_joint_state,
+    Odometry: _decode_odometry,
+    DiagnosticStatus: _decode_status,
+    WrenchStamped: _decode_wrench,
+    Text: _decode_text,
+}
