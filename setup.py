@@ -46,9 +46,19 @@ setup(
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
     ],
     python_requires=">=3.11",
-    install_requires=["setuptools", "numpy>=1.26", "scipy>=1.11", "numba>=0.59", "click>=8.1", "rich>=13", "PyYAML>=6", "jsonschema>=4.18"],
+    install_requires=[
+        # the model and its solver use these three alone
+        "numpy>=1.26",
+        "scipy>=1.11",
+        "numba>=0.59",
+        # scene files and the command line
+        "click>=8.1",
+        "jsonschema>=4.18",
+        "PyYAML>=6",
+        "rich>=13",
+    ],
     extras_require=EXTRAS,
-    zip_safe=True,
+    zip_safe=False,
     entry_points={
         "console_scripts": [
             "plow-twin = plow_twin.cli:main",

@@ -1,0 +1,10 @@
+"""Scene files: YAML to `Scene` and back.
+
+Numbers are read by the YAML 1.2 core schema, so that `9.6975e6` is a number and `on` a text; integers stand for
+doubles. Whatever is wrong with a file comes in one `SceneError`.
+"""
+
+from plow_twin.scene_file.reader import load_scene as load_scene
+from plow_twin.scene_file.reader import loads_scene as loads_scene
+from plow_twin.scene_file.schema import scene_schema as scene_schema
+from plow_twin.scene_file.writer import dump_scene as dump_scene

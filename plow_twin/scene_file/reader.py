@@ -1,0 +1,179 @@
+"""From the text of a scene file to a `Scene`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from plow_twin.errors import Problem, SceneError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import (
+    Clearance,
+    Contact,
+    Frame,
+    Head,
+    Load,
+    Mark,
+    Provenance,
+    Scene,
+    Table,
+    Wear,
+)
+from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS
+from plow_twin.scene_file.table import read_table, sample_table
+from plow_twin.scene_file.validation import validate
+from plow_twin.scene_file.yaml_text import load_yaml
+
+#: Stands in for a part with problems, so that the other parts can still be checked against each other.
+_SOUND: Final[Mapping[str, Any]] = MappingProxyType(
+    {
+        "head": Head(1.0, 1.0),
+        "frame": Frame(1.0, 1.0),
+        "clearance": Clearance(0.0, 0.0),
+        "contact": Contact("hertz", 1.0),
+    }
+)
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Read a scene file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The YAML file; load tables are looked up beside it.
+
+    Raises
+    ------
+    SceneError
+        When the file cannot be read or used; it lists every problem.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        raise SceneError([Problem("file", str(path), f"a readable scene file ({reason})")], str(path)) from None
+    return loads_scene(text, path.parent, source=str(path))
+
+
+def loads_scene(text: str, base: str | Path | None = None, *, source: str = "scene") -> Scene:
+    """Read a scene from YAML text.
+
+    Parameters
+    ----------
+    text : str
+        The scene as YAML.
+    base : str or Path, optional
+        Folder against which load tables are looked up; the working directory by default.
+    source : str
+        What messages call the scene.
+
+    Raises
+    ------
+    SceneError
+        When the scene cannot be used; it lists every problem.
+    """
+    raw, problems = load_yaml(text)
+    if raw is None and problems:
+        raise SceneError(problems, source)
+    problems += validate(raw)
+    bad = {problem.key.partition(".")[0] for problem in problems}
+    marks: dict[str, Provenance] = {}
+    parts = _read_parts(raw, bad, marks, Path(base or "."), problems) if isinstance(raw, dict) else {}
+    if problems:
+        raise SceneError([*problems, *_problems_across(parts)], source)
+    try:
+        return Scene(**parts, marks=MappingProxyType(marks))
+    except SceneError as error:
+        raise SceneError([_as_written(problem, raw) for problem in error.problems], source) from None
+
+
+def _read_parts(
+    raw: Mapping[str, Any], bad: set[str], marks: dict[str, Provenance], base: Path, problems: list[Problem]
+) -> dict[str, Any]:
+    """Build the parts of a scene that have no problem."""
+    parts: dict[str, Any] = {}
+    for key, part in SECTIONS.items():
+        if key in raw and key not in bad:
+            parts[key] = part(**_arguments(part, raw[key], key, marks))
+    if "loads" in raw and "loads" not in bad:
+        parts["loads"] = tuple(_read_loads(raw["loads"], bad, marks, base, problems))
+    if "locked" in raw and not any(key.startswith("locked") for key in bad):
+        parts["locked"] = tuple(raw["locked"])
+    if "pairs" in raw and not any(key.startswith("pairs") for key in bad):
+        parts["pairs"] = PAIR_NAMES if raw["pairs"] == "all" else tuple(raw["pairs"])
+    if isinstance(raw.get("wear"), dict) and "wear" not in bad:
+        parts["wear"] = Wear(**_arguments(Wear, raw["wear"], "wear", marks))
+    return parts
+
+
+def _arguments(part: type, raw: Mapping[str, Any], path: str, marks: dict[str, Provenance]) -> dict[str, Any]:
+    """Return the keyword arguments of a dataclass: numbers as floats, marks taken off and kept."""
+    specs = {spec.name: spec for spec in fields(part)}
+    return {
+        key: _number(value, f"{path}.{key}", marks) if "unit" in specs[key].metadata else value
+        for key, value in raw.items()
+    }
+
+
+def _number(raw: Any, path: str, marks: dict[str, Provenance]) -> float | tuple[float, ...]:
+    if isinstance(raw, dict):
+        marks[path] = Provenance(Mark(raw["mark"]), raw.get("source", ""))
+        raw = raw["value"]
+    if isinstance(raw, list):
+        # the elements of a list are numbers, perhaps marked ones
+        return tuple(float(_number(item, f"{path}[{index}]", marks)) for index, item in enumerate(raw))  # type: ignore[arg-type]
+    return float(raw)
+
+
+def _read_loads(
+    raw: list[dict[str, Any]], bad: set[str], marks: dict[str, Provenance], base: Path, problems: list[Problem]
+) -> Iterator[Load]:
+    for index, item in enumerate(raw):
+        path = f"loads[{index}]"
+        if path in bad:
+            continue
+        kind = next(kind for kind in LOAD_KINDS if kind in item)
+        shared = {"name": item["name"]}
+        if "at_m" in item:
+            shared["at_m"] = _number(item["at_m"], f"{path}.at_m", marks)
+        if kind != "table":
+            part = LOAD_KINDS[kind]
+            yield part(**shared, **_arguments(part, item[kind], path, marks))
+            continue
+        try:
+            t, wrench = _samples(item["table"], f"{path}.table", base)
+        except SceneError as error:
+            problems += error.problems
+        else:
+            hold = {"hold": item["table"]["hold"]} if "hold" in item["table"] else {}
+            yield Table(**shared, t=t, wrench=wrench, **hold)
+
+
+def _samples(raw: Mapping[str, Any], path: str, base: Path) -> tuple[Any, Any]:
+    if "file" in raw:
+        return read_table(base / raw["file"], raw.get("columns"), f"{path}.file")
+    return sample_table(raw["t"], raw["wrench"], path)
+
+
+def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
+    """Check the sound parts against each other, with harmless stand-ins for the rest."""
+    try:
+        Scene(**{**_SOUND, **parts})
+    except SceneError as error:
+        return error.problems
+    return ()
+
+
+def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
+    """Give the key as it stands in the file: `loads[0].force_n` lies under the kind of the load there."""
+    head, _, rest = problem.key.partition("].")
+    index = head.removeprefix("loads[")
+    if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):
+        return problem
+    kind = next(kind for kind in LOAD_KINDS if kind in raw["loads"][int(index)])
+    return Problem(f"{head}].{kind}.{rest}", problem.got, problem.expected)

@@ -1,0 +1,179 @@
+"""JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`: one source for both.
+
+A number may stand plain or as `{value, mark, source}`; so may a list of numbers. Samples of a table load are plain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, Field, fields
+from typing import Any, Final
+
+from plow_twin.model.scene import (
+    SCENE_VERSION,
+    Clearance,
+    Constant,
+    Contact,
+    Frame,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Load,
+    Mark,
+    Scene,
+    Table,
+    Wear,
+    describe,
+)
+
+Schema = dict[str, Any]
+
+#: Sections of the file that are one dataclass each.
+SECTIONS: Final[dict[str, type]] = {
+    "head": Head,
+    "frame": Frame,
+    "clearance": Clearance,
+    "contact": Contact,
+    "gravity": Gravity,
+    "initial": Initial,
+}
+#: Sections that a file must hold.
+REQUIRED_SECTIONS: Final = ("head", "frame", "clearance", "contact")
+#: Kinds of load; exactly one stands beside the name.
+LOAD_KINDS: Final[dict[str, type[Load]]] = {"harmonic": Harmonic, "constant": Constant, "table": Table}
+#: Columns of a load file unless `columns` names others: time, Fx, Fy, M.
+TABLE_COLUMNS: Final = ("t", "fx", "fy", "m")
+
+_BOUNDS: Final = {"gt": "exclusiveMinimum", "ge": "minimum", "lt": "exclusiveMaximum", "le": "maximum"}
+
+
+def scene_schema() -> Schema:
+    """Return the JSON Schema (draft 2020-12) of scene file version 1."""
+    described = {spec.name: spec for spec in fields(Scene)}
+    names = {key: _name_list(described[key]) for key in ("locked", "pairs")}
+    properties: Schema = {
+        "version": {"const": SCENE_VERSION, "description": f"{SCENE_VERSION}, the supported version of the scene file"},
+        **{key: _object(part) for key, part in SECTIONS.items()},
+        "loads": {"type": "array", "items": _load(), "description": "a list of loads"},
+        "locked": names["locked"],
+        "pairs": _either(names["pairs"], {"const": "all"}, "all, or " + names["pairs"]["description"]),
+        "wear": _either(_object(Wear), {"enum": ["none", None]}, "none, or the parameters of wear"),
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "plow_twin scene",
+        "type": "object",
+        "description": "a mapping with the sections of a scene",
+        "properties": properties,
+        "required": ["version", *REQUIRED_SECTIONS],
+        "additionalProperties": False,
+    }
+
+
+def _object(part: type, without: tuple[str, ...] = ()) -> Schema:
+    specs = [spec for spec in fields(part) if spec.name not in without]
+    return {
+        "type": "object",
+        "description": f"a mapping with {', '.join(spec.name for spec in specs)}",
+        "properties": {spec.name: _property(spec) for spec in specs},
+        "required": [spec.name for spec in specs if spec.default is MISSING and spec.default_factory is MISSING],
+        "additionalProperties": False,
+    }
+
+
+def _property(spec: Field[Any]) -> Schema:
+    if "unit" in spec.metadata:
+        return _quantity(spec)
+    if spec.default_factory is not MISSING:
+        return _labels(spec)
+    if "choices" in spec.metadata:
+        choices = spec.metadata["choices"]
+        return {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
+    return {"type": "string", "minLength": 1, "description": "a name"}
+
+
+def _quantity(spec: Field[Any]) -> Schema:
+    expected = describe(spec)
+    number: Schema = {"type": "number", "description": expected}
+    number |= {keyword: spec.metadata[name] for name, keyword in _BOUNDS.items() if name in spec.metadata}
+    if not isinstance(spec.default, tuple):
+        return _markable(number)
+    length = len(spec.default)
+    plain = {"type": "array", "items": _markable(number), "minItems": length, "maxItems": length}
+    return _markable({**plain, "description": f"a list of {length}: {expected}"})
+
+
+def _markable(plain: Schema) -> Schema:
+    marked = {
+        "type": "object",
+        "description": f"a mapping with value, mark and source, value: {plain['description']}",
+        "properties": {
+            "value": plain,
+            "mark": {
+                "enum": [mark.value for mark in Mark],
+                "description": f"one of {', '.join(m.value for m in Mark)}",
+            },
+            "source": {"type": "string", "description": "a text"},
+        },
+        "required": ["value", "mark"],
+        "additionalProperties": False,
+    }
+    return _either(plain, marked, plain["description"])
+
+
+def _either(first: Schema, second: Schema, expected: str) -> Schema:
+    return {"anyOf": [first, second], "description": expected}
+
+
+def _labels(spec: Field[Any]) -> Schema:
+    choices = spec.metadata["choices"]
+    corner = {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
+    return {
+        "type": "object",
+        "description": "a mapping from letters to corners",
+        "additionalProperties": corner,
+        "propertyNames": {"type": "string", "description": "a text as label"},
+    }
+
+
+def _name_list(spec: Field[Any]) -> Schema:
+    choices = ", ".join(spec.metadata["choices"])
+    item = {"enum": list(spec.metadata["choices"]), "description": f"one of {choices}"}
+    return {"type": "array", "items": item, "description": f"a list of {choices}"}
+
+
+def _load() -> Schema:
+    at_m = _property(next(spec for spec in fields(Constant) if spec.name == "at_m"))
+    kinds = {kind: _object(part, without=("name", "at_m")) for kind, part in LOAD_KINDS.items()}
+    kinds["table"] = _table(kinds["table"])
+    return {
+        "type": "object",
+        "description": f"a mapping with name, at_m and one of {', '.join(kinds)}",
+        "properties": {"name": {"type": "string", "minLength": 1, "description": "a name"}, **kinds, "at_m": at_m},
+        "required": ["name"],
+        "additionalProperties": False,
+        "oneOf": [{"required": [kind]} for kind in kinds],
+    }
+
+
+def _table(plain: Schema) -> Schema:
+    """Let a table stand in a file (`file`, `columns`) or in the scene itself (`t`, `wrench`)."""
+    columns = {
+        "type": "array",
+        "items": {"type": "string", "description": "the name of a column"},
+        "minItems": len(TABLE_COLUMNS),
+        "maxItems": len(TABLE_COLUMNS),
+        "description": "a list of 4 column names: time, Fx, Fy, M",
+    }
+    samples = {
+        "t": {"type": "array", "description": "a list of times [s]"},
+        "wrench": {"type": "array", "description": "a list of [Fx, Fy, M] [N, N, N m]"},
+    }
+    file = {"file": {"type": "string", "minLength": 1, "description": "the path of a csv file"}, "columns": columns}
+    return {
+        "type": "object",
+        "description": "a mapping with file (and columns), or with t and wrench",
+        "properties": {**plain["properties"], **file, **samples},
+        "oneOf": [{"required": ["file"]}, {"required": ["t", "wrench"]}],
+        "additionalProperties": False,
+    }

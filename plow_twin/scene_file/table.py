@@ -1,0 +1,81 @@
+"""Samples of a table load, from a csv file or from the scene itself."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import Problem, SceneError
+from plow_twin.scene_file.schema import TABLE_COLUMNS
+
+Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "file") -> Samples:
+    """Read times, shape (n,) [s], and wrenches, shape (n, 3) [N, N, N m], from a csv file with a header line.
+
+    Parameters
+    ----------
+    path : Path
+        The file; lines that start with `#` are left out.
+    columns : sequence of str, optional
+        Names in the header of time, Fx, Fy and M; `t, fx, fy, m` by default.
+    key : str
+        What messages call the file.
+
+    Raises
+    ------
+    SceneError
+        When the file, a column or a number is missing; it lists every line that is no use.
+    """
+    columns = tuple(columns or TABLE_COLUMNS)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [(line, row) for line, row in enumerate(csv.reader(file), 1) if row and not row[0].startswith("#")]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise SceneError([Problem(key, str(path), f"a readable csv file ({reason})")]) from None
+    header = [name.strip() for name in rows[0][1]] if rows else []
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise SceneError([Problem(key, header, f"a header line with {', '.join(columns)}")])
+    return _parse(rows[1:], [header.index(name) for name in columns], key)
+
+
+def _parse(rows: list[tuple[int, list[str]]], places: list[int], key: str) -> Samples:
+    samples = np.empty((len(rows), 4))
+    problems = []
+    for index, (line, row) in enumerate(rows):
+        try:
+            samples[index] = [float(row[place]) for place in places]
+        except (ValueError, IndexError):
+            problems.append(Problem(f"{key} line {line}", ",".join(row), "a number in each of the 4 columns"))
+    if problems:
+        raise SceneError(problems)
+    return samples[:, 0].copy(), samples[:, 1:].copy()
+
+
+def sample_table(t: list[Any], wrench: list[Any], key: str) -> Samples:
+    """Return the samples written in a scene as arrays; raises `SceneError` naming each row that is no use."""
+    problems = [
+        Problem(f"{key}.t[{index}]", value, "a number [s]") for index, value in enumerate(t) if not _is_number(value)
+    ]
+    problems += [
+        Problem(f"{key}.wrench[{index}]", row, "3 numbers: Fx, Fy, M [N, N, N m]")
+        for index, row in enumerate(wrench)
+        if not isinstance(row, list) or len(row) != 3 or not all(map(_is_number, row))
+    ]
+    if problems:
+        raise SceneError(problems)
+    flat = np.fromiter(chain.from_iterable(wrench), dtype=float, count=3 * len(wrench))
+    return np.array(t, dtype=float), flat.reshape(-1, 3)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 2**1024
