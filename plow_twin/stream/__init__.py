@@ -1,0 +1,1 @@
+"""Samples over time: order, gaps, hold policy, health counters; every clock is passed in."""

@@ -1,0 +1,140 @@
+"""Whether an arriving sample is used, and the count of each reason why one was not.
+
+The clock is passed in: nothing here reads one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from enum import Enum
+
+NS_PER_S = 1_000_000_000
+
+
+class Verdict(Enum):
+    """What became of one arriving sample; the value is the name of its counter."""
+
+    ACCEPTED = "accepted"
+    #: accepted after a reset: the stamps stepped back by more than `jump_back_s`
+    JUMP_BACK = "jump_back"
+    #: accepted after a reset: the stamps stepped forward by more than `jump_forward_s`
+    JUMP_FORWARD = "jump_forward"
+    NON_FINITE = "non_finite"
+    UNSTAMPED = "unstamped"
+    DUPLICATE = "duplicate"
+    OUT_OF_ORDER = "out_of_order"
+    #: newer than the last sample, but the model has already passed it under the hold policy
+    LATE = "late"
+    #: names or lengths of the message do not fit the scene
+    MALFORMED = "malformed"
+    #: came on a topic that is not the selected excitation source
+    NOT_SELECTED = "not_selected"
+    #: came while the node was not active
+    INACTIVE = "inactive"
+
+    @property
+    def used(self) -> bool:
+        """Whether the sample is used."""
+        return self in _USED
+
+    @property
+    def resets(self) -> bool:
+        """Whether the model is reset before the sample is used."""
+        return self in _RESETS
+
+
+_USED = frozenset({Verdict.ACCEPTED, Verdict.JUMP_BACK, Verdict.JUMP_FORWARD})
+_RESETS = frozenset({Verdict.JUMP_BACK, Verdict.JUMP_FORWARD})
+
+
+class Intake:
+    """Judge one stream of stamped samples, in order of arrival.
+
+    Parameters
+    ----------
+    jump_back_s
+        A stamp older than the newest one by more than this [s] is a step of the sender's clock; less is a late packet.
+    jump_forward_s
+        A stamp newer than the model's time by more than this [s] is a step of the sender's clock.
+    expected_rate_hz
+        Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: not known.
+    """
+
+    def __init__(
+        self, *, jump_back_s: float = 1.0, jump_forward_s: float = 10.0, expected_rate_hz: float = 0.0
+    ) -> None:
+        self.jump_back_s = jump_back_s
+        self.jump_forward_s = jump_forward_s
+        self.expected_rate_hz = expected_rate_hz
+        self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
+        #: samples that were used although a component outside the plane was not zero
+        self.out_of_plane = 0
+        #: samples that the expected rate asks for and that did not come in their place
+        self.missing = 0
+        self._newest_ns: int | None = None
+
+    @property
+    def arrived(self) -> int:
+        """Number of samples judged."""
+        return sum(self.counts.values())
+
+    @property
+    def used(self) -> int:
+        """Number of samples used."""
+        return sum(count for verdict, count in self.counts.items() if verdict.used)
+
+    def judge(self, stamp_ns: int, values: Sequence[float], reached_ns: int | None = None) -> Verdict:
+        """Return the verdict on one sample and count it.
+
+        Parameters
+        ----------
+        stamp_ns
+            Stamp of the sample [ns].
+        values
+            All its numbers.
+        reached_ns
+            Time that the model has reached [ns], None before its first sample.
+        """
+        verdict = self._judge(stamp_ns, values, reached_ns)
+        self.counts[verdict] += 1
+        if verdict is Verdict.ACCEPTED:
+            self._count_missing(stamp_ns)
+        if verdict.used:
+            self._newest_ns = stamp_ns
+        return verdict
+
+    def refuse(self, verdict: Verdict) -> None:
+        """Count a sample that was dropped before it could be judged."""
+        if verdict.used:
+            raise ValueError(f"verdict: got {verdict.value}, expected a reason to drop")
+        self.counts[verdict] += 1
+
+    def restart(self) -> None:
+        """Forget the newest stamp: the next sample is a first one. The counts go on."""
+        self._newest_ns = None
+
+    def _count_missing(self, stamp_ns: int) -> None:
+        if self._newest_ns is not None and self.expected_rate_hz > 0.0:
+            periods = (stamp_ns - self._newest_ns) * self.expected_rate_hz / NS_PER_S
+            self.missing += max(0, round(periods) - 1)
+
+    def _judge(self, stamp_ns: int, values: Sequence[float], reached_ns: int | None) -> Verdict:
+        if not all(map(math.isfinite, values)):
+            return Verdict.NON_FINITE
+        if stamp_ns <= 0:
+            return Verdict.UNSTAMPED
+        newest_ns = self._newest_ns
+        latest_ns = max((ns for ns in (newest_ns, reached_ns) if ns is not None), default=None)
+        if latest_ns is None:
+            return Verdict.ACCEPTED
+        if stamp_ns == newest_ns:
+            return Verdict.DUPLICATE
+        ahead_ns = stamp_ns - latest_ns
+        if ahead_ns > self.jump_forward_s * NS_PER_S:
+            return Verdict.JUMP_FORWARD
+        if ahead_ns > 0:
+            return Verdict.ACCEPTED
+        if -ahead_ns > self.jump_back_s * NS_PER_S:
+            return Verdict.JUMP_BACK
+        return Verdict.LATE if newest_ns is None or stamp_ns > newest_ns else Verdict.OUT_OF_ORDER

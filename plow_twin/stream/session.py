@@ -1,0 +1,124 @@
+"""The deterministic machine that the live node and a replay both drive: entries of the journal in, motion out."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset, Sample, Snapshot, Travel
+from plow_twin.stream.outputs import Outputs
+
+if TYPE_CHECKING:
+    from plow_twin.twin import Advance, Twin
+
+#: A digest follows each so many advances.
+DIGEST_INTERVAL: Final = 100
+_HEADER: Final = struct.Struct("<?qqq")
+
+
+def _ignore(entry: Entry) -> None:
+    """Drop an entry."""
+
+
+class Session:
+    """One run of a twin under a journal.
+
+    The same entries in the same order give the same motion, the same frames (`outputs`) and the same digests, bit for
+    bit, whatever the clock did meanwhile. Model time is (stamp - origin), the origin being the first stamp.
+
+    Parameters
+    ----------
+    twin
+        The twin to drive; nobody else may advance it.
+    origin_ns
+        Stamp of model time 0, or None: the first stamp.
+    on_entry
+        Receives each accepted entry before it is applied, and each digest after the advance that it covers.
+    """
+
+    def __init__(self, twin: Twin, origin_ns: int | None = None, on_entry: Callable[[Entry], object] = _ignore) -> None:
+        self.twin = twin
+        self.origin_ns = origin_ns
+        #: the time that the model has reached [ns], None before the first stamp
+        self.stamp_ns: int | None = None
+        self.outputs = Outputs(twin.scene)
+        self._on_entry = on_entry
+        self._advances = 0
+
+    def start(self) -> None:
+        """Emit the snapshot that opens a journal."""
+        self._on_entry(self.snapshot())
+
+    def close(self) -> None:
+        """Emit the digest that ends a journal."""
+        if self.stamp_ns is not None:
+            self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
+
+    def apply(self, entry: Entry) -> Advance | None:
+        """Emit one entry, apply it, and return the advance when it made one.
+
+        A digest or a loss says something about a journal and changes nothing: it is not emitted again.
+
+        Raises
+        ------
+        ValueError
+            The entry cannot be applied (its stamp lies before the time reached, a number is not finite); nothing is
+            changed then.
+        """
+        match entry:
+            case Sample(stamp_ns, wrench):
+                return self._advance(entry, stamp_ns, wrench)
+            case Hold(stamp_ns):
+                return self._advance(entry, stamp_ns, None)
+            case Travel(_, speed):
+                self._on_entry(entry)
+                self.twin.set_travel_speed(speed)
+            case Reset():
+                self._on_entry(entry)
+                self._reset()
+            case Parameter():
+                # acts through the entries that follow it
+                self._on_entry(entry)
+            case Snapshot(_, data):
+                self._on_entry(entry)
+                self._restore(data)
+            case Digest() | Loss():
+                pass
+        return None
+
+    def snapshot(self) -> Snapshot:
+        """Return the exact state of twin, outputs and session."""
+        known = self.stamp_ns is not None
+        header = _HEADER.pack(known, self.origin_ns or 0, self.stamp_ns or 0, self._advances)
+        stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
+        return Snapshot(stamp_ns, header + self.outputs.state() + self.twin.snapshot())
+
+    def _advance(self, entry: Entry, stamp_ns: int, wrench: tuple[float, float, float] | None) -> Advance:
+        if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
+            raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
+        self._on_entry(entry)
+        if self.origin_ns is None:
+            self.origin_ns = stamp_ns
+        advance = self.twin.advance((stamp_ns - self.origin_ns) * 1e-9, wrench)
+        self.stamp_ns = stamp_ns
+        if not advance.status:
+            self.outputs.add(stamp_ns, advance)
+        self._advances += 1
+        if self._advances % DIGEST_INTERVAL == 0:
+            self._on_entry(Digest(stamp_ns, self.twin.digest()))
+        return advance
+
+    def _reset(self) -> None:
+        self.twin.reset(0.0)
+        self.outputs.restart()
+        self.origin_ns = self.stamp_ns = None
+
+    def _restore(self, data: bytes) -> None:
+        known, origin_ns, stamp_ns, advances = _HEADER.unpack_from(data)
+        split = _HEADER.size + self.outputs.state_size()
+        self.twin.restore(data[split:])
+        self.outputs.set_state(data[_HEADER.size : split])
+        self.origin_ns = origin_ns if known else self.origin_ns
+        self.stamp_ns = stamp_ns if known else None
+        self._advances = advances
