@@ -1,0 +1,50 @@
+"""The normal force of a pair, compiled: once as a number, once as a power series in time.
+
+    Kelvin-Voigt      F = K d + C d'
+    all other laws    F = K d^n (1 + lambda d')
+
+(model of the paper's lost eq. 6; the laws' lambda comes from `contact_laws`). A solver decides when a pair is in contact
+and when its force would pull: there the force is zero.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+#: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
+FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def normal_force(
+    penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float
+) -> float:
+    """Return F >= 0 in N for penetration d in m and rate d' in m/s; zero for d <= 0.
+
+    `factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero.
+    """
+    if penetration <= 0.0:
+        return 0.0
+    elastic = stiffness * (penetration if exponent == 1.0 else penetration**exponent)
+    return max(0.0, elastic * (1.0 + factor * rate) + viscous * rate)
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+def power_term(
+    base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float, shift: int
+) -> float:
+    """Return coefficient k of base(t)^exponent and store it in `power`, both shape (order + 1,).
+
+    Recurrence  b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j}  (Knuth, TAOCP 2, sec. 4.7). A base that starts with
+    t^shift is divided by it first, `power` is then the series of (base / t^shift)^exponent.
+    """
+    if k == 0:
+        power[0] = base[shift] ** exponent
+        return power[0]
+    total = 0.0
+    for j in range(1, k + 1):
+        total += (exponent * j - (k - j)) * base[j + shift] * power[k - j]
+    power[k] = total / (k * base[shift])
+    return power[k]

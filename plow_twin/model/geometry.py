@@ -1,0 +1,107 @@
+"""Geometry of the guide: where each frame corner lies in the head's axes, how deep, and with which arm.
+
+The head's state is kept in *body coordinates* of its centre of mass G:
+
+    X, Y     position of G, VX, VY its velocity, both resolved in head axes,
+    omega    angular velocity,  c, s = cos(theta), sin(theta),  theta.
+
+With them every penetration is linear, and so is every arm. A frame corner C = (Cx, Cy) is seen from the cavity's centre at
+p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
+
+    p_x =  c Cx + s Cy - X + rx        p_y = -s Cx + c Cy - Y + ry
+
+with (rx, ry) the offset of G from the cavity's centre in head axes. The penetration past a wall with outward normal n at
+distance H is n . p - H; its rate is n . dp/dt, positive inward.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y
+
+if TYPE_CHECKING:
+    from plow_twin.model.scene import Scene
+
+#: Number of components of the body-coordinate state: X, Y, VX, VY, omega, c, s, theta.
+STATE_SIZE = 8
+
+
+def corner_positions(scene: Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the frame corner (Cx, Cy) of each pair, shape (8,) each, in m, world axes."""
+    return 0.5 * scene.frame.width_m * CORNER_X, 0.5 * scene.frame.height_m * CORNER_Y
+
+
+def wall_distances(scene: Scene) -> NDArray[np.float64]:
+    """Return the distance of each pair's wall from the cavity's centre, shape (8,), in m, before wear."""
+    half_width = 0.5 * (scene.frame.width_m + scene.clearance.horizontal_m)
+    half_height = 0.5 * (scene.frame.height_m + scene.clearance.vertical_m)
+    return np.abs(NORMAL_X) * half_width + np.abs(NORMAL_Y) * half_height
+
+
+def penetration_rows(scene: Scene) -> NDArray[np.float64]:
+    """Return the coefficients of each penetration, shape (5, 8): rows for c, s, X, Y and 1, before wear.
+
+    n . p - H  with p of the module's docstring.
+    """
+    corner_x, corner_y = corner_positions(scene)
+    offset_x, offset_y = scene.head.com_offset_m
+    return np.array(
+        [
+            NORMAL_X * corner_x + NORMAL_Y * corner_y,
+            NORMAL_X * corner_y - NORMAL_Y * corner_x,
+            -NORMAL_X,
+            -NORMAL_Y,
+            NORMAL_X * offset_x + NORMAL_Y * offset_y - wall_distances(scene),
+        ]
+    )
+
+
+def arm_rows(scene: Scene) -> NDArray[np.float64]:
+    """Return the coefficients of each force's arm about G, shape (4, 8): rows for c, s, X, Y.
+
+    The force of a pair acts at the corner along n, so its moment about G is (p - r) x n per newton.
+    """
+    corner_x, corner_y = corner_positions(scene)
+    return np.array(
+        [
+            NORMAL_Y * corner_x - NORMAL_X * corner_y,
+            NORMAL_Y * corner_y + NORMAL_X * corner_x,
+            -NORMAL_Y,
+            NORMAL_X,
+        ]
+    )
+
+
+def body_state(
+    q: tuple[float, float, float] | NDArray[np.float64],
+    v: tuple[float, float, float] | NDArray[np.float64],
+    com_offset: tuple[float, float],
+) -> NDArray[np.float64]:
+    """Convert pose and rate of the cavity's centre, shape (3,) each, to body coordinates of G, shape (8,)."""
+    x, y, theta = (float(value) for value in q)
+    vx, vy, omega = (float(value) for value in v)
+    c, s = math.cos(theta), math.sin(theta)
+    rx, ry = com_offset
+    return np.array(
+        [c * x + s * y + rx, -s * x + c * y + ry, c * vx + s * vy - omega * ry, -s * vx + c * vy + omega * rx, omega, c, s, theta]
+    )
+
+
+def length_scale(scene: Scene) -> float:
+    """Return the length in m that a tolerance refers to: the smallest clearance that is not negligible.
+
+    A clearance that is zero, negative or below 1e-4 of the frame's diagonal does not count; without any the scale is that
+    fraction of the diagonal.
+    """
+    floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)
+    return min((c for c in (scene.clearance.horizontal_m, scene.clearance.vertical_m) if c > floor), default=floor)
+
+
+def half_diagonal(scene: Scene) -> float:
+    """Return the distance of a frame corner from the frame's centre in m: it turns angles into lengths."""
+    return 0.5 * math.hypot(scene.frame.width_m, scene.frame.height_m)

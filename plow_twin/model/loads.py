@@ -1,0 +1,113 @@
+"""Loads of a scene as the solver needs them: harmonics grouped by frequency, and one list of linear pieces.
+
+A load (Fx, Fy) at the constant arm (x, y) in world axes gives M = x Fy - y Fx about the cavity's centre, whatever the pose
+(paper, section 2). Gravity is not a load.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.scene import Constant, Harmonic, Load, Table
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """A piecewise linear wrench: `start + slope (t - knots[i])` on [knots[i], knots[i + 1]); the last piece has no end.
+
+    `knots` has shape (n,), strictly increasing; before the first one the first start value holds. `start` and `slope`
+    have shape (n, 3): Fx, Fy in N, M in N m, and the same per second.
+    """
+
+    knots: Array
+    start: Array
+    slope: Array
+
+    @staticmethod
+    def through(t: Array, wrench: Array) -> Pieces:
+        """Join samples by straight lines; the last one is held."""
+        slope = np.zeros_like(wrench)
+        slope[:-1] = np.diff(wrench, axis=0) / np.diff(t)[:, None]
+        return Pieces(t, wrench, slope)
+
+    def at(self, t: Array) -> tuple[Array, Array]:
+        """Return value and slope just after each time, shape (m, 3) each."""
+        index = np.clip(np.searchsorted(self.knots, t, side="right") - 1, 0, None)
+        before = t < self.knots[0]
+        slope = np.where(before[:, None], 0.0, self.slope[index])
+        return self.start[index] + slope * (t - self.knots[index])[:, None], slope
+
+
+@dataclass(frozen=True)
+class LoadSet:
+    """All loads of a scene, summed.
+
+    constant : shape (3,), wrench Fx, Fy in N, M in N m
+    omega : shape (h,), rad/s, distinct
+    sine, cosine : shape (h, 3), amplitudes of sin(omega t) and cos(omega t)
+    pieces : the tables' sum, or None without tables
+    """
+
+    constant: Array
+    omega: Array
+    sine: Array
+    cosine: Array
+    pieces: Pieces | None
+
+    def at(self, t: Array) -> Array:
+        """Return the wrench at each time, shape (m, 3)."""
+        t = np.atleast_1d(np.asarray(t, dtype=np.float64))
+        angle = t[:, None] * self.omega
+        wrench = self.constant + np.sin(angle) @ self.sine + np.cos(angle) @ self.cosine
+        return wrench if self.pieces is None else wrench + self.pieces.at(t)[0]
+
+
+def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]) -> Array:
+    """Return (Fx, Fy, M) of a force with its arm and a free moment, shape (3,):  M = x Fy - y Fx + moment."""
+    return np.array([force[0], force[1], at[0] * force[1] - at[1] * force[0] + moment])
+
+
+def load_direction(load: Harmonic | Constant) -> Array:
+    """Return the wrench per newton along the load's own direction, shape (3,); a pure moment counts per N m."""
+    size = float(np.hypot(*load.force_n)) or abs(load.moment_n_m) or 1.0
+    return wrench_of(load.force_n, load.moment_n_m, load.at_m) / size
+
+
+def compile_loads(loads: Iterable[Load]) -> LoadSet:
+    """Sum the loads of a scene."""
+    constant = np.zeros(3)
+    spectrum: dict[float, Array] = {}
+    tables: list[Pieces] = []
+    for load in loads:
+        if isinstance(load, Table):
+            tables.append(_pieces_of(load))
+            continue
+        wrench = wrench_of(load.force_n, load.moment_n_m, load.at_m)
+        if isinstance(load, Constant):
+            constant += wrench
+        else:
+            phasor = spectrum.setdefault(load.omega_rad_s, np.zeros((2, 3)))
+            phasor += np.outer([np.cos(load.phase_rad), np.sin(load.phase_rad)], wrench)
+    phasors = np.array(list(spectrum.values())).reshape(-1, 2, 3)
+    return LoadSet(constant, np.array(list(spectrum)), phasors[:, 0], phasors[:, 1], _sum_pieces(tables))
+
+
+def _pieces_of(table: Table) -> Pieces:
+    t = np.asarray(table.t, dtype=np.float64)
+    wrench = np.array(table.wrench, dtype=np.float64)
+    wrench[:, 2] += table.at_m[0] * wrench[:, 1] - table.at_m[1] * wrench[:, 0]
+    return Pieces.through(t, wrench) if table.hold == "linear" else Pieces(t, wrench, np.zeros_like(wrench))
+
+
+def _sum_pieces(tables: list[Pieces]) -> Pieces | None:
+    if len(tables) < 2:
+        return tables[0] if tables else None
+    knots = np.unique(np.concatenate([table.knots for table in tables]))
+    values, slopes = zip(*(table.at(knots) for table in tables), strict=True)
+    return Pieces(knots, np.sum(values, axis=0), np.sum(slopes, axis=0))

@@ -1,0 +1,182 @@
+"""From a scene to what the kernels take: the one place where names and units of the scene meet the solver's arrays."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from plow_twin.model import geometry
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.loads import LoadSet, Pieces, compile_loads
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.scene import DOF_NAMES, Contact, Scene
+from plow_twin.solve.layout import MAX_ORDER, Array, Harmonics, Law, Params, Parts, Segments, State, new_state
+from plow_twin.solve.step import settle_modes
+
+#: Tightest and loosest tolerance.
+TOLERANCE_RANGE = (1e-13, 1e-1)
+#: Mode changes at one instant before the solver goes on past it.
+MAX_EVENTS_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """A scene at one tolerance, ready for the kernels."""
+
+    scene: Scene
+    params: Params
+    parts: Parts
+    loads: LoadSet
+
+    def initial_state(self, time: float = 0.0) -> State:
+        """Return the scene's initial state."""
+        state = new_state()
+        state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
+        state.factor[:] = self.scene.contact.damping or 0.0
+        if self.scene.wear is not None:
+            state.depth[:] = self.scene.wear.initial_depth_m
+        state.clock[0] = time
+        settle_modes(self.params, state)
+        return state
+
+
+def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compiled:
+    """Compile a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    tol : float
+        Tolerance of the pose relative to `geometry.length_scale`, 1e-13 .. 1e-1.
+    sampled : bool
+        Leave the scene's loads out: the load comes as samples.
+
+    Raises
+    ------
+    ValueError
+        For a tolerance out of range.
+    """
+    low, high = TOLERANCE_RANGE
+    if not low <= tol <= high:
+        raise ValueError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
+    loads = compile_loads(() if sampled else scene.loads)
+    mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
+    gravity = scene.gravity.acceleration_m_s2
+    constant = per_mass(scene, loads.constant)
+    constant[1] -= gravity
+    constant[2] -= mass * gravity * scene.gravity.arm_m / inertia
+    direction, harmonics, second = _harmonics(scene, loads)
+    law, factor = law_of(scene.contact)
+    length = geometry.length_scale(scene)
+    speed = _velocity_scale(scene, loads, length)
+    params = Params(
+        gap=geometry.penetration_rows(scene),
+        arm=geometry.arm_rows(scene),
+        enabled=np.array([name in scene.pairs for name in PAIR_NAMES], dtype=np.int64),
+        inverse_mass=1.0 / mass,
+        inverse_inertia=1.0 / inertia,
+        stiffness=float(scene.contact.stiffness),
+        damping_factor=factor,
+        speed_floor=float(scene.contact.impact_speed_floor_m_s),
+        gravity=float(gravity),
+        constant=constant,
+        direction=direction,
+        order=order_for(tol),
+        velocity_tolerance=tol * speed,
+        position_tolerance=tol * length,
+        radius=geometry.half_diagonal(scene),
+        release=0.0 if law.fraction is None else _release(scene, tol * speed, speed, law.fraction),
+        half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
+        max_events=MAX_EVENTS_AT_ONCE,
+    )
+    offset = np.array(scene.head.com_offset_m, dtype=np.float64) if any(scene.head.com_offset_m) else None
+    free = np.array([float(name not in scene.locked) for name in DOF_NAMES]) if scene.locked else None
+    segments = segments_of(scene, loads.pieces) if loads.pieces is not None else None
+    if sampled:
+        segments = Segments(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
+    parts = Parts(harmonics, second, segments, law, _wear_rate(scene), offset, free)
+    return Compiled(scene, params, parts, loads)
+
+
+def order_for(tol: float) -> int:
+    """Return the order of the series for a tolerance: about half the digits over log10(e), a few more for long steps."""
+    return int(min(MAX_ORDER, max(8, round(6.0 - 1.15 * math.log10(tol)))))
+
+
+def per_mass(scene: Scene, wrench: Array) -> Array:
+    """Divide wrenches, shape (..., 3), by mass and inertia."""
+    return np.asarray(wrench) / np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
+
+
+def segments_of(scene: Scene, pieces: Pieces) -> Segments:
+    """Return linear pieces per mass and inertia."""
+    return Segments(
+        np.ascontiguousarray(pieces.knots, dtype=np.float64), per_mass(scene, pieces.start), per_mass(scene, pieces.slope)
+    )
+
+
+def law_of(contact: Contact) -> tuple[Law, float]:
+    """Return which terms the law has, and D where lambda = D / v0 (else -1)."""
+    law = LAWS[contact.law]
+    exponent = contact.exponent
+    viscous = float(contact.damping or 0.0) if law.additive else 0.0
+    factor = -1.0 if contact.restitution is None else law.damping_factor(contact.restitution)
+    damped = not law.additive and (factor > 0.0 or bool(contact.damping))
+    return (
+        Law(
+            viscous=viscous if viscous > 0.0 else None,
+            factor=1 if damped else None,
+            integer=int(exponent) if exponent != 1.0 and float(exponent).is_integer() else None,
+            fraction=None if float(exponent).is_integer() else float(exponent),
+        ),
+        factor if damped else -1.0,
+    )
+
+
+def _harmonics(scene: Scene, loads: LoadSet) -> tuple[Array, Harmonics | None, Array | None]:
+    """Split harmonic forces into directions: one when all forces are parallel, else x and y."""
+    if loads.omega.size == 0:
+        return np.eye(2), None, None
+    sine, cosine = per_mass(scene, loads.sine), per_mass(scene, loads.cosine)
+    forces = np.concatenate([sine[:, :2], cosine[:, :2]])
+    largest = forces[np.argmax(np.hypot(forces[:, 0], forces[:, 1]))]
+    size = float(np.hypot(*largest))
+    unit = largest / size if size > 0.0 else np.array([1.0, 0.0])
+    across = np.abs(forces @ np.array([-unit[1], unit[0]]))
+    moment = np.stack([sine[:, 2], cosine[:, 2]], axis=1)
+    if across.max() <= 1e-15 * size:
+        first = np.stack([sine[:, :2] @ unit, cosine[:, :2] @ unit], axis=1)
+        return np.array([unit, [0.0, 0.0]]), Harmonics(loads.omega, first, moment), None
+    first, second = (np.stack([sine[:, i], cosine[:, i]], axis=1) for i in range(2))
+    return np.eye(2), Harmonics(loads.omega, first, moment), second
+
+
+def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
+    """Return the speed in m/s that the largest steady load gives the head over half the length scale."""
+    force = np.abs(loads.constant) + np.abs(loads.sine).sum(axis=0) + np.abs(loads.cosine).sum(axis=0)
+    if loads.pieces is not None:
+        force = force + np.abs(loads.pieces.start).max(axis=0)
+    acceleration = per_mass(scene, force)
+    radius = geometry.half_diagonal(scene)
+    total = abs(scene.gravity.acceleration_m_s2) + float(np.hypot(acceleration[0], acceleration[1])) + radius * acceleration[2]
+    initial = float(np.hypot(*scene.initial.v[:2])) + radius * abs(scene.initial.v[2])
+    return max(math.sqrt(length * total), initial, 1e-3 * length)
+
+
+def _release(scene: Scene, velocity_tolerance: float, speed: float, exponent: float) -> float:
+    """Return the penetration from which the impulse to separation is below 1e-3 of the velocity tolerance.
+
+    integral F dt = K d^(n+1) / ((n+1) v) at the speed v.
+    """
+    impulse = 1e-3 * velocity_tolerance * scene.head.mass_kg
+    return float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
+
+
+def _wear_rate(scene: Scene) -> Array | None:
+    """Return depth per impulse of each pad, shape (8,), in m/(N s):  dh/dt = k_s F v / A (Archard)."""
+    wear = scene.wear
+    if wear is None or wear.coefficient_m2_n == 0.0:
+        return None
+    return np.full(PAIR_COUNT, wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2)

@@ -1,0 +1,160 @@
+"""Polynomials on an interval: sure statements on sign, first root and maximum, from the Bernstein form.
+
+A polynomial lies within the hull of its Bernstein coefficients, and has no more roots than they have sign changes; halving
+the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.contact import FASTMATH
+from plow_twin.solve.layout import MAX_HALVINGS, Work
+
+Array = NDArray[np.float64]
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def horner(g: Array, n: int, x: float) -> float:
+    """Return the value at x of the polynomial with coefficients g[0..n]."""
+    value = g[n]
+    for k in range(n - 1, -1, -1):
+        value = value * x + g[k]
+    return value
+
+
+@numba.njit(cache=True, error_model="numpy")
+def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
+    """Write the Bernstein coefficients of g on [0, h] to b[0..n]."""
+    power = 1.0
+    for k in range(n + 1):
+        b[k] = g[k] * power * inverse_binomial[k]
+        power *= h
+    for r in range(1, n + 1):
+        for j in range(n, r - 1, -1):
+            b[j] += b[j - 1]
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+def columns_to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
+    """Do the same for eight polynomials side by side, coefficients in rows."""
+    power = 1.0
+    for k in range(n + 1):
+        scale = power * inverse_binomial[k]
+        power *= h
+        for lane in range(8):
+            b[k, lane] = g[k, lane] * scale
+    for r in range(1, n + 1):
+        for j in range(n, r - 1, -1):
+            for lane in range(8):
+                b[j, lane] += b[j - 1, lane]
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _halve(left: Array, right: Array, n: int) -> None:
+    """Split Bernstein coefficients in `left` at the middle: left half in place, right half to `right`."""
+    for r in range(n + 1):
+        right[n - r] = left[n]
+        for j in range(n, r, -1):
+            left[j] = 0.5 * (left[j] + left[j - 1])
+    # the sweep above leaves the left half's coefficients in `left`, the right half's in `right`
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
+    """Return the only root in [low, high], where g >= 0 at `low` side and < 0 at `high`: Newton within the bracket."""
+    x = min(max(start, low), high)
+    for _ in range(80):
+        value, slope = g[n], 0.0
+        for k in range(n - 1, -1, -1):
+            slope = slope * x + value
+            value = value * x + g[k]
+        if value >= 0.0:
+            low = x
+        else:
+            high = x
+        new = x - value / slope if slope < 0.0 else 0.5 * (low + high)
+        if not (low <= new <= high):
+            new = 0.5 * (low + high)
+        if abs(new - x) <= 2e-16 * high or high - low <= 2e-16 * high:
+            return new
+        x = new
+    return x
+
+
+@numba.njit(cache=True, error_model="numpy")
+def first_root(g: Array, n: int, h: float, w: Work) -> float:
+    """Return where g first turns negative in [0, h), or infinity; g[0] >= 0.
+
+    Intervals whose Bernstein coefficients show no negative value are left out, one sign change is one root, the rest is
+    halved, left part first.
+    """
+    b, bounds = w.halves, w.bounds
+    to_bernstein(g, n, h, w.binomial[n], b[0])
+    bounds[0, 0], bounds[0, 1] = 0.0, h
+    top = 0
+    while top >= 0:
+        low, high = bounds[top, 0], bounds[top, 1]
+        changes, crossing, positive, lowest = 0, low, b[top, 0] >= 0.0, b[top, 0]
+        for k in range(1, n + 1):
+            lowest = min(lowest, b[top, k])
+            if (b[top, k] >= 0.0) != positive:
+                changes += 1
+                if changes == 1:
+                    span = b[top, k - 1] - b[top, k]
+                    crossing = low + (high - low) * (k - 1 + b[top, k - 1] / span) / n
+                positive = not positive
+        if lowest >= 0.0:
+            top -= 1
+        elif changes == 1 and b[top, 0] >= 0.0:
+            return _crossing(g, n, low, high, crossing)
+        elif b[top, 0] < 0.0:
+            return low
+        elif top >= MAX_HALVINGS or high - low <= 4e-16 * h:
+            if b[top, n] < 0.0:
+                return low
+            top -= 1
+        else:
+            middle = 0.5 * (low + high)
+            # the right half stays below the left one on the stack
+            for k in range(n + 1):
+                b[top + 1, k] = b[top, k]
+            _halve(b[top + 1], b[top], n)
+            bounds[top, 0] = middle
+            bounds[top + 1, 0], bounds[top + 1, 1] = low, middle
+            top += 1
+    return np.inf
+
+
+@numba.njit(cache=True, error_model="numpy")
+def maximum(g: Array, n: int, h: float, floor: float, w: Work) -> float:
+    """Return the larger of `floor` and the maximum of g on [0, h], to 1e-12 of it."""
+    b = w.halves
+    to_bernstein(g, n, h, w.binomial[n], b[0])
+    best = floor
+    top = 0
+    while top >= 0:
+        best = max(best, b[top, 0], b[top, n])
+        bound = b[top, 0]
+        for k in range(1, n + 1):
+            bound = max(bound, b[top, k])
+        if bound <= best * (1.0 + 1e-12) or top >= MAX_HALVINGS:
+            top -= 1
+        else:
+            for k in range(n + 1):
+                b[top + 1, k] = b[top, k]
+            _halve(b[top + 1], b[top], n)
+            top += 1
+    return best
+
+
+@numba.njit(cache=True, error_model="numpy")
+def shift(g: Array, n: int, x: float, out: Array) -> None:
+    """Write the coefficients of g(x + .) to `out`."""
+    for k in range(n + 1):
+        out[k] = g[k]
+    for r in range(n):
+        for j in range(n - 1, r - 1, -1):
+            out[j] += x * out[j + 1]

@@ -1,0 +1,300 @@
+"""The live twin: one head, advanced by any interval under sampled or analytic loads; can be saved, restored and hashed."""
+
+from __future__ import annotations
+
+import hashlib
+import time as _time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.model.scene import Scene
+from plow_twin.solve import drive
+from plow_twin.solve.compiled import Compiled, compile_scene, per_mass
+from plow_twin.solve.layout import LENGTH, STEPS, T0, USED, State, Status, new_totals, new_work
+
+__all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
+
+#: Steps one advance may take before it gives up.
+DEFAULT_BUDGET = 50_000_000
+
+
+@dataclass(frozen=True)
+class Advance:
+    """What the head does at a time, and what happened since the advance before.
+
+    Attributes
+    ----------
+    t : float
+        Model time in s.
+    q, v : ndarray, shape (3,)
+        Pose x, y [m], theta [rad] of the cavity's centre, and its rate.
+    penetration, rate, force : ndarray, shape (8,)
+        Signed penetration [m], its rate [m/s] and normal force [N] of each pair at `t`.
+    peak, impulse : ndarray, shape (8,)
+        Largest force [N] and impulse [N s] since the advance before.
+    makes : ndarray of int64, shape (8,)
+        Touches since the advance before.
+    wear_depth : ndarray, shape (8,)
+        Wear depth of each pad in m, in total.
+    steps : int
+        Steps the solver took.
+    status : Status
+        Anything but `OK` means that the state is the last good one.
+    """
+
+    t: float
+    q: NDArray[np.float64]
+    v: NDArray[np.float64]
+    penetration: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    force: NDArray[np.float64]
+    peak: NDArray[np.float64]
+    impulse: NDArray[np.float64]
+    makes: NDArray[np.int64]
+    wear_depth: NDArray[np.float64]
+    steps: int
+    status: Status
+
+
+@dataclass(frozen=True)
+class AdvanceSeries:
+    """Many advances at once: the fields of `Advance`, each with a leading axis of length n."""
+
+    t: NDArray[np.float64]
+    q: NDArray[np.float64]
+    v: NDArray[np.float64]
+    penetration: NDArray[np.float64]
+    rate: NDArray[np.float64]
+    force: NDArray[np.float64]
+    peak: NDArray[np.float64]
+    impulse: NDArray[np.float64]
+    makes: NDArray[np.int64]
+    wear_depth: NDArray[np.float64]
+    steps: NDArray[np.int64]
+    status: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, index: int) -> Advance:
+        fields = {name: getattr(self, name)[index] for name in _ROW_FIELDS}
+        return Advance(
+            t=float(self.t[index]), steps=int(self.steps[index]), status=Status(int(self.status[index])), **fields
+        )
+
+
+_ROW_FIELDS = ("q", "v", "penetration", "rate", "force", "peak", "impulse", "makes", "wear_depth")
+
+
+class Twin:
+    """One head that is advanced in time.
+
+    Parameters
+    ----------
+    scene : Scene
+    tol : float
+        Tolerance of the pose relative to the clearance.
+    excitation : {"scene", "sampled"}
+        `scene`: the scene's own loads. `sampled`: wrenches given to `advance`, joined by straight lines; the scene's
+        loads are not used.
+    start : float
+        Model time of the scene's initial state in s.
+
+    Notes
+    -----
+    The motion does not depend on the times at which it is asked for, but a sample ends a step: the same samples give the
+    same bits.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        tol: float = 1e-9,
+        excitation: Literal["scene", "sampled"] = "scene",
+        start: float = 0.0,
+    ) -> None:
+        if excitation not in ("scene", "sampled"):
+            raise ValueError(f"excitation: got {excitation!r}, expected 'scene' or 'sampled'")
+        self.scene = scene
+        self.tol = tol
+        self.excitation = excitation
+        self._compiled: Compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
+        self._parts = self._compiled.parts
+        self._work = new_work()
+        self._totals = new_totals()
+        self._state = self._compiled.initial_state(start)
+        self._wrench = np.zeros(3)
+        self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
+
+    @property
+    def time(self) -> float:
+        """Model time in s."""
+        clock = self._state.clock
+        return float(clock[T0] + clock[USED]) if clock[LENGTH] >= 0.0 else float(clock[T0])
+
+    def warm_up(self) -> float:
+        """Compile every kernel that this scene uses, or load it from the cache on disk; return the seconds it took."""
+        begin = _time.perf_counter()
+        saved = self.snapshot()
+        if self.excitation == "sampled":
+            self.advance_samples(np.array([self.time + 1e-6]), np.zeros((1, 3)))
+        else:
+            self.advance(self.time + 1e-6)
+        self.restore(saved)
+        return _time.perf_counter() - begin
+
+    def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance:
+        """Advance to model time `t`.
+
+        Parameters
+        ----------
+        t : float
+            Model time in s, not before the present one.
+        wrench : array_like, shape (3,), optional
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only), reached on a straight
+            line from the sample before. Without it the last sample is held.
+
+        Raises
+        ------
+        ValueError
+            For a time before the present one, or anything that is not finite; nothing has changed then.
+        """
+        if self.excitation == "scene":
+            if wrench is not None:
+                raise ValueError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
+            return self._advance_scene(np.array([t], dtype=np.float64))[0]
+        sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
+        return self.advance_samples(np.array([t], dtype=np.float64), sample.reshape(1, -1))[0]
+
+    def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
+        """Advance through many samples; the same bits as one `advance` each.
+
+        Parameters
+        ----------
+        t : array_like, shape (n,)
+            Model times in s, never falling.
+        wrench : array_like, shape (n, 3)
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time.
+
+        Raises
+        ------
+        ValueError
+            As `advance`; nothing has changed then.
+        """
+        if self.excitation != "sampled":
+            raise ValueError("advance_samples: got excitation='scene', expected excitation='sampled'")
+        times, samples = np.asarray(t, dtype=np.float64), np.ascontiguousarray(wrench, dtype=np.float64)
+        self._check_times(times)
+        if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
+            raise ValueError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
+        out = _empty_series(times)
+        ends = np.concatenate([self._wrench[None], samples])
+        drive.advance_samples(
+            self._compiled.params, self._parts, self._state, self._work, self._totals, times,
+            per_mass(self.scene, ends), DEFAULT_BUDGET, *_columns(out),
+        )  # fmt: skip
+        self._wrench = samples[-1].copy() if len(samples) else self._wrench
+        return out
+
+    def reset(self, t: float) -> None:
+        """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
+        self._check_times(np.array([self.time if not np.isfinite(t) else max(t, self.time)]))
+        if not np.isfinite(t):
+            raise ValueError(f"t: got {t!r}, expected a finite time in s")
+        _copy_state(self._compiled.initial_state(t), self._state)
+        self._wrench = np.zeros(3)
+
+    def set_travel_speed(self, speed_m_s: float) -> None:
+        """Set the speed along the face from here on; only wear depends on it."""
+        if not np.isfinite(speed_m_s):
+            raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
+        wear = self.scene.wear
+        if wear is None or self._parts.wear is None:
+            return
+        self._end_step()
+        self._travel_speed = abs(float(speed_m_s))
+        self._parts.wear[:] = wear.coefficient_m2_n * self._travel_speed / wear.pad_area_m2
+
+    def snapshot(self) -> bytes:
+        """Return the exact state as bytes, to be restored by a twin of the same scene, tolerance and excitation."""
+        return b"".join(part.tobytes() for part in (*self._state, self._wrench, np.array([self._travel_speed])))
+
+    def restore(self, data: bytes) -> None:
+        """Take over a state saved by `snapshot`.
+
+        Raises
+        ------
+        ValueError
+            When the data has not the size of a snapshot.
+        """
+        parts = (*self._state, self._wrench, np.zeros(1))
+        size = sum(part.nbytes for part in parts)
+        if len(data) != size:
+            raise ValueError(f"snapshot: got {len(data)} bytes, expected {size}")
+        offset = 0
+        for part in parts:
+            part[:] = np.frombuffer(data, part.dtype, part.size, offset)
+            offset += part.nbytes
+        used = float(self._state.clock[USED])
+        self._set_speed_exactly(float(parts[-1][0]))
+        if self._state.clock[LENGTH] >= 0.0:
+            drive.lay_out_again(self._compiled.params, self._parts, self._state, self._work, used)
+
+    def digest(self) -> str:
+        """Return 16 hexadecimal digits that stand for the exact state."""
+        return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
+
+    @property
+    def steps(self) -> int:
+        """Steps taken so far."""
+        return int(self._state.count[STEPS])
+
+    def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
+        self._check_times(times)
+        out = _empty_series(times)
+        drive.advance_times(
+            self._compiled.params, self._parts, self._state, self._work, self._totals, times, DEFAULT_BUDGET, *_columns(out)
+        )
+        return out
+
+    def _check_times(self, times: NDArray[np.float64]) -> None:
+        if times.ndim != 1 or not np.isfinite(times).all():
+            raise ValueError(f"t: got {times!r}, expected finite times in s, shape (n,)")
+        before = np.concatenate([[self.time], times[:-1]]) if len(times) else times
+        late = np.flatnonzero(times < before)
+        if late.size:
+            index = int(late[0])
+            raise ValueError(f"t: got {times[index]!r} s, expected a time not before {before[index]!r} s")
+
+    def _end_step(self) -> None:
+        drive.end_step(self._compiled.params, self._parts, self._state, self._work, self._totals)
+
+    def _set_speed_exactly(self, speed: float) -> None:
+        self._travel_speed = speed
+        wear = self.scene.wear
+        if wear is not None and self._parts.wear is not None:
+            self._parts.wear[:] = wear.coefficient_m2_n * speed / wear.pad_area_m2
+
+
+def _empty_series(times: NDArray[np.float64]) -> AdvanceSeries:
+    n = len(times)
+    eight = [np.zeros((n, 8)) for _ in range(6)]
+    return AdvanceSeries(
+        times, np.zeros((n, 3)), np.zeros((n, 3)), *eight[:5], np.zeros((n, 8), np.int64), eight[5],
+        np.zeros(n, np.int64), np.zeros(n, np.int64),
+    )  # fmt: skip
+
+
+def _columns(out: AdvanceSeries) -> tuple[NDArray[np.float64] | NDArray[np.int64], ...]:
+    return tuple(getattr(out, name) for name in (*_ROW_FIELDS, "steps", "status"))
+
+
+def _copy_state(source: State, target: State) -> None:
+    for part, value in zip(target, source, strict=True):
+        part[:] = value
+
+
