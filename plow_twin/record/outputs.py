@@ -1,31 +1,56 @@
-"""From what the twin computed to what is sent; the live node and replay share this arithmetic."""
+"""From a frame of the session to the messages that are sent: the live node and replay share this arithmetic."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.record.messages import Float64s, JointState, Odometry
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.messages import JointState, Message, Odometry
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 
 if TYPE_CHECKING:
-    from plow_twin.twin import Advance
+    from plow_twin.stream.outputs import Frame
+
+#: Base names of the topics that follow from the journal alone.
+FRAME_TOPICS: Final = ("contact_forces", "contact_peaks", "head_state", "clearance", "wear_rate")
 
 
-def contact_forces(stamp_ns: int, frame_id: str, advance: Advance) -> JointState:
+def frame_messages(frame: Frame, frame_id: str, child_frame_id: str) -> dict[str, Message]:
+    """Return the messages of a frame by the base name of their topic; the slow ones only when the frame has them."""
+    messages: dict[str, Message] = {
+        "contact_forces": contact_forces(frame, frame_id),
+        "contact_peaks": contact_peaks(frame, frame_id),
+        "head_state": head_state(frame, frame_id, child_frame_id),
+    }
+    if frame.slow is not None:
+        slow, stamp_ns = frame.slow, frame.stamp_ns
+        messages["clearance"] = JointState(stamp_ns, frame_id, CLEARANCE_NAMES, position=slow.clearance)
+        messages["wear_rate"] = JointState(stamp_ns, frame_id, PAD_NAMES, velocity=slow.wear_rate)
+    return messages
+
+
+def contact_forces(frame: Frame, frame_id: str) -> JointState:
     """Return penetration [m] as position, its rate [m/s] as velocity and force [N] as effort, all at the stamp."""
-    return JointState(stamp_ns, frame_id, PAIR_NAMES, advance.penetration, advance.rate, advance.force)
+    return JointState(frame.stamp_ns, frame_id, PAIR_NAMES, frame.penetration, frame.rate, frame.force)
 
 
-def head_state(stamp_ns: int, frame_id: str, child_frame_id: str, advance: Advance) -> Odometry:
+def contact_peaks(frame: Frame, frame_id: str) -> JointState:
+    """Return all touches so far as position, impulse [N s] as velocity and peak force [N] as effort since the last."""
+    return JointState(
+        frame.stamp_ns, frame_id, PAIR_NAMES, frame.touches.astype(np.float64), frame.impulse, frame.peak
+    )
+
+
+def head_state(frame: Frame, frame_id: str, child_frame_id: str) -> Odometry:
     """Return the head's pose in the slide's frame and its twist in the head's own axes, as Odometry asks."""
-    x, y, theta = (float(value) for value in advance.q)
-    vx, vy, omega = (float(value) for value in advance.v)
+    x, y, theta = (float(value) for value in frame.q)
+    vx, vy, omega = (float(value) for value in frame.v)
     cos, sin = math.cos(theta), math.sin(theta)
     return Odometry(
-        stamp_ns,
+        frame.stamp_ns,
         frame_id,
         child_frame_id,
         position=(x, y, 0.0),
@@ -33,36 +58,3 @@ def head_state(stamp_ns: int, frame_id: str, child_frame_id: str, advance: Advan
         linear=(cos * vx + sin * vy, cos * vy - sin * vx, 0.0),
         angular=(0.0, 0.0, omega),
     )
-
-
-class PeakWindow:
-    """What happened between two messages on `contact_peaks`, whatever the number of advances between them."""
-
-    def __init__(self) -> None:
-        self._impacts = np.zeros(PAIR_COUNT)
-        self._clear()
-
-    def _clear(self) -> None:
-        self._impulse = np.zeros(PAIR_COUNT)
-        self._peak = np.zeros(PAIR_COUNT)
-
-    def add(self, advance: Advance) -> None:
-        """Take in one advance."""
-        self._impacts += advance.makes
-        self._impulse += advance.impulse
-        np.maximum(self._peak, advance.peak, out=self._peak)
-
-    def take(self, stamp_ns: int, frame_id: str) -> JointState:
-        """Return the message and start the next window.
-
-        Position is the count of impacts since the start, velocity the impulse [N s] and effort the largest force [N]
-        since the last message.
-        """
-        message = JointState(stamp_ns, frame_id, PAIR_NAMES, self._impacts.copy(), self._impulse, self._peak)
-        self._clear()
-        return message
-
-    def restart(self, impacts: Float64s | None = None) -> None:
-        """Begin anew, with the counters at `impacts`, shape (8,), or at zero."""
-        self._impacts = np.zeros(PAIR_COUNT) if impacts is None else np.array(impacts, dtype=np.float64)
-        self._clear()

@@ -1,0 +1,137 @@
+"""What stands at the head of a recording: all that replay needs besides the journal."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Final
+
+from plow_twin.errors import RecordingError
+from plow_twin.stream.journal import ParameterValue
+
+#: Name of the MCAP metadata record that holds the header.
+HEADER_RECORD: Final = "plow_twin"
+#: Name of the MCAP metadata record, written at close, that holds the loss counters.
+LOSS_RECORD: Final = "plow_twin_loss"
+#: Version of the layout that `docs/recording.md` describes.
+LAYOUT_VERSION: Final = 1
+
+#: Folders and files whose code decides the bits of a run.
+_NUMERIC_SOURCES: Final = ("model", "solve", "twin.py", "stream/session.py", "stream/outputs.py", "record/outputs.py")
+
+
+@cache
+def build_fingerprint() -> Mapping[str, str]:
+    """Return what the exact bits of a run depend on: versions, processor, platform, a hash of the numeric sources."""
+    import llvmlite.binding  # type: ignore[import-untyped]
+    import numba
+
+    return {
+        "plow_twin": package_version(),
+        "source": _source_hash(),
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
+        "llvmlite": version("llvmlite"),
+        "jit": "off" if getattr(numba.config, "DISABLE_JIT", 0) else "on",
+        "cpu": llvmlite.binding.get_host_cpu_name(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "libc": " ".join(platform.libc_ver()),
+    }
+
+
+def package_version() -> str:
+    """Return the version of the installed package."""
+    for name in ("plow_twin", "plow-twin"):
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            continue
+    return "not installed"
+
+
+def _source_hash() -> str:
+    root = Path(__file__).resolve().parent.parent
+    digest = hashlib.sha256()
+    for name in _NUMERIC_SOURCES:
+        part = root / name
+        for path in sorted(part.glob("*.py")) if part.is_dir() else [part]:
+            if path.exists():
+                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class RunHeader:
+    """Scene and settings of a run.
+
+    `scene_yaml` is self-contained. `topics` maps the outputs' base names to the names they were sent under. `clock`
+    says what the receive times are: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
+    """
+
+    scene_yaml: str
+    tol: float = 1e-9
+    excitation_source: str = "excitation"
+    node: str = "/plow_twin"
+    topics: Mapping[str, str] = field(default_factory=dict)
+    frame_id: str = "slide_frame"
+    child_frame_id: str = "head_frame"
+    clock: str = "system"
+    origin_ns: int | None = None
+    parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
+    build: Mapping[str, str] = field(default_factory=build_fingerprint)
+    package_version: str = field(default_factory=package_version)
+
+    @property
+    def samples_topic(self) -> str:
+        """Topic of the journal's samples."""
+        return f"{self.node}/journal/samples"
+
+    @property
+    def entries_topic(self) -> str:
+        """Topic of all other journal entries."""
+        return f"{self.node}/journal/entries"
+
+    def topic(self, base_name: str) -> str:
+        """Return the name that an output was sent under."""
+        return self.topics.get(base_name, f"{self.node.rpartition('/')[0]}/{base_name}")
+
+    def to_record(self) -> dict[str, str]:
+        """Return the MCAP metadata record: texts stay as they are, all else is JSON."""
+        record = {"layout_version": str(LAYOUT_VERSION)}
+        for spec in fields(self):
+            value = getattr(self, spec.name)
+            text = value if isinstance(value, str) else json.dumps(dict(value) if isinstance(value, Mapping) else value)
+            record[spec.name] = text
+        return record
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, str], source: str) -> RunHeader:
+        """Read the MCAP metadata record; unknown keys are passed over.
+
+        Raises
+        ------
+        RecordingError
+            A key is missing or does not hold what it should; the message names `source`.
+        """
+        layout = record.get("layout_version", "")
+        if layout != str(LAYOUT_VERSION):
+            raise RecordingError(f"{source}: layout_version: got {layout!r}, expected {str(LAYOUT_VERSION)!r}")
+        values: dict[str, Any] = {}
+        for spec in fields(cls):
+            text = record.get(spec.name)
+            if text is None:
+                raise RecordingError(f"{source}: metadata {HEADER_RECORD!r}: {spec.name} is missing")
+            try:
+                values[spec.name] = text if spec.type == "str" else json.loads(text)
+            except json.JSONDecodeError as error:
+                raise RecordingError(f"{source}: {spec.name}: got {text!r}, expected JSON ({error})") from error
+        if not isinstance(values["tol"], float) or not 0.0 < values["tol"] < 1.0:
+            raise RecordingError(f"{source}: tol: got {record['tol']}, expected a number between 0 and 1")
+        return cls(**values)

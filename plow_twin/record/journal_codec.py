@@ -1,0 +1,99 @@
+"""Journal entries as ROS messages: samples as wrenches, all others as one line of JSON each, exact to the bit."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.messages import Message, Text, WrenchStamped
+from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset, Sample, Snapshot, Travel
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """The recorder's own note: `count` messages on `topic` before this place did not reach the file."""
+
+    topic: str
+    count: int
+
+
+_KINDS: Final[dict[str, type[Any]]] = {
+    "hold": Hold,
+    "travel": Travel,
+    "reset": Reset,
+    "parameter": Parameter,
+    "snapshot": Snapshot,
+    "digest": Digest,
+    "loss": Loss,
+    "dropped": Dropped,
+}
+_NAMES: Final = {kind: name for name, kind in _KINDS.items()}
+
+
+def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
+    """Return the message that stands for an entry."""
+    if isinstance(entry, Sample):
+        fx, fy, m = entry.wrench
+        return WrenchStamped(entry.stamp_ns, frame_id, (fx, fy, 0.0), (0.0, 0.0, m))
+    values = {spec.name: getattr(entry, spec.name) for spec in fields(entry)}
+    if isinstance(entry, Snapshot):
+        values["data"] = base64.b64encode(entry.data).decode()
+    return Text(json.dumps({"kind": _NAMES[type(entry)], **values}, allow_nan=False))
+
+
+def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
+    """Return the entry that a message stands for.
+
+    Raises
+    ------
+    RecordingError
+        The message is no entry; `source` names it in the error.
+    """
+    if isinstance(message, WrenchStamped):
+        wrench = (message.force[0], message.force[1], message.torque[2])
+        if not all(map(math.isfinite, wrench)):
+            raise RecordingError(f"{source}: sample at {message.stamp_ns}: got {wrench}, expected finite numbers")
+        return Sample(message.stamp_ns, wrench)
+    if not isinstance(message, Text):
+        raise RecordingError(f"{source}: got a {message.TYPE}, expected a sample or a line of JSON")
+    return _from_json(message.data, source)
+
+
+def _from_json(text: str, source: str) -> Entry | Dropped:
+    try:
+        values = json.loads(text)
+        kind = _KINDS[values.pop("kind")]
+        arguments = {spec.name: _READERS[str(spec.type)](values[spec.name]) for spec in fields(kind)}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise RecordingError(f"{source}: got {text[:120]!r}, expected an entry of the journal ({error!r})") from error
+    entry: Entry | Dropped = kind(**arguments)
+    return entry
+
+
+def _exactly(*kinds: type) -> Callable[[Any], Any]:
+    """Return a reader that takes only these types, so that 1, 1.0 and True stay apart."""
+
+    def read(value: Any) -> Any:
+        if type(value) not in kinds:
+            raise TypeError(f"{value!r} is not of type {' or '.join(kind.__name__ for kind in kinds)}")
+        return value
+
+    return read
+
+
+def _bytes(value: Any) -> bytes:
+    return base64.b64decode(value, validate=True)
+
+
+_READERS: Final[dict[str, Callable[[Any], Any]]] = {
+    "int": _exactly(int),
+    "float": _exactly(float, int),
+    "str": _exactly(str),
+    "bytes": _bytes,
+    "ParameterValue": _exactly(bool, int, float, str),
+}

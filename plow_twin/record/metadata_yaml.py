@@ -1,0 +1,105 @@
+"""The `metadata.yaml` that rosbag2 of Jazzy (version 9) keeps beside its files, and the QoS texts inside the file."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from plow_twin.record.cdr import type_hash
+from plow_twin.record.messages import DiagnosticStatus
+
+METADATA_VERSION: Final = 9
+_INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
+
+
+@dataclass
+class TopicCount:
+    """One topic of a recording and how many messages it has."""
+
+    topic: str
+    message_type: str
+    count: int = 0
+
+
+def qos_profile(message_type: str) -> dict[str, Any]:
+    """Return the QoS that the node offers: reliable, and latched for the status."""
+    latched = message_type == DiagnosticStatus.TYPE
+    return {
+        "history": "keep_last",
+        "depth": 1 if latched else 10,
+        "reliability": "reliable",
+        "durability": "transient_local" if latched else "volatile",
+        "deadline": dict(_INFINITE),
+        "lifespan": dict(_INFINITE),
+        "liveliness": "automatic",
+        "liveliness_lease_duration": dict(_INFINITE),
+        "avoid_ros_namespace_conventions": False,
+    }
+
+
+def qos_text(message_type: str) -> str:
+    """Return the QoS as the text that a channel of the file carries."""
+    return dump_yaml([qos_profile(message_type)]).strip()
+
+
+def dump_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
+    """Return YAML in block style."""
+    from ruamel.yaml import YAML
+
+    yaml = YAML()
+    yaml.default_flow_style = False
+    stream = io.StringIO()
+    yaml.dump(value, stream)
+    return stream.getvalue()
+
+
+def bag_metadata(
+    file_name: str, topics: Sequence[TopicCount], start_ns: int, end_ns: int, custom: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return the content of `metadata.yaml` for one file with receive times from `start_ns` to `end_ns`."""
+    count = sum(topic.count for topic in topics)
+
+    def span() -> dict[str, Any]:
+        return {
+            "duration": {"nanoseconds": max(0, end_ns - start_ns)},
+            "starting_time": {"nanoseconds_since_epoch": start_ns},
+            "message_count": count,
+        }
+
+    listed = [
+        {
+            "topic_metadata": {
+                "name": topic.topic,
+                "type": topic.message_type,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": [qos_profile(topic.message_type)],
+                "type_description_hash": type_hash(topic.message_type),
+            },
+            "message_count": topic.count,
+        }
+        for topic in topics
+    ]
+    return {
+        "rosbag2_bagfile_information": {
+            "version": METADATA_VERSION,
+            "storage_identifier": "mcap",
+            **span(),
+            "topics_with_message_count": listed,
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [file_name],
+            "files": [{"path": file_name, **span()}],
+            "custom_data": dict(custom) or None,
+            "ros_distro": "jazzy",
+        }
+    }
+
+
+def write_metadata(folder: Path, metadata: Mapping[str, Any]) -> None:
+    """Write `metadata.yaml` in one step, so that no reader meets half of it."""
+    partial = folder / "metadata.yaml.partial"
+    partial.write_text(dump_yaml(metadata), encoding="utf-8")
+    partial.replace(folder / "metadata.yaml")
