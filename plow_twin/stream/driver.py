@@ -115,6 +115,10 @@ class Driver:
         self._newest_ns = None
         self.state = State.WAITING
 
+    def resume(self, now_ns: int) -> None:
+        """Let silence count from now on: the time spent inactive is not caught up."""
+        self._received_ns = now_ns
+
     def close(self) -> None:
         """End the journal."""
         self.session.close()
@@ -138,14 +142,14 @@ class Driver:
         return advance
 
 
-def counters(driver: Driver, verdicts: tuple[Verdict, ...] = tuple(Verdict)) -> dict[str, int]:
+def counters(driver: Driver) -> dict[str, int]:
     """Return every counter of a driver under its published name."""
     intake = driver.intake
     return {
         "samples_in": intake.arrived,
         "samples_used": intake.used,
         "samples_missing": intake.missing,
-        **{f"dropped_{verdict.value}": intake.counts[verdict] for verdict in verdicts if not verdict.used},
+        **{f"dropped_{verdict.value}": intake.counts[verdict] for verdict in Verdict if not verdict.used},
         "jumps_back": intake.counts[Verdict.JUMP_BACK],
         "jumps_forward": intake.counts[Verdict.JUMP_FORWARD],
         "out_of_plane": intake.out_of_plane,

@@ -5,6 +5,7 @@ A frame is a function of the journal alone, so that a replay forms the same fram
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -58,6 +59,15 @@ class Frame:
     q: Array
     v: Array
     slow: Slow | None
+
+    @property
+    def finite(self) -> bool:
+        """Whether every number is finite."""
+        total = self.q.sum() + self.v.sum() + self.penetration.sum() + self.rate.sum() + self.force.sum()
+        total += self.impulse.sum() + self.peak.sum()
+        if self.slow is not None:
+            total += self.slow.clearance.sum() + self.slow.wear_rate.sum()
+        return math.isfinite(total)
 
 
 def clearances(scene: Scene, depth: Array) -> Array:

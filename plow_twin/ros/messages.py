@@ -1,0 +1,115 @@
+"""Between ROS messages and plain numbers. Messages to send are made once and written over."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike, NDArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+
+from plow_twin.model.loads import load_direction
+from plow_twin.model.scene import Constant, Harmonic, Scene
+from plow_twin.stream.intake import NS_PER_S
+from plow_twin.stream.outputs import Frame
+
+Wrench = tuple[float, float, float]
+
+_QUANTITIES: Final = ("position", "velocity", "effort")
+
+
+def stamp_ns(header: Header) -> int:
+    """Return the stamp of a header [ns]."""
+    return int(header.stamp.sec * NS_PER_S + header.stamp.nanosec)
+
+
+def set_stamp(header: Header, stamp: int) -> None:
+    """Write a stamp [ns] into a header."""
+    header.stamp.sec, header.stamp.nanosec = divmod(stamp, NS_PER_S)
+
+
+def planar_wrench(message: WrenchStamped) -> tuple[Wrench, bool]:
+    """Return Fx, Fy [N] and M [N m], and whether a component outside the plane is not zero."""
+    force, torque = message.wrench.force, message.wrench.torque
+    out_of_plane = force.z != 0.0 or torque.x != 0.0 or torque.y != 0.0
+    return (force.x, force.y, torque.z), out_of_plane
+
+
+class ToolForces:
+    """The wrench of measured forces along the directions of the scene's loads.
+
+    1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; a pure moment counts
+    in N m. A table has no direction of its own and cannot be measured in this way.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._directions: Mapping[str, NDArray[np.float64]] = {
+            load.name: load_direction(load)
+            for load in scene.loads
+            if isinstance(load, Harmonic | Constant) and np.any(load_direction(load))
+        }
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The loads that each message must name."""
+        return tuple(self._directions)
+
+    def wrench(self, message: JointState) -> Wrench | None:
+        """Return the total wrench, or None when the message does not give each measurable load exactly once."""
+        if len(message.effort) != len(message.name) or sorted(message.name) != sorted(self._directions):
+            return None
+        total = np.zeros(3)
+        for name, effort in zip(message.name, message.effort, strict=True):
+            total += effort * self._directions[name]
+        return (float(total[0]), float(total[1]), float(total[2]))
+
+
+class JointStateWriter:
+    """One `JointState` of named numbers that is written over for each message."""
+
+    def __init__(self, frame_id: str, names: tuple[str, ...], quantities: tuple[str, ...] = _QUANTITIES) -> None:
+        self.message = JointState(name=list(names))
+        self.message.header.frame_id = frame_id
+        self._views = []
+        for quantity in quantities:
+            numbers = array("d", bytes(8 * len(names)))
+            setattr(self.message, quantity, numbers)
+            # the view writes into the message's own array
+            self._views.append(np.frombuffer(numbers))
+
+    def write(self, stamp: int, *values: ArrayLike) -> JointState:
+        """Return the message with the values of its quantities, in order of `quantities`."""
+        set_stamp(self.message.header, stamp)
+        for view, value in zip(self._views, values, strict=True):
+            view[:] = value
+        return self.message
+
+
+class OdometryWriter:
+    """One `Odometry` that is written over: pose in the slide's frame, twist in the head's own axes.
+
+    The covariances stay zero: unknown.
+    """
+
+    def __init__(self, frame_id: str, child_frame_id: str) -> None:
+        self.message = Odometry(child_frame_id=child_frame_id)
+        self.message.header.frame_id = frame_id
+
+    def write(self, frame: Frame) -> Odometry:
+        """Return the message of one frame."""
+        set_stamp(self.message.header, frame.stamp_ns)
+        x, y, theta = frame.q.tolist()
+        vx, vy, omega = frame.v.tolist()
+        cos, sin = math.cos(theta), math.sin(theta)
+        pose, twist = self.message.pose.pose, self.message.twist.twist
+        pose.position.x, pose.position.y = x, y
+        pose.orientation.z, pose.orientation.w = math.sin(0.5 * theta), math.cos(0.5 * theta)
+        twist.linear.x, twist.linear.y = cos * vx + sin * vy, cos * vy - sin * vx
+        twist.angular.z = omega
+        return self.message

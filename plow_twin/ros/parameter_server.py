@@ -1,0 +1,102 @@
+"""The table of parameters on a ROS node: declared with descriptors, checked, kept up to date."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import Field, replace
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from plow_twin.ros import parameters
+from plow_twin.ros.parameters import SPECS, Effect, Settings
+
+
+def descriptor(spec: Field[Any]) -> ParameterDescriptor:
+    """Return the ROS descriptor of one parameter: meaning, unit, range, when it takes effect."""
+    unit = f" [{spec.metadata['unit']}]" if "unit" in spec.metadata else ""
+    message = ParameterDescriptor(
+        name=spec.name,
+        description=f"{spec.metadata['doc']}{unit}; takes effect {spec.metadata['effect'].value}",
+        additional_constraints=parameters.expected(spec),
+        read_only=spec.metadata["effect"] is Effect.START,
+    )
+    if isinstance(spec.default, float):
+        low, high = spec.metadata["low"], spec.metadata["high"]
+        message.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    elif "unit" in spec.metadata:
+        low, high = spec.metadata["low"], spec.metadata["high"]
+        message.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
+    return message
+
+
+class ParameterServer:
+    """Declare all parameters on a node and hold their current values in `settings`.
+
+    The node must have been made with `automatically_declare_parameters_from_overrides=True`: what the user gave is then
+    seen before any type check, so that an integer can be taken for a double and all bad values be named together.
+
+    Parameters
+    ----------
+    node
+        The node.
+    unconfigured
+        Tells whether parameters that take effect on configure can be changed now.
+    changed
+        Called with name and value of each parameter that has changed at run time and takes effect at once.
+
+    Raises
+    ------
+    ParameterError
+        Some of the values given at start cannot be used; the message lists them all.
+    """
+
+    def __init__(self, node: Node, unconfigured: Callable[[], bool], changed: Callable[[str, Any], None]) -> None:
+        self._node = node
+        self._unconfigured = unconfigured
+        self._changed = changed
+        given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
+        self.unknown = parameters.unknown(given)
+        for name, nearest in self.unknown.items():
+            hint = f"; did you mean {nearest}?" if nearest else ""
+            node.get_logger().warning(f"unknown parameter {name}: {given[name]!r} is not used{hint}")
+        self.settings: Settings = parameters.settings(given)
+        for name, spec in SPECS.items():
+            if node.has_parameter(name):
+                node.undeclare_parameter(name)
+            node.declare_parameter(name, getattr(self.settings, name), descriptor(spec), ignore_override=True)
+        node.add_pre_set_parameters_callback(self._before)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._after)
+
+    def _before(self, asked: list[Parameter]) -> list[Parameter]:
+        """Take integers for doubles, and name all bad values in one message: rclpy's own checks stop at the first."""
+        found = parameters.problems({parameter.name: parameter.value for parameter in asked})
+        if found:
+            self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))
+        return [
+            Parameter(parameter.name, value=parameters.coerce(parameter.name, parameter.value))
+            if parameter.name in SPECS and parameter.type_ is Parameter.Type.INTEGER
+            else parameter
+            for parameter in asked
+        ]
+
+    def _check(self, asked: list[Parameter]) -> SetParametersResult:
+        values = {parameter.name: parameter.value for parameter in asked}
+        reasons = [str(problem) for problem in parameters.problems(values)]
+        if not self._unconfigured():
+            reasons += [
+                f"{name}: takes effect {Effect.CONFIGURE.value}"
+                for name in values
+                if name in SPECS and SPECS[name].metadata["effect"] is Effect.CONFIGURE
+            ]
+        return SetParametersResult(successful=not reasons, reason="; ".join(reasons))
+
+    def _after(self, changed: list[Parameter]) -> None:
+        values = {parameter.name: parameter.value for parameter in changed if parameter.name in SPECS}
+        self.settings = replace(self.settings, **values)
+        for name, value in values.items():
+            if SPECS[name].metadata["effect"] is Effect.NOW:
+                self._changed(name, value)

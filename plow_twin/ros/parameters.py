@@ -1,0 +1,204 @@
+"""The node's parameters: one table, from which come defaults, checks, ROS descriptors, config/twin.yaml and the docs.
+
+`python -m plow_twin.ros.parameters yaml` prints config/twin.yaml, `... markdown` the table of docs/node.md.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import Field, dataclass, field, fields
+from enum import Enum
+from typing import Any, Final
+
+from plow_twin.errors import PlowTwinError, Problem
+
+
+class Effect(Enum):
+    """When a changed value takes effect; the value says so in words."""
+
+    START = "at start (read only)"
+    CONFIGURE = "on configure; can be changed while unconfigured"
+    NOW = "at once"
+
+
+class ParameterError(PlowTwinError, ValueError):
+    """Parameters cannot be used; the message lists every problem found."""
+
+    def __init__(self, problems: Iterable[Problem], source: str = "parameters") -> None:
+        self.problems = tuple(problems)
+        lines = "\n".join(f"  {problem}" for problem in self.problems)
+        super().__init__(f"{source}: {len(self.problems)} problem(s)\n{lines}")
+
+
+def _number(default: float, unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
+    return field(default=default, metadata={"unit": unit, "low": low, "high": high, "effect": effect, "doc": doc})
+
+
+def _choice(default: str, choices: tuple[str, ...], effect: Effect, doc: str) -> Any:
+    return field(default=default, metadata={"choices": choices, "effect": effect, "doc": doc})
+
+
+def _plain(default: bool | str, effect: Effect, doc: str) -> Any:
+    return field(default=default, metadata={"effect": effect, "doc": doc})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All parameters with their defaults; numbers in SI units."""
+
+    autostart: bool = _plain(True, Effect.START, "configure and activate at start; false: wait for lifecycle requests")
+    hardware_id: str = _plain("plough_head", Effect.START, "serial of the head, in status and diagnostics")
+    scene: str = _plain("paper", Effect.CONFIGURE, "scene file, or the name of a preset: paper, bench_kv, bench_hc")
+    tolerance: float = _number(1e-9, "1", 1e-13, 1e-3, Effect.CONFIGURE, "relative tolerance of the solver")
+    excitation_source: str = _choice(
+        "excitation",
+        ("excitation", "tool_forces", "scene"),
+        Effect.CONFIGURE,
+        "topic that drives the model, or the scene's own loads by the node's clock; samples on the other topic are "
+        "counted and ignored",
+    )
+    input_depth: int = _number(1000, "messages", 200, 100000, Effect.CONFIGURE, "queue depth of the excitation topics")
+    expected_rate: float = _number(
+        0.0,
+        "Hz",
+        0.0,
+        1e5,
+        Effect.CONFIGURE,
+        "rate of the samples, to count missing ones by gaps in their stamps; 0: off",
+    )
+    publish_mode: str = _choice(
+        "on_sample",
+        ("on_sample", "fixed_rate"),
+        Effect.CONFIGURE,
+        "publish after each sample used, or at publish_rate; in both the stamp is that of the newest sample used",
+    )
+    publish_rate: float = _number(100.0, "Hz", 0.1, 1000.0, Effect.CONFIGURE, "rate of publish_mode fixed_rate")
+    step_rate: float = _number(
+        100.0, "Hz", 1.0, 1000.0, Effect.CONFIGURE, "rate of advances under the scene's own loads and the hold policy"
+    )
+    frame_id: str = _plain("slide_frame", Effect.CONFIGURE, "frame of all outputs: centre of the slide, x right, y up")
+    child_frame_id: str = _plain("head_frame", Effect.CONFIGURE, "frame of the head in head_state")
+    record_path: str = _plain("", Effect.CONFIGURE, "folder to make for the recording of the run; empty: none")
+    excitation_timeout: float = _number(
+        0.5,
+        "s",
+        0.01,
+        3600.0,
+        Effect.NOW,
+        "silence after which the excitation counts as stale; unused under use_sim_time",
+    )
+    hold_policy: str = _choice(
+        "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last one held, or zero"
+    )
+    jump_back: float = _number(
+        1.0, "s", 0.0, 3600.0, Effect.NOW, "a stamp older than the newest by more than this resets the model"
+    )
+    jump_forward: float = _number(
+        10.0, "s", 0.1, 3600.0, Effect.NOW, "a stamp ahead of the model's time by more than this resets the model"
+    )
+    failure_limit: int = _number(
+        10, "advances", 0, 1000000, Effect.NOW, "failed advances in a row after which the model is reset; 0: never"
+    )
+
+
+SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
+#: Declared by rclpy itself.
+_FOREIGN: Final = ("use_sim_time", "start_type_description_service")
+
+
+def coerce(name: str, value: Any) -> Any:
+    """Return the value in the parameter's own type where that loses nothing: an integer for a double."""
+    if isinstance(SPECS[name].default, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    return value
+
+
+def expected(spec: Field[Any]) -> str:
+    """Say in words what a parameter must be."""
+    if "choices" in spec.metadata:
+        return f"one of {', '.join(spec.metadata['choices'])}"
+    if "unit" in spec.metadata:
+        kind = "an integer" if isinstance(spec.default, int) else "a number"
+        return f"{kind} from {spec.metadata['low']:g} to {spec.metadata['high']:g} [{spec.metadata['unit']}]"
+    return "true or false" if isinstance(spec.default, bool) else "a text"
+
+
+def problems(values: Mapping[str, Any]) -> list[Problem]:
+    """Return every problem of the given values; names that are not in the table are passed over."""
+    found = []
+    for name, value in values.items():
+        spec = SPECS.get(name)
+        if spec is not None and not _admissible(spec, coerce(name, value)):
+            found.append(Problem(name, value, expected(spec)))
+    return found
+
+
+def settings(values: Mapping[str, Any]) -> Settings:
+    """Return the settings with the given values in place of defaults.
+
+    Raises
+    ------
+    ParameterError
+        Some values cannot be used; the message lists them all.
+    """
+    found = problems(values)
+    if found:
+        raise ParameterError(found)
+    return Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
+
+
+def unknown(names: Iterable[str]) -> dict[str, str]:
+    """Return the names that no parameter bears, each with the nearest one that exists, or an empty text."""
+    return {
+        name: next(iter(difflib.get_close_matches(name, SPECS, 1)), "")
+        for name in names
+        if name not in SPECS and name not in _FOREIGN and not name.startswith("qos_overrides.")
+    }
+
+
+def _admissible(spec: Field[Any], value: Any) -> bool:
+    if type(value) is not type(spec.default):
+        return False
+    if "choices" in spec.metadata:
+        return value in spec.metadata["choices"]
+    if "unit" in spec.metadata:
+        return math.isfinite(value) and spec.metadata["low"] <= value <= spec.metadata["high"]
+    return True
+
+
+def _yaml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        # YAML 1.1 reads 1e-09 as a text: the mantissa needs a point
+        return f"{value!r}" if "e" not in repr(value) else f"{value:.1e}"
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def yaml_text() -> str:
+    """Return the parameter file with all defaults, each one explained."""
+    lines = ["# Parameters of the node plow_twin, all at their defaults.", "/**:", "  ros__parameters:"]
+    for spec in SPECS.values():
+        doc, effect = spec.metadata["doc"], spec.metadata["effect"].value
+        lines += [
+            f"    # {doc}",
+            f"    # {expected(spec)}; takes effect {effect}",
+            f"    {spec.name}: {_yaml_value(spec.default)}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def markdown_table() -> str:
+    """Return the table of all parameters for the documentation."""
+    rows = ["| parameter | default | must be | takes effect | meaning |", "|---|---|---|---|---|"]
+    for spec in SPECS.values():
+        default, effect = _yaml_value(spec.default), spec.metadata["effect"].value
+        rows.append(f"| `{spec.name}` | `{default}` | {expected(spec)} | {effect} | {spec.metadata['doc']} |")
+    return "\n".join(rows) + "\n"
+
+
+if __name__ == "__main__":
+    sys.stdout.write({"yaml": yaml_text, "markdown": markdown_table}[sys.argv[1]]())

@@ -1,0 +1,60 @@
+"""The outputs of a frame as ROS messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from nav_msgs.msg import Odometry
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.ros.messages import JointStateWriter, OdometryWriter
+from plow_twin.ros.qos import OUTPUT
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, Frame
+
+#: Output topics that follow from the motion, with their types.
+TOPICS: Final[dict[str, type]] = {
+    "contact_forces": JointState,
+    "contact_peaks": JointState,
+    "head_state": Odometry,
+    "clearance": JointState,
+    "wear_rate": JointState,
+}
+
+
+class FramePublishers:
+    """Publishers of all outputs of a frame; their messages are written over."""
+
+    def __init__(self, node: Node, frame_id: str, child_frame_id: str) -> None:
+        self._node = node
+        self._publishers = {topic: node.create_publisher(kind, topic, OUTPUT) for topic, kind in TOPICS.items()}
+        #: resolved names by base names
+        self.topics = {topic: str(publisher.topic_name) for topic, publisher in self._publishers.items()}
+        self._forces = JointStateWriter(frame_id, PAIR_NAMES)
+        self._peaks = JointStateWriter(frame_id, PAIR_NAMES)
+        self._head = OdometryWriter(frame_id, child_frame_id)
+        self._clearance = JointStateWriter(frame_id, CLEARANCE_NAMES, ("position",))
+        self._wear_rate = JointStateWriter(frame_id, PAD_NAMES, ("velocity",))
+        self.published = 0
+
+    def publish(self, frame: Frame, forces_sent: Callable[[], None]) -> None:
+        """Publish a frame, the forces first; `forces_sent` is called right after them."""
+        stamp = frame.stamp_ns
+        self._send("contact_forces", self._forces.write(stamp, frame.penetration, frame.rate, frame.force))
+        forces_sent()
+        self._send("contact_peaks", self._peaks.write(stamp, frame.touches, frame.impulse, frame.peak))
+        self._send("head_state", self._head.write(frame))
+        if frame.slow is not None:
+            self._send("clearance", self._clearance.write(stamp, frame.slow.clearance))
+            self._send("wear_rate", self._wear_rate.write(stamp, frame.slow.wear_rate))
+        self.published += 1
+
+    def close(self) -> None:
+        """Take the publishers off the node."""
+        for publisher in self._publishers.values():
+            self._node.destroy_publisher(publisher)
+
+    def _send(self, topic: str, message: Any) -> None:
+        self._publishers[topic].publish(message)

@@ -1,0 +1,88 @@
+"""Between the node and the recorder; imported only when a run is recorded."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+
+from plow_twin.model.scene import Scene
+from plow_twin.record.header import RunHeader
+from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.outputs import frame_messages
+from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
+from plow_twin.ros.parameters import Settings
+from plow_twin.scene_file import dump_scene
+from plow_twin.stream.journal import Entry
+from plow_twin.stream.outputs import Frame
+from plow_twin.stream.session import Session
+
+
+class Recording:
+    """The recording of one configured node.
+
+    Parameters
+    ----------
+    settings, scene
+        What the node was configured with.
+    node_name
+        Fully qualified name of the node.
+    topics
+        Resolved names of the outputs by their base names.
+    clock
+        Returns the node's ROS time [ns] when the node runs under `/clock`; None: the system's time.
+    on_error
+        Called, from the recorder's thread, with the reason when recording stops early.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        scene: Scene,
+        node_name: str,
+        topics: Mapping[str, str],
+        clock: Callable[[], int] | None,
+        on_error: Callable[[str], None],
+    ) -> None:
+        self._frames = (settings.frame_id, settings.child_frame_id)
+        self._topics = topics
+        header = RunHeader(
+            scene_yaml=dump_scene(scene),
+            tol=settings.tolerance,
+            excitation_source=settings.excitation_source,
+            node=node_name,
+            topics=dict(topics),
+            frame_id=settings.frame_id,
+            child_frame_id=settings.child_frame_id,
+            clock="system" if clock is None else "ros",
+            parameters=asdict(settings),
+        )
+        self._recorder = Recorder(Path(settings.record_path), header, now_ns=clock or time.time_ns, on_error=on_error)
+
+    @property
+    def counters(self) -> RecorderCounters:
+        """Counters as of now."""
+        return self._recorder.counters
+
+    def journal(self, entry: Entry) -> None:
+        """Take a journal entry; a loss is counted by the recorder."""
+        self._recorder.journal(entry)
+
+    def frame(self, frame: Frame) -> None:
+        """Take the messages of a frame that has been published."""
+        for topic, message in frame_messages(frame, *self._frames).items():
+            self._recorder.output(self._topics[topic], frame.stamp_ns, message)
+
+    def status(self, stamp_ns: int, status: DiagnosticStatus) -> None:
+        """Take a status that has been published."""
+        self._recorder.output(self._topics["status"], stamp_ns, status)
+
+    def renew(self, session: Session) -> None:
+        """Journal a snapshot when entries were lost and there is room again."""
+        if self._recorder.snapshot_wanted:
+            self._recorder.journal(session.snapshot())
+
+    def close(self) -> LossReport:
+        """Write what is queued and close the file."""
+        return self._recorder.close()
