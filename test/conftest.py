@@ -1,0 +1,82 @@
+"""Set-up of every test process: ROS kept to this machine, compiled kernels shared, skips accounted for."""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import os
+import shutil
+import tempfile
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+ROOT = Path(__file__).resolve().parent.parent
+SKIPS = ROOT / "test" / "skips.txt"
+
+
+def _prepare_environment() -> None:
+    """Set what child processes inherit; runs before rclpy or numba are imported anywhere."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    os.environ.pop("ROS_LOCALHOST_ONLY", None)
+    # 1..101 keeps clear of the ephemeral ports; two runs at once get two domains
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+    logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
+    atexit.register(shutil.rmtree, logs, ignore_errors=True)
+    os.environ["ROS_LOG_DIR"] = logs
+    # numba does not notice a change in a function that another file has inlined: one cache for each state of the sources
+    folder = Path(tempfile.gettempdir()) / f"plow_twin-numba-{os.getuid()}" / _source_hash()
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
+
+
+def _source_hash() -> str:
+    digest = hashlib.sha256()
+    for path in sorted((ROOT / "plow_twin").rglob("*.py")):
+        text = path.read_bytes()
+        if b"numba" in text:
+            digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + text)
+    return digest.hexdigest()[:16]
+
+
+_prepare_environment()
+settings.register_profile("plow_twin", deadline=None, derandomize=True, database=None)
+settings.load_profile("plow_twin")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--check-skips", action="store_true", help="fail when a test is skipped that test/skips.txt does not list"
+    )
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    for nodeid, reason in _skipped(terminalreporter):
+        terminalreporter.write_line(f"skipped: {nodeid} | {reason}")
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if not session.config.getoption("--check-skips"):
+        return
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    allowed = _allowed_skips()
+    unknown = [
+        (nodeid, reason)
+        for nodeid, reason in _skipped(reporter)
+        if not any(fnmatchcase(nodeid, glob) for glob in allowed)
+    ]
+    for nodeid, reason in unknown:
+        reporter.write_line(f"not in test/skips.txt: {nodeid} | {reason}", red=True)
+    if unknown and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def _skipped(reporter: pytest.TerminalReporter) -> list[tuple[str, str]]:
+    reports = reporter.stats.get("skipped", [])
+    return [(report.nodeid, report.longrepr[2] if isinstance(report.longrepr, tuple) else "") for report in reports]
+
+
+def _allowed_skips() -> list[str]:
+    lines = (line.partition("#")[0].strip() for line in SKIPS.read_text(encoding="utf-8").splitlines())
+    return [line.partition("|")[0].strip() for line in lines if line]
