@@ -5,16 +5,24 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from plow_twin.solve.layout import AT_HARD_END, LENGTH, STEPS, T0, USED, Status
+from plow_twin.solve.layout import AT_HARD_END, EVENT_PAIR, LENGTH, PIECE, SIGMA, STEPS, T0, USED, Status
 from plow_twin.solve.step import account, begin, evaluate, finish, pair_outputs, pose_of, sigma_at, within_range
 
-_OK, _STALLED = int(Status.OK), int(Status.STALLED)
-_RANGE, _NON_FINITE = int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
+_OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _next(p, state, w, hard_time, harmonics, second, segments, law, wear, offset, free, budget) -> int:  # type: ignore[no-untyped-def]
+def _lay_out(p, parts, state, w, hard_time) -> bool:  # type: ignore[no-untyped-def]
+    law = parts.law
+    return begin(
+        p, state, w, hard_time, parts.harmonics, parts.second, parts.segments,
+        law.viscous, law.factor, law.integer, law.fraction, parts.wear, parts.offset, parts.free,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _next(p, parts, state, w, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
     """Lay out the next step unless one is under way."""
     if state.clock[LENGTH] >= 0.0:
         return _OK
@@ -22,44 +30,95 @@ def _next(p, state, w, hard_time, harmonics, second, segments, law, wear, offset
         return _BUDGET
     if not within_range(p, state):
         return _RANGE
-    if not begin(
-        p, state, w, hard_time, harmonics, second, segments, law.viscous, law.factor, law.integer, law.fraction, wear, offset, free
-    ):
-        return _NON_FINITE
-    return _OK
+    return _OK if _lay_out(p, parts, state, w, hard_time) else _NON_FINITE
 
 
 @numba.njit(cache=True, error_model="numpy")
-def advance(p, parts, state, w, totals, log, target, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
+def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
     """Bring the motion to `target`; steps may reach beyond it, up to `hard_time`. Returns a `Status`."""
-    harmonics, segments, law = parts.harmonics, parts.segments, parts.law
     while True:
         t0 = state.clock[T0]
         if t0 >= target and state.clock[LENGTH] < 0.0:
             return _OK
-        if log is not None and log.length[0] >= log.time.size:
-            return _LOG_FULL
-        code = _next(p, state, w, hard_time, harmonics, parts.second, segments, law, parts.wear, parts.offset, parts.free, budget)
+        code = _next(p, parts, state, w, hard_time, budget)
         if code != _OK:
+            # the last good state is held; time goes on without it
+            state.clock[T0], state.clock[LENGTH] = target, -1.0
             return code
         low = sigma_at(state, state.clock[USED])
-        end = t0 + state.clock[LENGTH]
-        if target < end or (target == end and state.step[AT_HARD_END] == 0):
+        if target < t0 + state.clock[LENGTH]:
             account(state, w, low, sigma_at(state, target - t0), totals)
             state.clock[USED] = target - t0
             return _OK
         account(state, w, low, sigma_at(state, state.clock[LENGTH]), totals)
-        finish(p, state, w, totals, log, parts.wear, law.fraction)
+        finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def read(p, parts, state, w, q, v, penetration, rate, force) -> None:  # type: ignore[no-untyped-def]
-    """Write pose, rate and the pairs' outputs at the present time; a step must be under way."""
-    sigma = sigma_at(state, state.clock[USED])
-    y = np.empty(8)
-    evaluate(state, w, sigma, y)
-    pose_of(y, parts.offset, q, v)
-    pair_outputs(p, state, w, sigma, penetration, rate, force)
+def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth) -> None:  # type: ignore[no-untyped-def]
+    """Write row i: the state at the present time and the totals, which are cleared."""
+    y = state.y
+    if state.clock[LENGTH] >= 0.0:
+        y = np.empty(8)
+        evaluate(state, w, sigma_at(state, state.clock[USED]), y)
+    pose_of(y, parts.offset, q[i], v[i])
+    pair_outputs(p, state, y, penetration[i], rate[i], force[i])
+    for pair in range(8):
+        peak[i, pair] = max(totals.peak[pair], force[i, pair])
+        impulse[i, pair], makes[i, pair] = totals.impulse[pair], totals.makes[pair]
+        depth[i, pair] = state.depth[pair]
+    totals.peak[:] = 0.0
+    totals.impulse[:] = 0.0
+    totals.makes[:] = 0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def advance_times(p, parts, state, w, totals, times, budget, q, v, penetration, rate, force, peak, impulse, makes, depth, steps, status) -> None:  # type: ignore[no-untyped-def]  # noqa: E501
+    """Advance to each time under the scene's own loads and write a row for each."""
+    for i in range(times.size):
+        before = state.count[STEPS]
+        status[i] = _advance(p, parts, state, w, totals, times[i], np.inf, before + budget)
+        steps[i] = state.count[STEPS] - before
+        _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def advance_samples(p, parts, state, w, totals, times, wrench, budget, q, v, penetration, rate, force, peak, impulse, makes, depth, steps, status) -> None:  # type: ignore[no-untyped-def]  # noqa: E501
+    """Advance to each time under a wrench that runs straight from wrench[i] to wrench[i + 1]; a sample ends a step."""
+    piece = parts.segments
+    state.step[PIECE] = 0
+    for i in range(times.size):
+        before = state.count[STEPS]
+        span = times[i] - state.clock[T0]
+        piece.knots[0] = state.clock[T0]
+        for j in range(3):
+            piece.start[0, j] = wrench[i, j]
+            piece.slope[0, j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 0.0 else 0.0
+        status[i] = _advance(p, parts, state, w, totals, times[i], times[i], before + budget)
+        steps[i] = state.count[STEPS] - before
+        _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def end_step(p, parts, state, w, totals) -> None:  # type: ignore[no-untyped-def]
+    """End the step under way at the present time: something changes from outside."""
+    clock = state.clock
+    if clock[LENGTH] < 0.0:
+        return
+    clock[SIGMA] = sigma_at(state, clock[USED])
+    clock[LENGTH] = clock[USED]
+    state.step[EVENT_PAIR] = -1
+    state.step[AT_HARD_END] = 0
+    finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def lay_out_again(p, parts, state, w, used) -> None:  # type: ignore[no-untyped-def]
+    """Compute the step under way once more after a restore: its series are not part of the state."""
+    count = state.count.copy()
+    _lay_out(p, parts, state, w, np.inf)
+    state.count[:] = count
+    state.clock[USED] = used
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -68,28 +127,31 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
 
     `penetration` and `force` may be None. The rows' times do not change the steps.
     """
-    harmonics, segments, law = parts.harmonics, parts.segments, parts.law
     rate, y = np.empty(8), np.empty(8)
     row = first[0]
     while True:
-        t0 = state.clock[T0]
-        if t0 >= t_end and row >= t.size:
-            return _OK
-        if log is not None and log.length[0] >= log.time.size:
+        if state.clock[T0] >= t_end:
+            break
+        if log.length[0] >= log.time.size:
             return _LOG_FULL
-        code = _next(p, state, w, t_end, harmonics, parts.second, segments, law, parts.wear, parts.offset, parts.free, budget)
+        code = _next(p, parts, state, w, t_end, budget)
         if code != _OK:
             return code
-        length = state.clock[LENGTH]
+        t0, length = state.clock[T0], state.clock[LENGTH]
         end = t0 + length
-        last = state.step[AT_HARD_END] == 1 and end >= t_end * (1.0 - 1e-15)
-        while row < t.size and (t[row] < end or last):
-            sigma = sigma_at(state, min(max(t[row] - t0, 0.0), length))
-            evaluate(state, w, sigma, y)
+        while row < t.size and t[row] < end:
+            evaluate(state, w, sigma_at(state, max(t[row] - t0, 0.0)), y)
             pose_of(y, parts.offset, q[row], v[row])
             if force is not None:
-                pair_outputs(p, state, w, sigma, penetration[row], rate, force[row])
+                pair_outputs(p, state, y, penetration[row], rate, force[row])
             row += 1
             first[0] = row
         account(state, w, 0.0, sigma_at(state, length), totals)
-        finish(p, state, w, totals, log, parts.wear, law.fraction)
+        finish(p, state, w, totals, log, parts.wear, parts.law.fraction)
+    while row < t.size:
+        pose_of(state.y, parts.offset, q[row], v[row])
+        if force is not None:
+            pair_outputs(p, state, state.y, penetration[row], rate, force[row])
+        row += 1
+    first[0] = row
+    return _OK

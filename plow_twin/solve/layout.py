@@ -76,6 +76,8 @@ class Params(NamedTuple):
     inverse_mass: float
     inverse_inertia: float
     stiffness: float
+    exponent: float
+    viscous: float  #: C in N s/m, 0 without
     damping_factor: float  #: D of lambda = D / v0, or a negative number when lambda is constant
     speed_floor: float  #: smallest v0
     gravity: float

@@ -11,7 +11,7 @@ import math
 import numba
 import numpy as np
 
-from plow_twin.model.contact import FASTMATH
+from plow_twin.model.contact import FASTMATH, normal_force
 from plow_twin.solve.layout import (
     ALPHA,
     AT_HARD_END,
@@ -43,7 +43,7 @@ from plow_twin.solve.layout import (
     VX,
     VY,
 )
-from plow_twin.solve.polynomial import columns_to_bernstein, first_root, horner, maximum, shift
+from plow_twin.solve.polynomial import columns_to_bernstein, first_root, maximum, shift
 from plow_twin.solve.series import expand, expand_harmonics
 
 #: Share of the tolerance that one step may spend.
@@ -268,7 +268,6 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     if pair >= 0 and step[STALL] > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.count[RECOVERIES] += 1
-        step[STALL] = 0
         end, pair = max(end, min(sigma, 1e-9)), -1
         limited = limited and end == sigma
     clock[SIGMA] = end
@@ -313,22 +312,16 @@ def pose_of(y, offset, q, v) -> None:  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
-def pair_outputs(p, state, w, sigma, penetration, rate, force) -> None:  # type: ignore[no-untyped-def]
-    """Write penetration, rate and force of the eight pairs at sigma, shape (8,) each."""
-    order = state.step[ORDER]
-    y = np.empty(8)
-    evaluate(state, w, sigma, y)
+def pair_outputs(p, state, y, penetration, rate, force) -> None:  # type: ignore[no-untyped-def]
+    """Write penetration, rate and force of the eight pairs in body coordinates y, shape (8,) each."""
     A = p.gap
     c, s, om = y[COS], y[SIN], y[OMEGA]
     for pair in range(8):
-        value = w.gap[order, pair]
-        for k in range(order - 1, -1, -1):
-            value = value * sigma + w.gap[k, pair]
-        penetration[pair] = value
-        rate[pair] = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
-        force[pair] = 0.0
+        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair] - state.depth[pair]
+        r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
+        penetration[pair], rate[pair], force[pair] = d, r, 0.0
         if state.mode[pair] == ON:
-            force[pair] = max(0.0, horner(w.force[pair], order - 1, sigma))
+            force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous)
 
 
 @numba.njit(cache=True, error_model="numpy")
