@@ -1,0 +1,273 @@
+"""Run a scene from its initial state and return everything about the motion as arrays."""
+
+from __future__ import annotations
+
+import time as _time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import SolverError
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.scene import Scene
+from plow_twin.solve import drive, fixed
+from plow_twin.solve.compiled import Compiled, compile_scene
+from plow_twin.solve.layout import COEFFICIENTS, EVENTS, STEPS, Log, State, Status, Totals, new_log, new_totals, new_work
+
+Method = Literal["events", "rk4", "euler"]
+Array = NDArray[np.float64]
+
+#: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
+EVENT_DTYPE: Final = np.dtype(
+    [("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")]
+)
+_FIRST_LOG = 4096
+_ROWS_BY_DEFAULT = 1000
+_BUDGET = 2**62
+
+
+@dataclass(frozen=True)
+class Result:
+    """A motion.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Times of the output rows in s.
+    q, v : ndarray, shape (n, 3)
+        Pose x, y [m], theta [rad] of the cavity's centre, and its rate.
+    force, penetration : ndarray, shape (n, 8)
+        Normal force [N] and signed penetration [m] of each pair.
+    events : ndarray of `EVENT_DTYPE`
+        Every change of contact in order of time.
+    statistics : mapping
+        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s], makes; over the whole
+        motion, not over the output rows.
+    contact_sets : mapping
+        `ccw` and `cw`: share of the contact time of that sense in which exactly these corners carry force. Corners by the
+        scene's labels, else by name.
+    solver : mapping
+        method, tol or dt, steps, evaluations (orders of series, or right-hand sides), events.
+    wear_depth : ndarray, shape (8,)
+        Wear depth of each pad at the end in m.
+    wall_s, compile_s : float
+        Time taken by the run, and by compiling before it, in s.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    force: Array
+    penetration: Array
+    events: NDArray[np.void]
+    statistics: Mapping[str, Mapping[str, float]]
+    contact_sets: Mapping[str, Mapping[str, float]]
+    solver: Mapping[str, Any]
+    wear_depth: Array
+    wall_s: float
+    compile_s: float
+
+
+def simulate(
+    scene: Scene,
+    t_end: float,
+    output_dt: float | None = None,
+    tol: float = 1e-9,
+    method: Method = "events",
+    dt: float | None = None,
+) -> Result:
+    """Simulate a scene from t = 0 to `t_end`.
+
+    Parameters
+    ----------
+    scene : Scene
+    t_end : float
+        End in s, not negative.
+    output_dt : float, optional
+        Distance of the output rows in s; a thousandth of the motion by default. The rows do not change the motion, but for
+        the fixed-step methods `output_dt` is a whole multiple of `dt`.
+    tol : float
+        Tolerance of the pose relative to the clearance (`method="events"`).
+    method : {"events", "rk4", "euler"}
+        Event-located Taylor series, or a fixed step without event location.
+    dt : float, optional
+        The fixed step in s.
+
+    Raises
+    ------
+    ValueError
+        For an argument that cannot be used.
+    SolverError
+        When the motion could not be continued; says when and why.
+    """
+    _check(t_end, output_dt, method, dt)
+    compiled = compile_scene(scene, tol)
+    if output_dt is None:
+        output_dt = t_end / _ROWS_BY_DEFAULT if dt is None else dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
+    times = _grid(t_end, output_dt) if t_end > 0.0 else np.zeros(1)
+    begin = _time.perf_counter()
+    run = _run_events if method == "events" else _run_fixed
+    run(compiled, np.zeros(1), 0.0, method, dt)
+    compile_s = _time.perf_counter() - begin
+    begin = _time.perf_counter()
+    motion = run(compiled, times, t_end, method, dt)
+    wall_s = _time.perf_counter() - begin
+    return _result(scene, times, t_end, tol, method, dt, motion, wall_s, compile_s)
+
+
+@dataclass
+class _Motion:
+    """Arrays that a run fills."""
+
+    state: State
+    totals: Totals
+    log: Log
+    q: Array
+    v: Array
+    penetration: Array
+    force: Array
+
+
+def _check(t_end: float, output_dt: float | None, method: str, dt: float | None) -> None:
+    if not (np.isfinite(t_end) and t_end >= 0.0):
+        raise ValueError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
+    if output_dt is not None and not (np.isfinite(output_dt) and output_dt > 0.0):
+        raise ValueError(f"output_dt: got {output_dt!r}, expected a finite time > 0 [s]")
+    if method not in get_args(Method):
+        raise ValueError(f"method: got {method!r}, expected one of {', '.join(get_args(Method))}")
+    if method == "events":
+        if dt is not None:
+            raise ValueError(f"dt: got {dt!r}, expected None with method='events'")
+        return
+    if dt is None or not (np.isfinite(dt) and dt > 0.0):
+        raise ValueError(f"dt: got {dt!r}, expected a finite time > 0 [s] with method={method!r}")
+    if output_dt is not None and abs(output_dt / dt - round(output_dt / dt)) > 1e-6 * output_dt / dt:
+        raise ValueError(f"output_dt: got {output_dt!r}, expected a whole multiple of dt = {dt!r} [s]")
+
+
+def _grid(t_end: float, output_dt: float) -> Array:
+    """Return 0, output_dt, .. and t_end."""
+    count = int(np.floor(t_end / output_dt * (1.0 + 1e-12)))
+    times = np.arange(count + 1) * output_dt
+    times = np.minimum(times, t_end)
+    return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
+
+
+def _new_motion(compiled: Compiled, rows: int) -> _Motion:
+    three, eight = (rows, 3), (rows, PAIR_COUNT)
+    return _Motion(
+        compiled.initial_state(), new_totals(), new_log(_FIRST_LOG),
+        np.zeros(three), np.zeros(three), np.zeros(eight), np.zeros(eight),
+    )  # fmt: skip
+
+
+def _run_events(compiled: Compiled, times: Array, t_end: float, method: str, dt: float | None) -> _Motion:
+    del method, dt
+    motion = _new_motion(compiled, len(times))
+    work, first = new_work(), np.zeros(1, np.int64)
+    while True:
+        code = drive.record(
+            compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, _BUDGET, first,
+            times, motion.q, motion.v, motion.penetration, motion.force,
+        )  # fmt: skip
+        if code != Status.LOG_FULL:
+            break
+        motion.log = _grown(motion.log)
+    _raise_for(code, motion.state)
+    return motion
+
+
+def _run_fixed(compiled: Compiled, times: Array, t_end: float, method: str, dt: float | None) -> _Motion:
+    assert dt is not None
+    stride = round(float(times[1]) / dt) if len(times) > 1 else 1
+    steps = (len(times) - 1) * stride
+    motion = _new_motion(compiled, len(times))
+    done = np.zeros(1, np.int64)
+    while True:
+        code = fixed.march(
+            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, method == "euler",
+            stride, motion.q, motion.v, motion.penetration, motion.force,
+        )  # fmt: skip
+        if code != Status.LOG_FULL:
+            break
+        motion.log = _grown(motion.log)
+    _raise_for(code, motion.state, float(done[0]) * dt)
+    return motion
+
+
+def _grown(log: Log) -> Log:
+    larger = new_log(2 * log.time.size)
+    for new, old in zip(larger[:-1], log[:-1], strict=True):
+        new[: old.size] = old
+    larger.length[0] = log.length[0]
+    return larger
+
+
+def _raise_for(code: int, state: State, time: float | None = None) -> None:
+    status = Status(code)
+    if status is not Status.OK:
+        raise SolverError(f"at t = {state.clock[0] if time is None else time:.9g} s: {status.text}")
+
+
+def _result(
+    scene: Scene,
+    times: Array,
+    t_end: float,
+    tol: float,
+    method: str,
+    dt: float | None,
+    motion: _Motion,
+    wall_s: float,
+    compile_s: float,
+) -> Result:
+    log, count = motion.log, motion.state.count
+    size = int(log.length[0])
+    events = np.zeros(size, EVENT_DTYPE)
+    for name in EVENT_DTYPE.names or ():
+        events[name] = getattr(log, name)[:size]
+    setting = {"tol": tol} if method == "events" else {"dt": dt}
+    solver = {
+        "method": method, **setting, "steps": int(count[STEPS]), "evaluations": int(count[COEFFICIENTS]),
+        "events": int(count[EVENTS]) if method != "events" else size,
+    }  # fmt: skip
+    return Result(
+        t=times, q=motion.q, v=motion.v, force=motion.force, penetration=motion.penetration, events=events,
+        statistics=statistics_of(motion.totals, t_end), contact_sets=contact_sets_of(scene, motion.totals), solver=solver,
+        wear_depth=motion.state.depth.copy(), wall_s=wall_s, compile_s=compile_s,
+    )  # fmt: skip
+
+
+def statistics_of(totals: Totals, duration: float) -> dict[str, dict[str, float]]:
+    """Return the statistics of each pair over the motion (see `Result`)."""
+    table = {}
+    for pair, name in enumerate(PAIR_NAMES):
+        impulse, contact = float(totals.impulse[pair]), float(totals.time_in_contact[pair])
+        table[name] = {
+            "max": float(totals.peak[pair]),
+            "mean_in_contact": impulse / contact if contact > 0.0 else 0.0,
+            "mean_over_time": impulse / duration if duration > 0.0 else 0.0,
+            "impulse": impulse,
+            "time_in_contact": contact,
+            "makes": int(totals.makes[pair]),
+        }
+    return table
+
+
+def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]:
+    """Return the shares of the sets of corners that carry force together, for each sense, largest first."""
+    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
+    labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
+    joint = "" if letters else "+"
+    senses = {}
+    for sense, times in zip(("ccw", "cw"), totals.set_time, strict=True):
+        total = times.sum()
+        shares = {
+            joint.join(sorted(labels[i] for i in range(4) if mask >> i & 1)): float(times[mask] / total)
+            for mask in range(1, 16)
+            if times[mask] > 0.0
+        }
+        senses[sense] = dict(sorted(shares.items(), key=lambda item: -item[1]))
+    return senses

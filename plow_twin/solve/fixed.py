@@ -1,0 +1,183 @@
+"""Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
+
+They evaluate the equations of motion (paper, eq. 5) as they stand, in world axes about the centre of mass, independently
+of the series: a check on them as much as a method.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from plow_twin.model.contact import normal_force
+from plow_twin.solve.layout import COEFFICIENTS, COS, EVENTS, OFF, OMEGA, ON, SIN, STEPS, THETA, VX, VY, Status
+from plow_twin.solve.step import pair_outputs, pose_of, touch, within_range
+
+_OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
+_LOG_FULL = int(Status.LOG_FULL)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _load(p, harmonics, second, segments, t, out) -> None:  # type: ignore[no-untyped-def]
+    """Write force per mass and moment per inertia at t, world axes."""
+    out[:] = p.constant
+    if harmonics is not None:
+        _add_harmonics(p, harmonics, second, t, out)
+    if segments is not None:
+        piece = max(np.searchsorted(segments.knots, t, side="right") - 1, 0)
+        ahead = max(t - segments.knots[piece], 0.0)
+        for j in range(3):
+            out[j] += segments.start[piece, j] + segments.slope[piece, j] * ahead
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_harmonics(p, harmonics, second, t, out) -> None:  # type: ignore[no-untyped-def]
+    for i in range(harmonics.omega.size):
+        sine, cosine = math.sin(harmonics.omega[i] * t), math.cos(harmonics.omega[i] * t)
+        s1 = harmonics.first[i, 0] * sine + harmonics.first[i, 1] * cosine
+        out[0] += p.direction[0, 0] * s1
+        out[1] += p.direction[0, 1] * s1
+        out[2] += harmonics.moment[i, 0] * sine + harmonics.moment[i, 1] * cosine
+        if second is not None:
+            s2 = second[i, 0] * sine + second[i, 1] * cosine
+            out[0] += p.direction[1, 0] * s2
+            out[1] += p.direction[1, 1] * s2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:  # type: ignore[no-untyped-def]
+    """Write the rate of z = (x, y, theta, vx, vy, omega) of the centre of mass, world axes."""
+    _load(p, parts.harmonics, parts.second, parts.segments, t, load)
+    A, B = p.gap, p.arm
+    c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
+    x, y, vx, vy = c * z[0] + s * z[1], c * z[1] - s * z[0], c * z[3] + s * z[4], c * z[4] - s * z[3]
+    fx = fy = torque = 0.0
+    for pair in range(8):
+        if p.enabled[pair] == 0:
+            continue
+        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * x + A[3, pair] * y + A[4, pair] - state.depth[pair]
+        if d > 0.0:
+            r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (vx + om * y) + A[3, pair] * (vy - om * x)
+            f = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous)
+            fx -= A[2, pair] * f
+            fy -= A[3, pair] * f
+            torque += (B[0, pair] * c + B[1, pair] * s + B[2, pair] * x + B[3, pair] * y) * f
+    moment = load[2] + torque * p.inverse_inertia
+    if offset is not None:
+        force_x, force_y = load[0], load[1] + p.gravity
+        across = (c * offset[0] - s * offset[1]) * force_y - (s * offset[0] + c * offset[1]) * force_x
+        moment -= across * p.inverse_inertia / p.inverse_mass
+    out[0], out[1], out[2] = z[3], z[4], z[5]
+    out[3] = load[0] + (c * fx - s * fy) * p.inverse_mass
+    out[4] = load[1] + (s * fx + c * fy) * p.inverse_mass
+    out[5] = moment
+    if free is not None:
+        for j in range(3):
+            out[3 + j] *= free[j]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _to_body(z, y) -> None:  # type: ignore[no-untyped-def]
+    """Write body coordinates from z."""
+    c, s = math.cos(z[2]), math.sin(z[2])
+    y[0], y[1] = c * z[0] + s * z[1], c * z[1] - s * z[0]
+    y[VX], y[VY], y[OMEGA] = c * z[3] + s * z[4], c * z[4] - s * z[3], z[5]
+    y[COS], y[SIN], y[THETA] = c, s, z[2]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _switch(p, state, penetration, rate, time, totals, log) -> None:  # type: ignore[no-untyped-def]
+    """Note which pairs touch or part, at the step's resolution."""
+    for pair in range(8):
+        inside = p.enabled[pair] == 1 and penetration[pair] > 0.0
+        mode = ON if inside else OFF
+        if mode == state.mode[pair]:
+            continue
+        if mode == ON:
+            touch(p, state, pair)
+            totals.makes[pair] += 1
+        i = log.length[0]
+        log.time[i], log.pair[i], log.rate[i] = time, pair, rate[pair]
+        log.mode_from[i], log.mode_to[i] = state.mode[pair], mode
+        log.length[0] = i + 1
+        state.mode[pair] = mode
+        state.count[EVENTS] += 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _account(state, force_before, force, dt, totals) -> None:  # type: ignore[no-untyped-def]
+    """Add one step to the totals by the trapezoidal rule."""
+    sets = np.zeros(2, np.int64)
+    for pair in range(8):
+        totals.peak[pair] = max(totals.peak[pair], force[pair])
+        totals.impulse[pair] += 0.5 * dt * (force_before[pair] + force[pair])
+        if force[pair] > 0.0:
+            totals.time_in_contact[pair] += dt
+            corner = pair // 2
+            sets[(pair + corner) % 2] |= 1 << corner
+    for sense in range(2):
+        if sets[sense] != 0:
+            totals.set_time[sense, sets[sense]] += dt
+
+
+@numba.njit(cache=True, error_model="numpy")
+def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force) -> int:  # type: ignore[no-untyped-def]  # noqa: E501
+    """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
+    z, trial = np.empty(6), np.empty(6)
+    k = np.empty((4, 6))
+    load, y = np.empty(3), state.y
+    pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
+    c, s = y[COS], y[SIN]
+    z[0], z[1], z[2] = c * y[0] - s * y[1], s * y[0] + c * y[1], y[THETA]
+    z[3], z[4], z[5] = c * y[VX] - s * y[VY], s * y[VX] + c * y[VY], y[OMEGA]
+    pair_outputs(p, state, y, pen, rate, now)
+    while True:
+        n = done[0]
+        if n % stride == 0:
+            row = n // stride
+            pose_of(y, parts.offset, q[row], v[row])
+            if force is not None:
+                pair_outputs(p, state, y, penetration[row], rate, force[row])
+        if n >= steps:
+            return _OK
+        if log.length[0] + 8 > log.time.size:
+            return _LOG_FULL
+        if not within_range(p, state):
+            return _RANGE
+        t = n * dt
+        if euler:
+            _accelerations(p, parts, parts.offset, parts.free, state, t, z, load, k[0])
+            for j in range(3):
+                z[3 + j] += dt * k[0, 3 + j]
+                z[j] += dt * z[3 + j]
+            state.count[COEFFICIENTS] += 1
+        else:
+            _accelerations(p, parts, parts.offset, parts.free, state, t, z, load, k[0])
+            for stage in range(1, 4):
+                part = dt if stage == 3 else 0.5 * dt
+                for j in range(6):
+                    trial[j] = z[j] + part * k[stage - 1, j]
+                _accelerations(p, parts, parts.offset, parts.free, state, t + part, trial, load, k[stage])
+            for j in range(6):
+                z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
+            state.count[COEFFICIENTS] += 4
+        if not np.isfinite(z).all():
+            return _NON_FINITE
+        state.count[STEPS] += 1
+        _to_body(z, y)
+        _wear(parts.wear, state, now, dt)
+        before[:] = now
+        pair_outputs(p, state, y, pen, rate, now)
+        _switch(p, state, pen, rate, t + dt, totals, log)
+        pair_outputs(p, state, y, pen, rate, now)
+        _account(state, before, now, dt, totals)
+        done[0] = n + 1
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _wear(rate, state, force, dt) -> None:  # type: ignore[no-untyped-def]
+    if rate is not None:
+        for pair in range(8):
+            state.depth[pair] += rate[pair] * force[pair] * dt
