@@ -26,7 +26,7 @@ def _prepare_environment() -> None:
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
-    # numba does not notice a change in a function that another file has inlined: one cache for each state of the sources
+    # numba misses a change in a function that another file inlines: one cache for each state of the sources
     folder = Path(tempfile.gettempdir()) / f"plow_twin-numba-{os.getuid()}" / _source_hash()
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
 
@@ -61,11 +61,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         return
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
     allowed = _allowed_skips()
-    unknown = [
-        (nodeid, reason)
-        for nodeid, reason in _skipped(reporter)
-        if not any(fnmatchcase(nodeid, glob) for glob in allowed)
-    ]
+    skipped = _skipped(reporter)
+    unknown = [entry for entry in skipped if not any(fnmatchcase(entry[0], glob) for glob in allowed)]
     for nodeid, reason in unknown:
         reporter.write_line(f"not in test/skips.txt: {nodeid} | {reason}", red=True)
     if unknown and session.exitstatus == pytest.ExitCode.OK:

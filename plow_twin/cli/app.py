@@ -1,0 +1,92 @@
+"""The command group: how verbs are run and how errors become exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Final, NoReturn
+
+import click
+
+from plow_twin.cli.console import FAILED, WRONG_INPUT
+from plow_twin.cli.demo import demo
+from plow_twin.cli.info import info
+from plow_twin.cli.replay import replay
+from plow_twin.cli.simulate import simulate
+from plow_twin.cli.view import view
+from plow_twin.errors import PlowTwinError, SceneError
+from plow_twin.record.header import package_version
+
+#: Extra of the package that brings a module.
+EXTRA_OF_MODULE: Final = {
+    "rclpy": "ros",
+    "rcl_interfaces": "ros",
+    "builtin_interfaces": "ros",
+    "diagnostic_msgs": "ros",
+    "geometry_msgs": "ros",
+    "lifecycle_msgs": "ros",
+    "nav_msgs": "ros",
+    "rosgraph_msgs": "ros",
+    "sensor_msgs": "ros",
+    "std_msgs": "ros",
+    "std_srvs": "ros",
+    "mcap": "record",
+    "rosbags": "record",
+    "rerun": "view",
+}
+
+
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
+)
+@click.version_option(package_version(), "-V", "--version", prog_name="plow-twin")
+def commands() -> None:
+    """Digital twin of a coal plough head: contact-impact motion in its guide."""
+
+
+for _verb in (simulate, demo, replay, view, info):
+    commands.add_command(_verb)
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and leave with its exit code."""
+    code = run(arguments)
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # the reader has gone: nothing is left to say, and Python must not complain at exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)
+
+
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code; errors are one message on standard error."""
+    try:
+        code = commands.main(args=arguments, prog_name="plow-twin", standalone_mode=False)
+        return code if isinstance(code, int) else 0
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        return _fail("interrupted")
+    except SceneError as error:
+        return _fail(str(error), WRONG_INPUT)
+    except PlowTwinError as error:
+        return _fail(str(error))
+    except BrokenPipeError:
+        return FAILED
+    except OSError as error:
+        return _fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        if module not in EXTRA_OF_MODULE:
+            raise
+        extra = EXTRA_OF_MODULE[module]
+        return _fail(f"this verb needs {module}, which is not installed: pip install 'plow_twin[{extra}]'")
+
+
+def _fail(message: str, code: int = FAILED) -> int:
+    click.echo(f"plow-twin: {message}", err=True)
+    return code

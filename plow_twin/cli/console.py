@@ -1,0 +1,95 @@
+"""What the verbs share: exit codes, consoles, progress, checked numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Final
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+DONE: Final = 0
+FAILED: Final = 1
+WRONG_INPUT: Final = 2
+DONE_WITH_LOSS: Final = 3
+
+#: Called with the share of the work that is done, 0..1.
+OnProgress = Callable[[float], None]
+
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and no tables; files and errors only.")
+json_option = click.option("--json", "as_json", is_flag=True, help="The result as JSON on standard output.")
+
+
+class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on
+    """A finite number above zero."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number, or fail with the value got and the value expected."""
+        try:
+            number = float(value)
+        except ValueError:
+            number = math.nan
+        if not (math.isfinite(number) and number > 0.0):
+            self.fail(f"got {value!r}, expected a finite number > 0", param, ctx)
+        return number
+
+
+POSITIVE: Final = PositiveNumber()
+
+
+def output_console() -> Console:
+    """Return the console for results."""
+    return Console()
+
+
+def error_console() -> Console:
+    """Return the console for progress, which never mixes with results."""
+    return Console(stderr=True)
+
+
+@contextmanager
+def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
+    """Show a progress bar on standard error while the work reports the share done."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=error_console(), transient=True, disable=quiet) as bar:
+        task = bar.add_task(title, total=1.0)
+
+        def on_progress(share: float) -> None:
+            bar.update(task, completed=share)
+
+        yield on_progress
+
+
+@contextmanager
+def busy(title: str, quiet: bool) -> Iterator[None]:
+    """Show on standard error that work without known length goes on."""
+    if quiet:
+        yield
+        return
+    with error_console().status(title):
+        yield
+
+
+def table(title: str, *columns: str) -> Table:
+    """Return a table whose first column is text and whose others are numbers."""
+    result = Table(title=title, title_justify="left")
+    for index, name in enumerate(columns):
+        result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
+    return result
+
+
+def kilonewton(force_n: float) -> str:
+    """Return a force in N as text in kN."""
+    return f"{force_n / 1e3:.2f}"

@@ -1,0 +1,33 @@
+"""`plow-twin demo`: the main job, live."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from plow_twin.cli.console import POSITIVE, quiet_option
+
+
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with counted loss.")
+@click.option(
+    "--speed",
+    type=click.Choice(["real", "fast"]),
+    default="real",
+    show_default=True,
+    help="real: by the clock of the machine; fast: under /clock, as fast as the machine goes.",
+)
+@click.option("--seconds", type=POSITIVE, default=20.0, show_default=True, help="Machine time to run [s].")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("out/demo"),
+    show_default=True,
+    help="Folder of the recording and the view.",
+)
+@quiet_option
+def demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
+    """Run the twin on the paper's load: publisher, node and recorder in processes of their own."""
+    from plow_twin.ros.demo import run_demo
+
+    return run_demo(speed, seconds, out, quiet)

@@ -1,0 +1,49 @@
+"""Facts of a recording: what it holds, how it ended, what was lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from plow_twin.record.journal_codec import Dropped
+from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.stream.journal import Loss
+
+
+def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
+    """Return the facts of a recording, read from front to back, and whether anything of it was lost.
+
+    Raises
+    ------
+    RecordingError
+        When the file is no recording.
+    """
+    reader = RunReader(path)
+    first = last = None
+    lost: dict[str, int] = {}
+    for record in reader:
+        first = record.log_time_ns if first is None else first
+        last = record.log_time_ns
+        if isinstance(record, EntryRecord) and isinstance(record.entry, Loss | Dropped):
+            where = record.entry.topic if isinstance(record.entry, Dropped) else "journal"
+            lost[where] = lost.get(where, 0) + record.entry.count
+    # the recorder's closing count is the complete one; without it the notes in place are all there is
+    lost = {topic: count for topic, count in (reader.lost or lost).items() if count}
+    header = reader.header
+    facts: dict[str, Any] = {
+        "file": str(reader.path),
+        "status": reader.status.value,
+        "duration_s": 0.0 if first is None or last is None else (last - first) * 1e-9,
+        "messages": dict(sorted(reader.counts.items())),
+        "lost": lost,
+        "damaged_chunks": reader.damaged_chunks,
+        "package_version": header.package_version,
+        "node": header.node,
+        "excitation_source": header.excitation_source,
+        "tol": header.tol,
+        "clock": header.clock,
+        "origin_ns": header.origin_ns,
+        "build": dict(header.build),
+        "parameters": dict(header.parameters),
+    }
+    return facts, bool(lost) or reader.status is not FileStatus.COMPLETE

@@ -1,0 +1,62 @@
+"""`plow-twin replay`: run a recording again and compare."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import json_option, output_console, progress, quiet_option
+
+if TYPE_CHECKING:
+    from plow_twin.record.replay import ReplayReport
+
+
+@click.command(
+    epilog="Exit codes: 0 the same, bit for bit; 1 diverged or failed; 2 wrong usage; 3 the same, with counted loss."
+)
+@click.argument("recording", type=click.Path(path_type=Path, exists=True))
+@json_option
+@quiet_option
+def replay(recording: Path, as_json: bool, quiet: bool) -> int:
+    """Run the model again on the journal of RECORDING and compare with what was recorded; needs no ROS."""
+    from plow_twin.record.replay import replay as run
+
+    with progress("replaying", quiet) as on_progress:
+        report = run(recording, on_progress)
+    facts = _facts(report)
+    if as_json:
+        click.echo(json.dumps(facts, indent=2, allow_nan=False))
+    elif not quiet:
+        console = output_console()
+        for key, value in facts.items():
+            console.print(f"{key:24} {value}", highlight=False, soft_wrap=True)
+    if report.first_divergence is not None:
+        click.echo(f"plow-twin: diverged: {report.first_divergence}", err=True)
+    return report.exit_code
+
+
+def _facts(report: ReplayReport) -> dict[str, Any]:
+    diverged = report.first_divergence
+    return {
+        "file": str(report.path),
+        "result": "diverged" if diverged else "the same as far as the file goes" if report.loss else "the same",
+        "file_status": report.status.value,
+        "entries": report.entries,
+        "samples": report.samples,
+        "steps": report.steps,
+        "refused": report.refused,
+        "digests_compared": report.digests_compared,
+        "snapshots_compared": report.snapshots_compared,
+        "messages_compared": dict(report.compared),
+        "messages_not_compared": dict(report.not_compared),
+        "divergences": report.divergences,
+        "first_divergence": None if diverged is None else vars(diverged),
+        "lost": report.lost,
+        "damaged_chunks": report.damaged_chunks,
+        "build_differences": {key: list(pair) for key, pair in report.build_differences.items()},
+        "span_s": report.span_s,
+        "wall_s": report.wall_s,
+    }

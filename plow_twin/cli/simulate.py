@@ -1,0 +1,152 @@
+"""`plow-twin simulate`: one scene, offline."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import DONE, POSITIVE, busy, json_option, kilonewton, output_console, quiet_option, table
+from plow_twin.presets import scene_path
+
+if TYPE_CHECKING:
+    from plow_twin.simulate import Result
+
+
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene.")
+@click.argument("scene")
+@click.option("--t-end", metavar="T", type=POSITIVE, required=True, help="Time to simulate [s].")
+@click.option(
+    "--output-dt", type=POSITIVE, help="Distance of the output rows [s]; a thousandth of the motion by default."
+)
+@click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")
+@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), help="Output rows to this .csv or .npz file.")
+@json_option
+@click.option(
+    "--method",
+    type=click.Choice(["events", "rk4", "euler"]),
+    default="events",
+    show_default=True,
+    help="events: every touch located; rk4, euler: fixed steps for comparison.",
+)
+@click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
+@quiet_option
+def simulate(
+    scene: str,
+    t_end: float,
+    output_dt: float | None,
+    tol: float,
+    out: Path | None,
+    as_json: bool,
+    method: str,
+    dt: float | None,
+    quiet: bool,
+) -> int:
+    """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc."""
+    _check_usage(out, method, dt)
+    result = _run(scene, quiet, t_end, output_dt, tol, method, dt)
+    if out is not None:
+        write_samples(result, out)
+    if as_json:
+        click.echo(json.dumps(as_plain(result, scene, t_end), indent=2, allow_nan=False))
+    elif not quiet:
+        _print_statistics(result, scene, t_end)
+    return DONE
+
+
+def _run(scene: str, quiet: bool, t_end: float, *settings: Any) -> Result:
+    from plow_twin.errors import SceneError
+    from plow_twin.scene_file import load_scene
+    from plow_twin.simulate import simulate as run
+
+    model = load_scene(scene_path(scene))
+    try:
+        with busy(f"simulating {t_end:g} s (the first run compiles)", quiet):
+            return run(model, t_end, *settings)
+    except SceneError:
+        raise
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+
+
+def _check_usage(out: Path | None, method: str, dt: float | None) -> None:
+    if out is not None and out.suffix not in (".csv", ".npz"):
+        raise click.BadParameter(f"got {out.name!r}, expected a name that ends in .csv or .npz", param_hint="--out")
+    if out is not None and not out.parent.is_dir():
+        raise click.BadParameter(f"got {str(out)!r}, expected an existing folder before the name", param_hint="--out")
+    if method == "events" and dt is not None:
+        raise click.BadParameter("got a step with method events, expected rk4 or euler", param_hint="--dt")
+    if method != "events" and dt is None:
+        raise click.BadParameter(f"got nothing, expected the step of {method} [s]", param_hint="--dt")
+
+
+def write_samples(result: Result, path: Path) -> None:
+    """Write the samples as .csv (numbers with 17 digits, exact) or .npz (with all contact events)."""
+    import numpy as np
+
+    from plow_twin.model.pairs import PAIR_NAMES
+
+    if path.suffix == ".csv":
+        names = ["t", "x", "y", "theta", "vx", "vy", "omega", *(f"force_{name}" for name in PAIR_NAMES)]
+        rows = np.column_stack([result.t, result.q, result.v, result.force])
+        np.savetxt(path, rows, fmt="%.17g", delimiter=",", header=",".join(names), comments="")
+        return
+    events = result.events
+    np.savez(
+        path,
+        t=result.t,
+        q=result.q,
+        v=result.v,
+        force=result.force,
+        penetration=result.penetration,
+        event_time=events["time"],
+        event_pair=events["pair"],
+        event_from=events["mode_from"],
+        event_to=events["mode_to"],
+        event_rate=events["rate"],
+    )
+
+
+def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
+    """Return the result without its samples as plain numbers, texts and mappings, for JSON."""
+    return {
+        "scene": scene,
+        "t_end": t_end,
+        "pairs": _plain(result.statistics),
+        "contact_sets": _plain(result.contact_sets),
+        "solver": _plain(result.solver),
+        "wall_s": float(result.wall_s),
+        "compile_s": float(result.compile_s),
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return value.item() if hasattr(value, "item") else value
+
+
+def _print_statistics(result: Result, scene: str, t_end: float) -> None:
+    console = output_console()
+    columns = ("max kN", "mean in contact kN", "mean kN", "impulse kN s", "contact s", "makes")
+    forces = table(f"{scene}, {t_end:g} s", "pair", *columns)
+    for name, row in result.statistics.items():
+        forces.add_row(
+            name,
+            kilonewton(row["max"]),
+            kilonewton(row["mean_in_contact"]),
+            kilonewton(row["mean_over_time"]),
+            kilonewton(row["impulse"]),
+            f"{row['time_in_contact']:.3f}",
+            f"{row['makes']}",
+        )
+    console.print(forces)
+    sets = table("contact sets, share of contact time", "corners in contact", "counter-clockwise", "clockwise")
+    ccw, cw = result.contact_sets["ccw"], result.contact_sets["cw"]
+    for name in sorted({*ccw, *cw}, key=lambda name: (len(name), name)):
+        sets.add_row(name, f"{ccw.get(name, 0.0):.1%}", f"{cw.get(name, 0.0):.1%}")
+    console.print(sets)
+    solver = ", ".join(f"{key} {value}" for key, value in result.solver.items())
+    console.print(f"{solver}; {result.wall_s * 1e3:.1f} ms, compiled in {result.compile_s:.1f} s", highlight=False)
