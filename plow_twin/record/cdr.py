@@ -34,15 +34,25 @@ def typestore() -> Typestore:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
+@cache
 def schema_text(message_type: str) -> str:
     """Return the `ros2msg` schema of a message type, with those that it uses."""
     text, _ = typestore().generate_msgdef(message_type, ros_version=2)
     return text
 
 
+@cache
 def type_hash(message_type: str) -> str:
     """Return the REP-2016 hash of a message type."""
     return typestore().hash_rihs01(message_type)
+
+
+def warm_up() -> None:
+    """Do the work of first use (0.1 s) before time matters: schemas, hashes, and the code that encodes."""
+    for message_type in MESSAGE_TYPES:
+        schema_text(message_type)
+        type_hash(message_type)
+        typestore().get_msgdef(message_type)
 
 
 def encode(message: Message) -> bytes:

@@ -11,7 +11,7 @@ from typing import Final
 from mcap.writer import Writer
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.cdr import encode, schema_text, type_hash
+from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, RunHeader
 from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.messages import Message
@@ -44,6 +44,7 @@ class RunWriter:
         self._topics: dict[str, tuple[int, TopicCount]] = {}
         self._schemas: dict[str, int] = {}
         self._start_ns, self._end_ns = -1, -1
+        warm_up()
         _make_folder(folder)
         self._file = _UnbufferedFile(self.path)
         # the library's stream is an IO[bytes] by annotation, but only write, tell and flush are used
