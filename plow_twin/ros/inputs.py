@@ -105,7 +105,8 @@ class Inputs:
     def _incompatible(self, topic: str, event: Any) -> None:
         self.refused_publishers += event.total_count_change
         self._node.get_logger().warning(
-            f"{topic}: a publisher offers incompatible quality of service ({event.last_policy_kind}); nothing is received from it"
+            f"{topic}: nothing is received from a publisher of incompatible quality of service "
+            f"({event.last_policy_kind})"
         )
 
     def _excitation(self, message: WrenchStamped) -> None:

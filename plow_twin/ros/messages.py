@@ -44,8 +44,8 @@ def planar_wrench(message: WrenchStamped) -> tuple[Wrench, bool]:
 class ToolForces:
     """The wrench of measured forces along the directions of the scene's loads.
 
-    1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; a pure moment counts
-    in N m. A table has no direction of its own and cannot be measured in this way.
+    1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; a pure moment
+    counts in N m. A table has no direction of its own and cannot be measured in this way.
     """
 
     def __init__(self, scene: Scene) -> None:

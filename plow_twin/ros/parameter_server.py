@@ -57,7 +57,8 @@ class ParameterServer:
         self._node = node
         self._unconfigured = unconfigured
         self._changed = changed
-        given = {name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}
+        found: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
+        given = {name: parameter.value for name, parameter in found.items()}
         self.unknown = parameters.unknown(given)
         for name, nearest in self.unknown.items():
             hint = f"; did you mean {nearest}?" if nearest else ""

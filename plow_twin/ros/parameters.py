@@ -160,12 +160,14 @@ def unknown(names: Iterable[str]) -> dict[str, str]:
 
 
 def _admissible(spec: Field[Any], value: Any) -> bool:
-    if type(value) is not type(spec.default):
+    default: Any = spec.default
+    if type(value) is not type(default):
         return False
     if "choices" in spec.metadata:
         return value in spec.metadata["choices"]
     if "unit" in spec.metadata:
-        return math.isfinite(value) and spec.metadata["low"] <= value <= spec.metadata["high"]
+        low, high = spec.metadata["low"], spec.metadata["high"]
+        return bool(math.isfinite(value) and low <= value <= high)
     return True
 
 

@@ -1,4 +1,4 @@
-"""Quality of service of each kind of topic; depth and reliability of the inputs can be overridden by `qos_overrides`."""
+"""Quality of service of each kind of topic; `qos_overrides` parameters override that of the inputs."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import frame_messages
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
+from plow_twin.ros.diagnostics import Part
 from plow_twin.ros.parameters import Settings
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
@@ -61,6 +62,11 @@ class Recording:
         self._recorder = Recorder(Path(settings.record_path), header, now_ns=clock or time.time_ns, on_error=on_error)
 
     @property
+    def path(self) -> Path:
+        """The file being written."""
+        return self._recorder.path
+
+    @property
     def counters(self) -> RecorderCounters:
         """Counters as of now."""
         return self._recorder.counters
@@ -74,8 +80,10 @@ class Recording:
         for topic, message in frame_messages(frame, *self._frames).items():
             self._recorder.output(self._topics[topic], frame.stamp_ns, message)
 
-    def status(self, stamp_ns: int, status: DiagnosticStatus) -> None:
+    def status(self, stamp_ns: int, name: str, hardware_id: str, report: Part) -> None:
         """Take a status that has been published."""
+        level, message, values = report
+        status = DiagnosticStatus(level[0], name, message, hardware_id, tuple(values.items()))
         self._recorder.output(self._topics["status"], stamp_ns, status)
 
     def renew(self, session: Session) -> None:

@@ -1,0 +1,222 @@
+"""Health in words: the latched `status` and the parts of `/diagnostics`, from the counters of a running node."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
+
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+
+from plow_twin.stream.driver import State, counters
+
+if TYPE_CHECKING:
+    from plow_twin.ros.runtime import Runtime
+
+OK, WARN, ERROR, STALE = (
+    DiagnosticStatus.OK,
+    DiagnosticStatus.WARN,
+    DiagnosticStatus.ERROR,
+    DiagnosticStatus.STALE,
+)
+
+#: Level, message and values of one part.
+Part = tuple[bytes, str, dict[str, str]]
+
+#: Parts of /diagnostics with their keys and what each means.
+KEYS: Final[dict[str, dict[str, str]]] = {
+    "state": {
+        "lifecycle": "unconfigured, inactive, active or finalized",
+        "stream": "what the stream is doing",
+        "reason": "why configuring failed, or the text of the last failed advance; empty: nothing",
+        "scene": "scene in use",
+        "compile_s": "time that compiling or loading the solver took [s]",
+        "model_time_s": "model time advanced since configure [s]",
+        "real_time_factor": "model seconds per second over the last period [1]",
+        "real_time_factor_mean": "the same since the first advance [1]",
+        "solver_failures": "failed advances",
+        "resets": "resets of the model, by jumps, failures and the service",
+    },
+    "input": {
+        "source": "excitation source in use",
+        "samples_in": "samples that arrived on the excitation topics",
+        "samples_used": "samples that the model was advanced to",
+        "samples_missing": "samples that expected_rate asks for and that never came",
+        "messages_lost": "messages that the middleware reports as lost on the way",
+        "dropped_non_finite": "dropped: a number is not finite",
+        "dropped_unstamped": "dropped: the stamp is zero or negative",
+        "dropped_duplicate": "dropped: the stamp is that of the sample before",
+        "dropped_out_of_order": "dropped: older than the sample before, by less than jump_back",
+        "dropped_late": "dropped: newer than the sample before, but the hold policy has passed it",
+        "dropped_malformed": "dropped: names do not match the loads of the scene",
+        "dropped_not_selected": "ignored: not the selected excitation source",
+        "dropped_inactive": "ignored: the node was not active",
+        "jumps_back": "stamps stepped back by more than jump_back",
+        "jumps_forward": "stamps stepped forward by more than jump_forward",
+        "out_of_plane": "samples used although a component outside the plane was not zero",
+        "holds": "advances under the hold policy",
+        "travel_used": "speeds along the face used",
+        "travel_dropped": "speeds along the face dropped",
+        "head_pose_used": "measured poses used",
+        "head_pose_dropped": "measured poses dropped",
+        "head_pose_residual": "model minus newest measured pose: x, y [m], theta [rad]; empty without one",
+        "refused_publishers": "publishers of incompatible quality of service",
+    },
+    "output": {
+        "published": "messages on contact_forces",
+        "withheld": "messages not published because a number was not finite",
+        "latency_p50_ms": "reception of a sample to publication of its forces, median [ms]",
+        "latency_p99_ms": "the same, 99 % [ms]",
+        "latency_max_ms": "the same, largest [ms]",
+        "age_p50_ms": "system time minus stamp when published, median [ms]; empty under use_sim_time",
+        "age_p99_ms": "the same, 99 % [ms]",
+    },
+    "recorder": {
+        "recording": "file being written; empty: none",
+        "written": "items in the file",
+        "queued": "items waiting for the recorder's thread",
+        "lost": "items lost, by topic",
+        "error": "why recording stopped; empty: it did not",
+    },
+}
+
+#: Keys of `status` and what each means.
+STATUS_KEYS: Final[dict[str, str]] = {
+    "lifecycle": "unconfigured, inactive, active or finalized",
+    "stream": "waiting, running, stale or failed",
+    "stale_inputs": "inputs that have gone silent, separated by commas",
+    "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated or not_observable",
+    "vertical": "the same of the vertical clearance",
+    "pads": "the same of the pads' wear",
+}
+
+_LEVELS: Final = {State.WAITING: OK, State.RUNNING: OK, State.STALE: WARN, State.FAILED: ERROR}
+
+
+def status(
+    name: str, hardware_id: str, level: bytes, message: str, values: Iterable[tuple[str, str]]
+) -> DiagnosticStatus:
+    """Return one part of the health report."""
+    pairs = [KeyValue(key=key, value=value) for key, value in values]
+    return DiagnosticStatus(level=level, name=name, message=message, hardware_id=hardware_id, values=pairs)
+
+
+def summary(lifecycle: str, reason: str, runtime: Runtime | None) -> tuple[bytes, str, dict[str, str]]:
+    """Return level, message and values of `status`."""
+    values = dict.fromkeys(STATUS_KEYS, "")
+    values["lifecycle"] = lifecycle
+    if runtime is None:
+        return (ERROR if reason else OK), reason or lifecycle, values
+    state = runtime.driver.state
+    values["stream"] = state.name.lower()
+    values["stale_inputs"] = "excitation" if state is State.STALE else ""
+    values |= dict.fromkeys(("horizontal", "vertical", "pads"), "prior")
+    if lifecycle != "active":
+        return OK, lifecycle, values
+    message = f"{state.value}: {runtime.driver.failure}" if state is State.FAILED else state.value
+    return _LEVELS[state], message, values
+
+
+class Health:
+    """The parts of `/diagnostics`; remembers counters to tell what has happened since the last report."""
+
+    def __init__(self) -> None:
+        self._before: dict[str, int] = {}
+
+    def state(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> Part:
+        """Return lifecycle, stream and solver."""
+        level, message, _ = summary(lifecycle, reason, runtime)
+        values = dict.fromkeys(KEYS["state"], "")
+        values |= {"lifecycle": lifecycle, "reason": reason}
+        if runtime is not None:
+            driver = runtime.driver
+            values |= {
+                "stream": driver.state.value,
+                "reason": driver.failure,
+                "scene": runtime.scene_name,
+                "compile_s": f"{runtime.compile_s:.3f}",
+                "model_time_s": f"{driver.real_time.model_s:.3f}",
+                "real_time_factor": f"{driver.real_time.recent(now_ns):.4f}",
+                "real_time_factor_mean": f"{driver.real_time.mean(now_ns):.4f}",
+                "solver_failures": str(driver.failures),
+                "resets": str(driver.resets),
+            }
+        return level, message, values
+
+    def input(self, runtime: Runtime) -> Part:
+        """Return what arrived and what became of it."""
+        counted = counters(runtime.driver)
+        inputs, residual = runtime.inputs, runtime.residual()
+        values = {key: str(counted[key]) for key in KEYS["input"] if key in counted} | {
+            "source": runtime.source,
+            "messages_lost": str(inputs.lost),
+            "travel_used": str(inputs.travel.used),
+            "travel_dropped": str(inputs.travel.arrived - inputs.travel.used),
+            "head_pose_used": str(inputs.head_pose.used),
+            "head_pose_dropped": str(inputs.head_pose.arrived - inputs.head_pose.used),
+            "head_pose_residual": "" if residual is None else "{:.6g} {:.6g} {:.6g}".format(*residual),
+            "refused_publishers": str(inputs.refused_publishers),
+        }
+        grown = self._grown({**counted, "messages_lost": inputs.lost}, _TROUBLE)
+        if runtime.driver.state is State.STALE:
+            grown.insert(0, "excitation stale")
+        if "dropped_unstamped" in grown:
+            return ERROR, "; ".join(grown), values
+        return (WARN if grown else OK), "; ".join(grown) or "no trouble since the last report", values
+
+    def output(self, runtime: Runtime) -> Part:
+        """Return how much was published and how fast."""
+        latency, age = runtime.latency, runtime.age
+        values = {
+            "published": str(runtime.published),
+            "withheld": str(runtime.withheld),
+            "latency_p50_ms": _ms(latency.quantile(0.5)),
+            "latency_p99_ms": _ms(latency.quantile(0.99)),
+            "latency_max_ms": _ms(latency.largest_s) if latency.count else "",
+            "age_p50_ms": _ms(age.quantile(0.5)),
+            "age_p99_ms": _ms(age.quantile(0.99)),
+        }
+        grown = self._grown({"withheld": runtime.withheld}, ("withheld",))
+        return (ERROR if grown else OK), "; ".join(grown) or "publishing", values
+
+    def recorder(self, runtime: Runtime) -> Part:
+        """Return how the recording is doing; loss is an error."""
+        values = dict.fromkeys(KEYS["recorder"], "")
+        if runtime.recording is None:
+            return OK, "not recording", values
+        found = runtime.recording.counters
+        values |= {
+            "recording": str(runtime.recording.path),
+            "written": str(found.written),
+            "queued": str(found.queued),
+            "lost": ", ".join(f"{topic}: {count}" for topic, count in sorted(found.lost.items())),
+            "error": found.error or "",
+        }
+        if found.error or found.lost:
+            return ERROR, found.error or f"lost: {values['lost']}", values
+        return OK, "recording", values
+
+    def _grown(self, now: dict[str, int], keys: Iterable[str]) -> list[str]:
+        grown = [key for key in keys if now[key] > self._before.get(key, 0)]
+        self._before |= now
+        return grown
+
+
+_TROUBLE: Final = (
+    "dropped_unstamped",
+    "dropped_non_finite",
+    "dropped_duplicate",
+    "dropped_out_of_order",
+    "dropped_late",
+    "dropped_malformed",
+    "dropped_not_selected",
+    "jumps_back",
+    "jumps_forward",
+    "out_of_plane",
+    "samples_missing",
+    "messages_lost",
+    "solver_failures",
+)
+
+
+def _ms(seconds: float) -> str:
+    return "" if seconds != seconds else f"{seconds * 1e3:.3f}"

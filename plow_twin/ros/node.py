@@ -1,0 +1,171 @@
+"""The lifecycle node `plow_twin`: transitions, status and diagnostics; the work is in `runtime`."""
+
+from __future__ import annotations
+
+import gc
+import time
+import traceback
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.srv import ChangeState
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.ros import diagnostics
+from plow_twin.ros.parameter_server import ParameterServer
+from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
+from plow_twin.ros.runtime import Runtime
+
+
+class TwinNode(LifecycleNode):
+    """The twin on ROS 2.
+
+    Takes the keyword arguments of `rclpy.node.Node`, so that several can live in one process and executor. Code that
+    makes one calls `start` for what the parameter `autostart` does in the program.
+
+    Raises
+    ------
+    ParameterError
+        Some parameters given at start cannot be used; the message lists them all.
+    """
+
+    def __init__(self, node_name: str = "plow_twin", **options: Any) -> None:
+        super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
+        self.runtime: Runtime | None = None
+        self.lifecycle = "unconfigured"
+        #: why the last configure failed
+        self.reason = ""
+        self._health = diagnostics.Health()
+        self._published_status: tuple[Any, ...] = ()
+        self._table = ParameterServer(self, lambda: self.runtime is None, self._parameter_changed)
+        self._status = self.create_publisher(DiagnosticStatus, "status", LATCHED)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
+        # steady: reports go on when /clock is paused
+        self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._refuse_invalid_transitions()
+        self._publish_status()
+
+    @property
+    def autostart(self) -> bool:
+        """Whether the program shall configure and activate the node."""
+        return self._table.settings.autostart
+
+    def start(self) -> bool:
+        """Configure and activate; False when one of them failed (the reason is in log, status and diagnostics)."""
+        done = TransitionCallbackReturn.SUCCESS
+        return self.trigger_configure() == done and self.trigger_activate() == done
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load the scene, compile the solver, open the recording, make all topics; fails with a reason."""
+        settings = self._table.settings
+        try:
+            self.runtime = Runtime(self, settings, self._publish_status)
+        except (PlowTwinError, OSError, ModuleNotFoundError) as error:
+            self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
+        except Exception:  # rclpy would swallow it
+            self.reason = traceback.format_exc()
+        else:
+            self.get_logger().info(f"scene {settings.scene}: solver ready in {self.runtime.compile_s:.2f} s")
+            return self._entered("inactive")
+        self.get_logger().error(f"not configured: {self.reason}")
+        self._publish_status()
+        return TransitionCallbackReturn.FAILURE
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take samples from now on."""
+        super().on_activate(state)
+        # what lives now lives long: the collector need not walk it while samples arrive
+        gc.collect()
+        gc.freeze()
+        self._running().activate()
+        return self._entered("active")
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take no samples; the state of the model is kept."""
+        super().on_deactivate(state)
+        self._running().deactivate()
+        return self._entered("inactive")
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release all that on_configure made and close the recording."""
+        self.release()
+        return self._entered("unconfigured")
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As cleanup, for good."""
+        self.release()
+        return self._entered("finalized")
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release everything, so that the node can be configured again."""
+        self.release()
+        return self._entered("unconfigured")
+
+    def release(self) -> None:
+        """Give back everything and close the recording; can be called at any time."""
+        runtime, self.runtime = self.runtime, None
+        lost = runtime.close() if runtime is not None else None
+        if lost is not None:
+            self.get_logger().error(lost)
+
+    def _running(self) -> Runtime:
+        if self.runtime is None:
+            raise RuntimeError(f"lifecycle: got {self.lifecycle}, expected a configured node")
+        return self.runtime
+
+    def _entered(self, lifecycle: str) -> TransitionCallbackReturn:
+        self.lifecycle = lifecycle
+        self.reason = ""
+        self._publish_status()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _parameter_changed(self, name: str, value: Any) -> None:
+        if self.runtime is not None:
+            self.runtime.parameter(name, value, self._table.settings)
+
+    def _refuse_invalid_transitions(self) -> None:
+        """Answer an impossible transition instead of ending the process, as rclpy's own callback would."""
+        service = self._service_change_state
+        change = service.callback
+
+        def answer(request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+            try:
+                return change(request, response)
+            except RuntimeError as error:
+                asked = request.transition.label or request.transition.id
+                self.get_logger().warning(f"transition {asked!r} refused in state {self.lifecycle}: {error}")
+                response.success = False
+                return response
+
+        service.callback = answer
+
+    def _publish_status(self) -> None:
+        report = diagnostics.summary(self.lifecycle, self.reason, self.runtime)
+        if report == self._published_status:
+            return
+        self._published_status = report
+        level, message, values = report
+        name, head = self.get_name(), self._table.settings.hardware_id
+        self._status.publish(diagnostics.status(name, head, level, message, values.items()))
+        if self.runtime is not None:
+            self.runtime.record_status(name, head, report)
+
+    def _publish_diagnostics(self) -> None:
+        runtime = self.runtime
+        parts = {"state": self._health.state(self.lifecycle, self.reason, runtime, time.monotonic_ns())}
+        if runtime is not None:
+            parts["input"] = self._health.input(runtime)
+            parts["output"] = self._health.output(runtime)
+            parts["recorder"] = self._health.recorder(runtime)
+        array = DiagnosticArray()
+        array.header.stamp = self.get_clock().now().to_msg()
+        head = self._table.settings.hardware_id
+        array.status = [
+            diagnostics.status(f"{self.get_name()}: {part}", head, level, message, values.items())
+            for part, (level, message, values) in parts.items()
+        ]
+        self._diagnostics.publish(array)
+        self._publish_status()

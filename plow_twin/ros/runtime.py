@@ -1,0 +1,240 @@
+"""All that a configured node holds, and the way of one sample through it: intake, twin, publication, recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from plow_twin.model.scene import Scene
+from plow_twin.presets import scene_path
+from plow_twin.ros.inputs import Inputs
+from plow_twin.ros.messages import Wrench
+from plow_twin.ros.parameters import Settings
+from plow_twin.ros.publishers import FramePublishers
+from plow_twin.scene_file import load_scene
+from plow_twin.stream.driver import Driver, Policy
+from plow_twin.stream.health import DurationHistogram
+from plow_twin.stream.intake import Intake
+from plow_twin.stream.journal import Entry
+from plow_twin.stream.session import Session
+from plow_twin.twin import Twin
+
+if TYPE_CHECKING:
+    from plow_twin.ros.diagnostics import Part
+    from plow_twin.ros.recording import Recording
+    from plow_twin.twin import Advance
+
+
+class Runtime:
+    """Everything made on configure and released on cleanup.
+
+    Parameters
+    ----------
+    node
+        The node; its clock stamps the scene's own loads.
+    settings
+        Its parameters.
+    changed
+        Called when the state of the stream may have changed.
+
+    Raises
+    ------
+    SceneError, RecordingError, OSError
+        The scene or the recording cannot be used.
+    """
+
+    def __init__(self, node: Node, settings: Settings, changed: Callable[[], None]) -> None:
+        self._node = node
+        self._settings = settings
+        self._changed = changed
+        self.sim_time: bool = node.get_parameter("use_sim_time").value
+        self.scene: Scene = load_scene(scene_path(settings.scene))
+        sampled = settings.excitation_source != "scene"
+        twin = Twin(self.scene, tol=settings.tolerance, excitation="sampled" if sampled else "scene")
+        #: seconds that compiling or loading the solver took
+        self.compile_s = twin.warm_up()
+        self.latency = DurationHistogram()
+        self.age = DurationHistogram()
+        #: frames that were not published because a number was not finite
+        self.withheld = 0
+        self._received_ns = 0
+        self._q: NDArray[np.float64] | None = None
+        self._publishers = FramePublishers(node, settings.frame_id, settings.child_frame_id)
+        self.recording = self._record()
+        session = Session(twin, on_entry=self.recording.journal if self.recording else _ignore)
+        self.driver = Driver(session, self._intake(), policy(settings))
+        self.inputs = Inputs(
+            node,
+            self.scene,
+            settings.excitation_source,
+            settings.input_depth,
+            self.driver.intake,
+            self._on_sample,
+            self.driver.travel,
+        )
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timers = [self._timer(rate, callback) for rate, callback in self._periodic()]
+        self._reset_service = node.create_service(Trigger, "~/reset", self._on_reset)
+        session.start()
+
+    @property
+    def published(self) -> int:
+        """Number of frames published."""
+        return self._publishers.published
+
+    @property
+    def scene_name(self) -> str:
+        """Scene file or preset in use."""
+        return self._settings.scene
+
+    @property
+    def source(self) -> str:
+        """Excitation source in use."""
+        return self._settings.excitation_source
+
+    def residual(self) -> tuple[float, float, float] | None:
+        """Return model minus newest measured pose: x, y [m], theta [rad], or None without a measurement."""
+        return self.inputs.residual(self._q) if self._q is not None else None
+
+    def record_status(self, name: str, hardware_id: str, report: Part) -> None:
+        """Put a published status into the recording."""
+        if self.recording:
+            stamp_ns = self.driver.session.stamp_ns
+            self.recording.status(self._ros_time_ns() if stamp_ns is None else stamp_ns, name, hardware_id, report)
+
+    def activate(self) -> None:
+        """Start taking samples."""
+        self.driver.resume(time.monotonic_ns())
+        self.inputs.active = True
+        for timer in self._timers:
+            timer.reset()
+
+    def deactivate(self) -> None:
+        """Stop taking samples."""
+        self.inputs.active = False
+        for timer in self._timers:
+            timer.cancel()
+
+    def close(self) -> str | None:
+        """Release everything; return what was lost of the recording, or None."""
+        self.deactivate()
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._node.destroy_service(self._reset_service)
+        self.inputs.close()
+        self.driver.close()
+        self._publishers.close()
+        report = self.recording.close() if self.recording else None
+        if report is None or report.complete:
+            return None
+        return f"recording incomplete: lost {dict(report.lost)}, closed {report.closed}, error {report.error}"
+
+    def parameter(self, name: str, value: Any, settings: Settings) -> None:
+        """Take over a parameter that takes effect at once."""
+        self._settings = settings
+        self.driver.policy = policy(settings)
+        for intake in (self.driver.intake, self.driver.clock):
+            intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
+        self.driver.parameter(name, value)
+
+    def _intake(self) -> Intake:
+        settings = self._settings
+        return Intake(
+            jump_back_s=settings.jump_back,
+            jump_forward_s=settings.jump_forward,
+            expected_rate_hz=settings.expected_rate,
+        )
+
+    def _record(self) -> Recording | None:
+        if not self._settings.record_path:
+            return None
+        from plow_twin.ros.recording import Recording
+
+        clock = self._ros_time_ns if self.sim_time else None
+        topics = {**self._publishers.topics, "status": self._node.resolve_topic_name("status")}
+        name = self._node.get_fully_qualified_name()
+        return Recording(self._settings, self.scene, name, topics, clock, self._node.get_logger().error)
+
+    def _periodic(self) -> list[tuple[float, Callable[[], None]]]:
+        settings = self._settings
+        periodic: list[tuple[float, Callable[[], None]]] = []
+        if settings.excitation_source == "scene":
+            periodic.append((settings.step_rate, self._on_clock))
+        elif not self.sim_time:
+            periodic.append((settings.step_rate, self._on_silence))
+        if settings.publish_mode == "fixed_rate":
+            periodic.append((settings.publish_rate, self._publish))
+        return periodic
+
+    def _timer(self, rate_hz: float, callback: Callable[[], None]) -> Any:
+        # steady: steps of the system's clock and a paused /clock do not touch it
+        timer = self._node.create_timer(1.0 / rate_hz, callback, clock=self._steady)
+        timer.cancel()
+        return timer
+
+    def _ros_time_ns(self) -> int:
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def _on_sample(self, stamp_ns: int, wrench: Wrench) -> None:
+        self._received_ns = now_ns = time.monotonic_ns()
+        self._advanced(self.driver.sample(stamp_ns, wrench, now_ns))
+
+    def _on_silence(self) -> None:
+        self._received_ns = 0
+        self._advanced(self.driver.silence(time.monotonic_ns()))
+
+    def _on_clock(self) -> None:
+        self._received_ns = now_ns = time.monotonic_ns()
+        self._advanced(self.driver.clock_tick(self._ros_time_ns(), now_ns))
+
+    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        stamp_ns = self.driver.session.stamp_ns
+        self.driver.reset(self._ros_time_ns() if stamp_ns is None else stamp_ns, "service")
+        self._changed()
+        response.success = True
+        response.message = "initial state restored; the next sample starts model time anew"
+        return response
+
+    def _advanced(self, advance: Advance | None) -> None:
+        if advance is None:
+            return
+        if self._settings.publish_mode == "on_sample":
+            self._publish()
+        if self.recording:
+            self.recording.renew(self.driver.session)
+        self._changed()
+
+    def _publish(self) -> None:
+        frame = self.driver.session.outputs.take()
+        if frame is None:
+            return
+        if not frame.finite:
+            self.withheld += 1
+            return
+        self._q = frame.q
+        self._publishers.publish(frame, self._forces_sent)
+        if self._received_ns and not self.sim_time:
+            self.age.add((time.time_ns() - frame.stamp_ns) * 1e-9)
+        if self.recording:
+            self.recording.frame(frame)
+
+    def _forces_sent(self) -> None:
+        if self._received_ns:
+            self.latency.add((time.monotonic_ns() - self._received_ns) * 1e-9)
+
+
+def policy(settings: Settings) -> Policy:
+    """Return the part of the settings that rules over silence and failures."""
+    return Policy(settings.excitation_timeout, settings.hold_policy, settings.failure_limit)
+
+
+def _ignore(entry: Entry) -> None:
+    """Drop an entry: nothing is recorded."""
