@@ -32,7 +32,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "compile_s": "time that compiling or loading the solver took [s]",
         "model_time_s": "model time advanced since configure [s]",
         "real_time_factor": "model seconds per second over the last period [1]",
-        "real_time_factor_mean": "the same since the first advance [1]",
+        "real_time_factor_mean": "the same from the first to the newest advance [1]",
         "solver_failures": "failed advances",
         "resets": "resets of the model, by jumps, failures and the service",
     },
@@ -136,7 +136,7 @@ class Health:
                 "compile_s": f"{runtime.compile_s:.3f}",
                 "model_time_s": f"{driver.real_time.model_s:.3f}",
                 "real_time_factor": f"{driver.real_time.recent(now_ns):.4f}",
-                "real_time_factor_mean": f"{driver.real_time.mean(now_ns):.4f}",
+                "real_time_factor_mean": f"{driver.real_time.mean():.4f}",
                 "solver_failures": str(driver.failures),
                 "resets": str(driver.resets),
             }

@@ -51,6 +51,7 @@ class RealTimeFactor:
     def __init__(self) -> None:
         self.model_s = 0.0
         self._start_ns: int | None = None
+        self._newest_ns = 0
         self._last = (0, 0.0)
 
     def advanced(self, duration_s: float, now_ns: int) -> None:
@@ -58,13 +59,14 @@ class RealTimeFactor:
         if self._start_ns is None:
             self._start_ns = now_ns
             self._last = (now_ns, 0.0)
+        self._newest_ns = now_ns
         self.model_s += duration_s
 
-    def mean(self, now_ns: int) -> float:
-        """Return the factor since the first advance; 0 before it."""
-        if self._start_ns is None or now_ns <= self._start_ns:
+    def mean(self) -> float:
+        """Return the factor from the first to the newest advance; 0 before them."""
+        if self._start_ns is None or self._newest_ns <= self._start_ns:
             return 0.0
-        return self.model_s / ((now_ns - self._start_ns) * 1e-9)
+        return self.model_s / ((self._newest_ns - self._start_ns) * 1e-9)
 
     def recent(self, now_ns: int) -> float:
         """Return the factor since the last call of this method; 0 before the first advance."""

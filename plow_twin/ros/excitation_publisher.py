@@ -1,0 +1,225 @@
+"""The program `excitation_publisher`: a scene's load as samples on `excitation`, by the clock or as fast as it goes.
+
+`real` keeps a grid on the steady clock: each sample leaves at its own time, a late one at once, none is left out.
+`fast` is the source of `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import struct
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from numpy.typing import NDArray
+from rclpy.executors import Executor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from plow_twin.errors import SceneError
+from plow_twin.model.loads import compile_loads
+from plow_twin.presets import scene_path
+from plow_twin.ros.main import StopRequested, StopSignals, make_executor
+from plow_twin.ros.messages import set_stamp
+from plow_twin.ros.qos import LATCHED, sensor_input
+from plow_twin.scene_file import load_scene
+from plow_twin.stream.intake import NS_PER_S
+
+#: Stamp of the first sample under /clock [ns]: zero would count as unstamped.
+FIRST_STAMP_NS: Final = NS_PER_S
+#: Samples that may be under way in `fast`.
+WINDOW: Final = 200
+#: Samples between two messages on /clock.
+_CLOCK_EVERY: Final = 10
+#: Without an answer for so long, the samples under way count as lost [s].
+_STALL_S: Final = 2.0
+_SETTLE_S: Final = 0.3
+#: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
+_STAMP: Final = struct.Struct("<4xiI")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`."""
+
+    wrench: NDArray[np.float64]
+    period_ns: int
+
+
+class ExcitationPublisher(Node):
+    """Sends the samples of a plan."""
+
+    def __init__(self, plan: Plan, stop: StopSignals, *, fast: bool) -> None:
+        super().__init__("excitation_publisher")
+        self._plan = plan
+        self._stop = stop
+        self._executor: Executor = make_executor()
+        self._executor.add_node(self)
+        self._message = WrenchStamped()
+        self._message.header.frame_id = "slide_frame"
+        self._samples = self.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=1000))
+        self._twin_active = False
+        self._answered_ns = FIRST_STAMP_NS
+        self.sent = 0
+        #: longest delay of a sample behind its time on the grid [s]
+        self.latest_s = 0.0
+        #: times that the twin did not answer within the time allowed
+        self.stalls = 0
+        self.create_subscription(DiagnosticStatus, "status", self._on_status, LATCHED)
+        self._answers = (
+            self.create_subscription(JointState, "contact_peaks", self._on_answer, sensor_input(1000), raw=True)
+            if fast
+            else None
+        )
+
+    def wait_for_twin(self, timeout_s: float) -> bool:
+        """Wait until a twin is active and reads `excitation`; False when none was found in time or on a stop."""
+        give_up = time.monotonic() + timeout_s
+        while not self._connected():
+            if self._stop.stopped or time.monotonic() > give_up:
+                return False
+            self._executor.spin_once(timeout_sec=0.05)
+        # the twin's side of the connections may lag behind this one's
+        time.sleep(_SETTLE_S)
+        return True
+
+    def _connected(self) -> bool:
+        answering = self._answers is None or self.count_publishers("contact_peaks") > 0
+        return self._twin_active and self._samples.get_subscription_count() > 0 and answering
+
+    def run_real(self) -> None:
+        """Send each sample at its own time, stamped with that time."""
+        stamp_ns, start_ns = time.time_ns(), time.monotonic_ns()
+        for index, wrench in enumerate(self._plan.wrench.tolist()):
+            due_ns = start_ns + index * self._plan.period_ns
+            wait_ns = due_ns - time.monotonic_ns()
+            if wait_ns > 0:
+                time.sleep(wait_ns * 1e-9)
+            else:
+                self.latest_s = max(self.latest_s, -wait_ns * 1e-9)
+            if self._stop.stopped:
+                return
+            self._send(stamp_ns + index * self._plan.period_ns, wrench)
+
+    def run_fast(self) -> None:
+        """Send `/clock` and samples as fast as the twin answers."""
+        clock = self.create_publisher(Clock, "/clock", QoSProfile(depth=1000))
+        message, ahead_ns = Clock(), WINDOW * self._plan.period_ns
+        for index, wrench in enumerate(self._plan.wrench.tolist()):
+            stamp_ns = FIRST_STAMP_NS + index * self._plan.period_ns
+            if index % _CLOCK_EVERY == 0:
+                message.clock.sec, message.clock.nanosec = divmod(stamp_ns, NS_PER_S)
+                clock.publish(message)
+                self._executor.spin_once(timeout_sec=0.0)
+                self._wait_for_answer(stamp_ns - ahead_ns)
+            if self._stop.stopped:
+                return
+            self._send(stamp_ns, wrench)
+        self._wait_for_answer(FIRST_STAMP_NS + (self.sent - 1) * self._plan.period_ns)
+
+    def _wait_for_answer(self, stamp_ns: int) -> None:
+        give_up = time.monotonic() + _STALL_S
+        while self._answered_ns < stamp_ns and not self._stop.stopped:
+            self._executor.spin_once(timeout_sec=0.01)
+            if time.monotonic() > give_up:
+                self.stalls += 1
+                self._answered_ns = stamp_ns
+
+    def _send(self, stamp_ns: int, wrench: list[float]) -> None:
+        set_stamp(self._message.header, stamp_ns)
+        force = self._message.wrench.force
+        force.x, force.y, self._message.wrench.torque.z = wrench
+        self._samples.publish(self._message)
+        self.sent += 1
+
+    def _on_status(self, message: DiagnosticStatus) -> None:
+        self._twin_active = any(value.key == "lifecycle" and value.value == "active" for value in message.values)
+
+    def _on_answer(self, data: bytes) -> None:
+        sec, nanosec = _STAMP.unpack_from(data)
+        self._answered_ns = max(self._answered_ns, sec * NS_PER_S + nanosec)
+
+
+def plan(scene_name: str, rate_hz: float, seconds: float) -> Plan:
+    """Sample the loads of a scene, gravity not included.
+
+    Raises
+    ------
+    SceneError, OSError
+        The scene cannot be used.
+    """
+    period_ns = round(NS_PER_S / rate_hz)
+    loads = compile_loads(load_scene(scene_path(scene_name)).loads)
+    times = np.arange(max(1, round(seconds * NS_PER_S / period_ns)), dtype=np.float64) * (period_ns * 1e-9)
+    return Plan(loads.at(times), period_ns)
+
+
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser("excitation_publisher", description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--scene", default="paper", help="scene file or preset whose loads are sent")
+    parser.add_argument("--rate", type=float, default=1000.0, help="samples per second of machine time [Hz]")
+    parser.add_argument("--seconds", type=float, default=20.0, help="machine time [s]")
+    parser.add_argument("--speed", choices=("real", "fast"), default="real", help="by the clock, or as fast as it goes")
+    parser.add_argument("--wait", type=float, default=60.0, help="longest wait for an active twin [s]")
+    options = parser.parse_args(arguments)
+    for name in ("rate", "seconds", "wait"):
+        if not 0.0 < getattr(options, name) < 1e6:
+            parser.error(f"--{name}: got {getattr(options, name)!r}, expected a number between 0 and 1e6")
+    return options
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Send a scene's load; return 0 when all was sent, 1 without a twin, 2 on wrong usage, 3 when answers failed."""
+    import rclpy.utilities
+    from rclpy.signals import SignalHandlerOptions
+
+    given = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])
+    stop = StopSignals()
+    try:
+        options = _parse(rclpy.utilities.remove_ros_args(given)[1:])
+        samples = plan(options.scene, options.rate, options.seconds)
+        stop.interrupt = False
+    except StopRequested:
+        return 0
+    except (SceneError, OSError) as error:
+        print(f"excitation_publisher: {error}", file=sys.stderr)
+        return 2
+    rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
+    node = ExcitationPublisher(samples, stop, fast=options.speed == "fast")
+    try:
+        return _publish(node, options)
+    finally:
+        node.destroy_node()
+        rclpy.utilities.try_shutdown()
+
+
+def _publish(node: ExcitationPublisher, options: argparse.Namespace) -> int:
+    if not node.wait_for_twin(options.wait):
+        print(f"excitation_publisher: no active twin within {options.wait:g} s", file=sys.stderr)
+        return 1
+    begin = time.monotonic()
+    if options.speed == "real":
+        node.run_real()
+    else:
+        node.run_fast()
+    report = {
+        "sent": node.sent,
+        "seconds": round(time.monotonic() - begin, 3),
+        "latest_ms": round(node.latest_s * 1e3, 3),
+        "stalls": node.stalls,
+    }
+    print(json.dumps(report), flush=True)
+    return 3 if node.stalls else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
