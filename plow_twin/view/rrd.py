@@ -1,0 +1,228 @@
+"""A recording turned into a rerun file with its arrangement: `to_rrd`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+
+from plow_twin.errors import RecordingError
+from plow_twin.model.scene import Scene
+from plow_twin.record.header import RunHeader
+from plow_twin.record.messages import DiagnosticStatus, JointState, Odometry
+from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
+from plow_twin.scene_file import loads_scene
+from plow_twin.stream.journal import Hold, Sample
+from plow_twin.view import layout
+from plow_twin.view.columns import Batches, Curves, buffers
+from plow_twin.view.events import Events
+from plow_twin.view.section import PAIR_COLORS, Section
+
+#: The cross-section moves at this rate [Hz]; curves keep every row.
+SECTION_HZ: Final = 100.0
+#: Stamps further than that from the recorder's clock [ns] are on another clock: no age is drawn.
+_LARGEST_AGE_NS: Final = 3_600_000_000_000
+_GREY: Final = (150, 155, 165)
+
+
+@dataclass(frozen=True)
+class ViewSummary:
+    """What a .rrd holds: rows of the curves, moments of the cross-section, events, and how the recording ended."""
+
+    path: Path
+    curve_rows: int
+    section_rows: int
+    events: int
+    status: FileStatus
+
+
+def to_rrd(
+    path: Path,
+    out: Path,
+    *,
+    section_hz: float = SECTION_HZ,
+    until_s: float | None = None,
+    on_progress: Callable[[float], object] | None = None,
+) -> ViewSummary:
+    """Write the .rrd of a recording, complete or cut off, with at most one block of it in memory.
+
+    Parameters
+    ----------
+    path
+        The `.mcap` file or its folder.
+    out
+        The .rrd file to write.
+    section_hz
+        Rate of the cross-section [Hz]; the force curves are never thinned.
+    until_s
+        Stop that long after the first stamp [s].
+    on_progress
+        Receives the share done, 0..1.
+
+    Raises
+    ------
+    RecordingError
+        The file is no recording, or `out` cannot be written.
+    """
+    reader = RunReader(Path(path))
+    scene = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
+    section = Section.of(scene)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    stream = rr.RecordingStream("plow_twin")
+    try:
+        stream.save(out, default_blueprint=layout.blueprint(section))
+    except Exception as error:  # the SDK raises RuntimeError and OSError alike
+        raise RecordingError(f"{out}: cannot be written: {error}") from error
+    run = _Run(stream, reader.header, section, section_hz)
+    run.start(scene, reader.path)
+    for index, record in enumerate(reader):
+        if isinstance(record, EntryRecord):
+            run.entry(record)
+        else:
+            run.output(record)
+        if until_s is not None and run.elapsed_s >= until_s:
+            break
+        if on_progress is not None and index % 1000 == 0:
+            on_progress(reader.position)
+    run.finish(reader.status)
+    stream.flush()
+    stream.disconnect()
+    return ViewSummary(out, run.force.sent, run.section_rows, run.events.count, reader.status)
+
+
+class _Run:
+    """Turn records into curves, moments of the cross-section and events."""
+
+    def __init__(self, stream: rr.RecordingStream, header: RunHeader, section: Section, section_hz: float) -> None:
+        self.stream = stream
+        self.header = header
+        self.section = section
+        self.force = Curves(stream, layout.FORCE)
+        self.force_at_stamp = Curves(stream, layout.FORCE_AT_STAMP)
+        self.penetration = Curves(stream, layout.PENETRATION)
+        self.load = Curves(stream, layout.LOAD)
+        self.age = Curves(stream, layout.AGE)
+        self.interval = Curves(stream, layout.INTERVAL)
+        self.head = Batches(stream, "section/head", rr.LineStrips2D, ("strips",))
+        self.corners = Batches(stream, "section/corners", rr.Points2D, ("positions", "radii"))
+        self.arrows = Batches(stream, "section/force", rr.Arrows2D, ("origins", "vectors", "colors", "labels"))
+        self.events = Events(stream)
+        self.slow: tuple[Curves, Curves] | None = None
+        self.section_rows = 0
+        self.step = -1
+        self._spacing_ns = round(1e9 / section_hz)
+        self._shown: int | None = None
+        self._stamp_ns = 0
+        self._first_ns: int | None = None
+        self._sample_ns: int | None = None
+        self._contact: JointState | None = None
+        self._handlers: dict[str, Callable[[OutputRecord, Any], None]] = {
+            header.topic("contact_forces"): self._contact_forces,
+            header.topic("contact_peaks"): self._contact_peaks,
+            header.topic("head_state"): self._head_state,
+            header.topic("clearance"): self._clearance,
+            header.topic("status"): self._status,
+        }
+
+    @property
+    def elapsed_s(self) -> float:
+        """Time since the first stamp [s]."""
+        return 0.0 if self._first_ns is None else (self._stamp_ns - self._first_ns) * 1e-9
+
+    def start(self, scene: Scene, source: Path) -> None:
+        """Write what does not change in time."""
+        layout.style_curves(self.stream)
+        outline = self.section.frame_strip()
+        self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
+        if any(self.section.labels):
+            places, names = 0.8 * self.section.corners(), self.section.labels
+            labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
+            self.stream.log("section/labels", labels, static=True)
+        self.stream.log("section/head", rr.LineStrips2D.from_fields(colors=[(235, 235, 235)], radii=[0.9]), static=True)
+        self.stream.log("section/corners", rr.Points2D.from_fields(colors=[(235, 235, 235)]), static=True)
+        self.stream.log("section/force", rr.Arrows2D.from_fields(radii=[2.2], show_labels=True), static=True)
+        document = rr.TextDocument(layout.about(scene, self.header, source), media_type=rr.MediaType.MARKDOWN)
+        self.stream.log("about", document, static=True)
+
+    def entry(self, record: EntryRecord) -> None:
+        """Take an entry of the journal."""
+        entry = record.entry
+        stamp_ns = getattr(entry, "stamp_ns", self._stamp_ns)
+        if isinstance(entry, Sample | Hold):
+            self.step += 1
+            self._stamp_ns = stamp_ns
+            self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        if isinstance(entry, Sample):
+            fx, fy, moment = entry.wrench
+            self.load.add(stamp_ns, self.step, (fx / 1e3, fy / 1e3, moment / 1e3))
+            self._quality(stamp_ns, record.log_time_ns)
+        self.events.entry(stamp_ns, max(self.step, 0), entry, self.header.excitation_source)
+
+    def _quality(self, stamp_ns: int, log_time_ns: int) -> None:
+        if self._sample_ns is not None:
+            self.interval.add(stamp_ns, self.step, [(stamp_ns - self._sample_ns) / 1e6])
+        self._sample_ns = stamp_ns
+        age_ns = log_time_ns - stamp_ns
+        if abs(age_ns) <= _LARGEST_AGE_NS:
+            self.age.add(stamp_ns, self.step, [age_ns / 1e6])
+
+    def output(self, record: OutputRecord) -> None:
+        """Take a message of the node; other topics are passed over."""
+        handler = self._handlers.get(record.topic)
+        if handler is not None:
+            handler(record, record.message())
+
+    def _contact_forces(self, record: OutputRecord, message: JointState) -> None:
+        self._contact = message
+        self.force_at_stamp.add(message.stamp_ns, self.step, message.effort / 1e3)
+        self.penetration.add(message.stamp_ns, self.step, message.position * 1e3)
+
+    def _contact_peaks(self, record: OutputRecord, message: JointState) -> None:
+        self.force.add(message.stamp_ns, self.step, message.effort / 1e3)
+        self.events.peaks(message.stamp_ns, self.step, message)
+
+    def _head_state(self, record: OutputRecord, message: Odometry) -> None:
+        stamp_ns, contact = message.stamp_ns, self._contact
+        place = stamp_ns // self._spacing_ns
+        if contact is None or contact.stamp_ns != stamp_ns or place == self._shown:
+            return
+        self._shown = place
+        self.section_rows += 1
+        theta = 2.0 * math.atan2(message.orientation[2], message.orientation[3])
+        pose = (message.position[0], message.position[1], theta)
+        self.head.add(stamp_ns, self.step, strips=list(self.section.head_strips(pose)))
+        radii = self.section.corner_radii(contact.effort)
+        self.corners.add(stamp_ns, self.step, positions=self.section.corners(), radii=radii)
+        origins, vectors, pairs = self.section.arrows(theta, contact.effort)
+        colors = [PAIR_COLORS[pair] for pair in pairs]
+        labels = [f"{contact.effort[pair] / 1e3:.0f} kN" for pair in pairs]
+        self.arrows.add(stamp_ns, self.step, origins=origins, vectors=vectors, colors=colors, labels=labels)
+
+    def _clearance(self, record: OutputRecord, message: JointState) -> None:
+        pads = np.array([name.startswith("pad_") for name in message.name])
+        if self.slow is None:
+            names = list(zip(message.name, pads, strict=True))
+            total = [f"clearance/{name}" for name, pad in names if not pad]
+            wear = [f"wear/{name}" for name, pad in names if pad]
+            layout.style_clearances(self.stream, (*total, *wear))
+            self.slow = (Curves(self.stream, total), Curves(self.stream, wear))
+        for curves, chosen in zip(self.slow, (~pads, pads), strict=True):
+            curves.add(message.stamp_ns, max(self.step, 0), 1e3 * message.position[chosen])
+
+    def _status(self, record: OutputRecord, message: DiagnosticStatus) -> None:
+        self.events.status(self._stamp_ns or record.publish_time_ns, max(self.step, 0), message)
+
+    def finish(self, status: FileStatus) -> None:
+        """Send what is still collected."""
+        if status in (FileStatus.TRUNCATED, FileStatus.DAMAGED):
+            self.events.add(self._stamp_ns, max(self.step, 0), f"recording {status.value}", "ERROR")
+        for buffer in buffers(self):
+            buffer.flush()
+        for curves in self.slow or ():
+            curves.flush()
+        self.events.flush()

@@ -1,0 +1,85 @@
+"""The cross-section as rerun draws it: millimetres, and y downwards: each y changes its sign here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import CORNER_NAMES, CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y, PAIR_COUNT
+from plow_twin.model.scene import Scene
+
+Array = NDArray[np.float64]
+
+_MM: Final = 1000.0
+#: Length of an arrow [mm] per force [N].
+ARROW_MM_PER_N: Final = 1e-3
+#: A force below that is not drawn [N].
+FAINT_N: Final = 500.0
+#: The head's body is drawn that much larger than its cavity [mm]; its true outline is not part of a scene.
+BODY_MARGIN_MM: Final = 60.0
+
+#: One hue per corner; the pair with the vertical wall in the lighter shade (Okabe and Ito's palette).
+_HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
+_LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
+PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
+
+_SQUARE: Final[Array] = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+_FLIP: Final[Array] = np.array([1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class Section:
+    """Sizes [mm] of what does not change in a run."""
+
+    frame: Array
+    cavity: Array
+    labels: tuple[str, ...]
+
+    @classmethod
+    def of(cls, scene: Scene) -> Section:
+        """Take them from a scene."""
+        frame = _MM * np.array([scene.frame.width_m, scene.frame.height_m])
+        gaps = _MM * np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
+        letters = {corner: letter for letter, corner in scene.frame.labels.items()}
+        return cls(frame, frame + gaps, tuple(letters.get(corner, "") for corner in CORNER_NAMES))
+
+    @property
+    def half_view(self) -> Array:
+        """Half width and height that show the body and the arrows of the largest forces, shape (2,)."""
+        return 0.5 * self.cavity + BODY_MARGIN_MM + 70.0
+
+    def frame_strip(self) -> Array:
+        """Outline of the frame, shape (5, 2)."""
+        return 0.5 * self.frame * _SQUARE * _FLIP
+
+    def corners(self) -> Array:
+        """Corners of the frame in the order of `CORNER_NAMES`, shape (4, 2)."""
+        return (0.5 * self.frame * np.stack((CORNER_X, CORNER_Y), axis=1) * _FLIP)[::2]
+
+    def head_strips(self, pose: Iterable[float]) -> Array:
+        """Outlines of the cavity and of the body at a pose x, y [m], theta [rad], shape (2, 5, 2)."""
+        x, y, theta = pose
+        sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
+        points = 0.5 * sides[:, None, :] * _SQUARE
+        turn = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
+        strips: Array = (points @ turn + _MM * np.array([x, y])) * _FLIP
+        return strips
+
+    def arrows(self, theta: float, force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Origins and vectors of the forces on the head, shape (k, 2), and the pairs that they belong to, (k,)."""
+        drawn = np.flatnonzero(force >= FAINT_N)
+        normal_x = math.cos(theta) * NORMAL_X[drawn] - math.sin(theta) * NORMAL_Y[drawn]
+        normal_y = math.sin(theta) * NORMAL_X[drawn] + math.cos(theta) * NORMAL_Y[drawn]
+        length = ARROW_MM_PER_N * force[drawn]
+        vectors = np.stack((length * normal_x, length * normal_y), axis=1) * _FLIP
+        return self.corners()[drawn // 2], vectors, drawn
+
+    def corner_radii(self, force: Array) -> Array:
+        """Radius of each corner's mark [mm]: larger where the corner carries force, shape (4,)."""
+        total = force.reshape(PAIR_COUNT // 2, 2).sum(axis=1)
+        return np.where(total >= FAINT_N, 7.0, 3.0)
