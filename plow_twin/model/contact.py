@@ -9,15 +9,13 @@ and when its force would pull: there the force is zero.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-#: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
-FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+from plow_twin.model.kernel import kernel
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline=True)
 def normal_force(
     penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float
 ) -> float:
@@ -31,7 +29,7 @@ def normal_force(
     return max(0.0, elastic * (1.0 + factor * rate) + viscous * rate)
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@kernel(fast=True)
 def power_term(
     base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float, shift: int
 ) -> float:

@@ -15,7 +15,6 @@ from typing import Final
 
 from scipy.optimize import brentq
 
-
 #: Largest D = lambda v0 used: a restitution below about 1/1000 would need an unbounded damping.
 DAMPING_FACTOR_CAP: Final = 1e3
 
@@ -36,7 +35,9 @@ def exact_damping_factor(restitution: float) -> float:
         return (1.0 + restitution) - (math.log1p(damping) - math.log1p(-damping * restitution)) / damping
 
     # the positive root lies below 1/e; near e = 1 it behaves as 3 (1 - e) / 2
-    lower, upper = 0.5 * (1.0 - restitution), (1.0 - 1e-16) / restitution
+    lower, upper = 0.5 * (1.0 - restitution), 1.0 / restitution
+    while upper * restitution >= 1.0:
+        upper = math.nextafter(upper, 0.0)
     if residual(upper) > 0.0:
         return upper
     return float(brentq(residual, lower, upper, xtol=1e-300, rtol=1e-15))

@@ -17,6 +17,8 @@ from plow_twin.solve.step import settle_modes
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
+#: Share of the tolerance that one step may spend.
+STEP_SHARE = 0.05
 #: Mode changes at one instant before the solver goes on past it.
 MAX_EVENTS_AT_ONCE = 64
 
@@ -71,6 +73,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     law, factor = law_of(scene.contact)
     length = geometry.length_scale(scene)
     speed = _velocity_scale(scene, loads, length)
+    order = order_for(tol)
     params = Params(
         gap=geometry.penetration_rows(scene),
         arm=geometry.arm_rows(scene),
@@ -85,7 +88,9 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         gravity=float(gravity),
         constant=constant,
         direction=direction,
-        order=order_for(tol),
+        order=order,
+        lacuna=_lacuna(law),
+        threshold=speed * (STEP_SHARE * tol) ** (np.arange(order + 1) / order),
         velocity_tolerance=tol * speed,
         position_tolerance=tol * length,
         radius=geometry.half_diagonal(scene),
@@ -105,6 +110,13 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
 def order_for(tol: float) -> int:
     """Return the order of the series for a tolerance: about half the digits over log10(e), a few more for long steps."""
     return int(min(MAX_ORDER, max(8, round(6.0 - 1.15 * math.log10(tol)))))
+
+
+def _lacuna(law: Law) -> int:
+    """Return how many orders in a row can vanish: d^n adds n + 1 orders at a time while nothing else acts."""
+    if law.fraction is not None:
+        return 6
+    return 2 if law.integer is None else law.integer + 1
 
 
 def per_mass(scene: Scene, wrench: Array) -> Array:

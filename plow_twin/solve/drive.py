@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import AT_HARD_END, EVENT_PAIR, LENGTH, PIECE, SIGMA, STEPS, T0, USED, Status
 from plow_twin.solve.step import account, begin, evaluate, finish, pair_outputs, pose_of, sigma_at, within_range
 
@@ -12,7 +12,7 @@ _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _lay_out(p, parts, state, w, hard_time) -> bool:  # type: ignore[no-untyped-def]
     law = parts.law
     return begin(
@@ -21,7 +21,7 @@ def _lay_out(p, parts, state, w, hard_time) -> bool:  # type: ignore[no-untyped-
     )  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _next(p, parts, state, w, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
     """Lay out the next step unless one is under way."""
     if state.clock[LENGTH] >= 0.0:
@@ -33,7 +33,7 @@ def _next(p, parts, state, w, hard_time, budget) -> int:  # type: ignore[no-unty
     return _OK if _lay_out(p, parts, state, w, hard_time) else _NON_FINITE
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
     """Bring the motion to `target`; steps may reach beyond it, up to `hard_time`. Returns a `Status`."""
     while True:
@@ -54,7 +54,7 @@ def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:  # t
         finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth) -> None:  # type: ignore[no-untyped-def]
     """Write row i: the state at the present time and the totals, which are cleared."""
     y = state.y
@@ -72,7 +72,7 @@ def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, pea
     totals.makes[:] = 0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def advance_times(p, parts, state, w, totals, times, budget, q, v, penetration, rate, force, peak, impulse, makes, depth, steps, status) -> None:  # type: ignore[no-untyped-def]  # noqa: E501
     """Advance to each time under the scene's own loads and write a row for each."""
     for i in range(times.size):
@@ -82,7 +82,7 @@ def advance_times(p, parts, state, w, totals, times, budget, q, v, penetration, 
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def advance_samples(p, parts, state, w, totals, times, wrench, budget, q, v, penetration, rate, force, peak, impulse, makes, depth, steps, status) -> None:  # type: ignore[no-untyped-def]  # noqa: E501
     """Advance to each time under a wrench that runs straight from wrench[i] to wrench[i + 1]; a sample ends a step."""
     piece = parts.segments
@@ -99,7 +99,7 @@ def advance_samples(p, parts, state, w, totals, times, wrench, budget, q, v, pen
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def end_step(p, parts, state, w, totals) -> None:  # type: ignore[no-untyped-def]
     """End the step under way at the present time: something changes from outside."""
     clock = state.clock
@@ -112,7 +112,7 @@ def end_step(p, parts, state, w, totals) -> None:  # type: ignore[no-untyped-def
     finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def lay_out_again(p, parts, state, w, used) -> None:  # type: ignore[no-untyped-def]
     """Compute the step under way once more after a restore: its series are not part of the state."""
     count = state.count.copy()
@@ -121,7 +121,7 @@ def lay_out_again(p, parts, state, w, used) -> None:  # type: ignore[no-untyped-
     state.clock[USED] = used
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force) -> int:  # type: ignore[no-untyped-def]
     """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
 

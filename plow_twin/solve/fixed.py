@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
 from plow_twin.model.contact import normal_force
+from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import COEFFICIENTS, COS, EVENTS, OFF, OMEGA, ON, SIN, STEPS, THETA, VX, VY, Status
 from plow_twin.solve.step import pair_outputs, pose_of, touch, within_range
 
@@ -19,7 +19,7 @@ _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.
 _LOG_FULL = int(Status.LOG_FULL)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _load(p, harmonics, second, segments, t, out) -> None:  # type: ignore[no-untyped-def]
     """Write force per mass and moment per inertia at t, world axes."""
     out[:] = p.constant
@@ -32,7 +32,7 @@ def _load(p, harmonics, second, segments, t, out) -> None:  # type: ignore[no-un
             out[j] += segments.start[piece, j] + segments.slope[piece, j] * ahead
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _add_harmonics(p, harmonics, second, t, out) -> None:  # type: ignore[no-untyped-def]
     for i in range(harmonics.omega.size):
         sine, cosine = math.sin(harmonics.omega[i] * t), math.cos(harmonics.omega[i] * t)
@@ -46,7 +46,7 @@ def _add_harmonics(p, harmonics, second, t, out) -> None:  # type: ignore[no-unt
             out[1] += p.direction[1, 1] * s2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:  # type: ignore[no-untyped-def]
     """Write the rate of z = (x, y, theta, vx, vy, omega) of the centre of mass, world axes."""
     _load(p, parts.harmonics, parts.second, parts.segments, t, load)
@@ -78,7 +78,7 @@ def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:  # t
             out[3 + j] *= free[j]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _to_body(z, y) -> None:  # type: ignore[no-untyped-def]
     """Write body coordinates from z."""
     c, s = math.cos(z[2]), math.sin(z[2])
@@ -87,7 +87,7 @@ def _to_body(z, y) -> None:  # type: ignore[no-untyped-def]
     y[COS], y[SIN], y[THETA] = c, s, z[2]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _switch(p, state, penetration, rate, time, totals, log) -> None:  # type: ignore[no-untyped-def]
     """Note which pairs touch or part, at the step's resolution."""
     for pair in range(8):
@@ -106,7 +106,7 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:  # type: ig
         state.count[EVENTS] += 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _account(state, force_before, force, dt, totals) -> None:  # type: ignore[no-untyped-def]
     """Add one step to the totals by the trapezoidal rule."""
     sets = np.zeros(2, np.int64)
@@ -122,7 +122,7 @@ def _account(state, force_before, force, dt, totals) -> None:  # type: ignore[no
             totals.set_time[sense, sets[sense]] += dt
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force) -> int:  # type: ignore[no-untyped-def]  # noqa: E501
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
     z, trial = np.empty(6), np.empty(6)
@@ -176,7 +176,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
         done[0] = n + 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _wear(rate, state, force, dt) -> None:  # type: ignore[no-untyped-def]
     if rate is not None:
         for pair in range(8):

@@ -27,14 +27,14 @@ MAX_HALVINGS: Final = 48
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
-#: Still penetrating, but the force that is left is below the tolerance (exponents that are not integers).
+#: Penetrating less than `Params.release`, where the force is negligible (exponents that are not integers).
 RELEASED: Final = 3
 
 # indices into State.y
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
 # indices into State.clock
 T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END = range(7)
-# indices into State.step
+# indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
 ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END = range(7)
 # indices into State.count
 STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES = range(5)
@@ -84,6 +84,8 @@ class Params(NamedTuple):
     constant: Array  #: (3,) Fx/m, Fy/m - g, M/I of all that does not change
     direction: Array  #: (2, 2) directions (x, y) of the harmonic forces S1, S2
     order: int
+    lacuna: int  #: orders in a row that may vanish while the series goes on
+    threshold: Array  #: (order + 1,) admissible size of term k of a velocity over a step
     velocity_tolerance: float  #: admissible local error of a velocity
     position_tolerance: float  #: admissible local error of a position
     radius: float  #: turns angles into lengths

@@ -6,17 +6,16 @@ the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.model.contact import FASTMATH
+from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import MAX_HALVINGS, Work
 
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline=True)
 def horner(g: Array, n: int, x: float) -> float:
     """Return the value at x of the polynomial with coefficients g[0..n]."""
     value = g[n]
@@ -25,7 +24,7 @@ def horner(g: Array, n: int, x: float) -> float:
     return value
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
     """Write the Bernstein coefficients of g on [0, h] to b[0..n]."""
     power = 1.0
@@ -37,7 +36,7 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
             b[j] += b[j - 1]
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@kernel(fast=True)
 def columns_to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
     """Do the same for eight polynomials side by side, coefficients in rows."""
     power = 1.0
@@ -52,7 +51,7 @@ def columns_to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b:
                 b[j, lane] += b[j - 1, lane]
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline=True)
 def _halve(left: Array, right: Array, n: int) -> None:
     """Split Bernstein coefficients in `left` at the middle: left half in place, right half to `right`."""
     for r in range(n + 1):
@@ -62,7 +61,7 @@ def _halve(left: Array, right: Array, n: int) -> None:
     # the sweep above leaves the left half's coefficients in `left`, the right half's in `right`
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
     """Return the only root in [low, high], where g >= 0 at `low` side and < 0 at `high`: Newton within the bracket."""
     x = min(max(start, low), high)
@@ -84,7 +83,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
     return x
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def first_root(g: Array, n: int, h: float, w: Work) -> float:
     """Return where g first turns negative in [0, h), or infinity; g[0] >= 0.
 
@@ -128,7 +127,7 @@ def first_root(g: Array, n: int, h: float, w: Work) -> float:
     return np.inf
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def maximum(g: Array, n: int, h: float, floor: float, w: Work) -> float:
     """Return the larger of `floor` and the maximum of g on [0, h], to 1e-12 of it."""
     b = w.halves
@@ -150,7 +149,7 @@ def maximum(g: Array, n: int, h: float, floor: float, w: Work) -> float:
     return best
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def shift(g: Array, n: int, x: float, out: Array) -> None:
     """Write the coefficients of g(x + .) to `out`."""
     for k in range(n + 1):

@@ -15,10 +15,8 @@ from __future__ import annotations
 
 import math
 
-import numba
-import numpy as np
-
-from plow_twin.model.contact import FASTMATH, power_term
+from plow_twin.model.contact import power_term
+from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import (
     ALPHA,
     BETA,
@@ -30,16 +28,12 @@ from plow_twin.solve.layout import (
     TOUCHING,
     VX,
     VY,
-    Harmonics,
-    Params,
-    State,
-    Work,
     X,
     Y,
 )
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@kernel(fast=True)
 def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:  # type: ignore[no-untyped-def]
     """Write the series of S1, S2 and M to `w.load`.
 
@@ -65,7 +59,7 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:  # ty
             sine, cosine = new_sine, new_cosine
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@kernel(fast=True)
 def expand(p, state, w, active, count, start, slope, hard, harmonics, second, viscous, factor, integer, fraction, wear, offset, free):  # type: ignore[no-untyped-def]  # noqa: E501
     """Write the series of state, penetration, rate and force to `w`; return the order used.
 
@@ -103,7 +97,7 @@ def expand(p, state, w, active, count, start, slope, hard, harmonics, second, vi
             reach *= hard
             size = abs(vx) + abs(vy) + p.radius * abs(om) + weight * (abs(c) + abs(s))
             quiet = quiet + 1 if size * reach < small else 0
-            if quiet == 2 and k >= 4:
+            if quiet == p.lacuna and k >= 4:
                 order = k
                 break
         if k == order:
@@ -172,7 +166,7 @@ def expand(p, state, w, active, count, start, slope, hard, harmonics, second, vi
                     elif fraction is not None:
                         base, bare = power[1], power[2]
                         power[0, k] = d
-                        if pair == touching and beta != 0.0:
+                        if touching >> pair & 1:
                             # d = sigma^2 (...): d^1.5 = sigma^3 (...)^1.5
                             base[k] = 0.0 if k < 3 else power_term(power[0], bare, k - 3, fraction, 2)
                         else:

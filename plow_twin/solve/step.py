@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-from plow_twin.model.contact import FASTMATH, normal_force
+from plow_twin.model.contact import normal_force
+from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import (
     ALPHA,
     AT_HARD_END,
@@ -46,13 +46,11 @@ from plow_twin.solve.layout import (
 from plow_twin.solve.polynomial import columns_to_bernstein, first_root, maximum, shift
 from plow_twin.solve.series import expand, expand_harmonics
 
-#: Share of the tolerance that one step may spend.
-STEP_SHARE = 0.05
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline=True)
 def gap_and_rate(p, state, pair):  # type: ignore[no-untyped-def]
     """Return penetration and its rate of one pair at the step's start."""
     y, A = state.y, p.gap
@@ -62,7 +60,7 @@ def gap_and_rate(p, state, pair):  # type: ignore[no-untyped-def]
     return d, r
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def touch(p, state, pair) -> None:  # type: ignore[no-untyped-def]
     """Start a contact: read its impact speed, lambda = D / v0."""
     if p.damping_factor >= 0.0:
@@ -70,21 +68,21 @@ def touch(p, state, pair) -> None:  # type: ignore[no-untyped-def]
         state.factor[pair] = p.damping_factor / max(speed, p.speed_floor)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def settle_modes(p, state) -> None:  # type: ignore[no-untyped-def]
     """Choose each pair's mode from its penetration, where a motion starts or is changed from outside."""
     for pair in range(8):
         state.mode[pair] = OFF
         if p.enabled[pair] == 1 and gap_and_rate(p, state, pair)[0] > 0.0:
             touch(p, state, pair)
-            state.mode[pair] = ON
+            state.mode[pair] = ON if gap_and_rate(p, state, pair)[0] >= p.release else RELEASED
     state.clock[USED] = 0.0
     state.clock[LENGTH] = -1.0
-    state.step[TOUCHING] = -1
+    state.step[TOUCHING] = 0
     state.step[STALL] = 0
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@kernel(fast=True)
 def _guards(p, state, w, order, viscous) -> bool:  # type: ignore[no-untyped-def]
     """Write each pair's first guard to `w.guard`; return whether some pair has a second one."""
     gap, guard, mode = w.gap, w.guard, state.mode
@@ -107,15 +105,15 @@ def _guards(p, state, w, order, viscous) -> bool:  # type: ignore[no-untyped-def
                     guard[k, lane] += ratio * w.rate[lane, k]
             else:
                 second = True
-                if p.release > 0.0:
-                    guard[0, lane] -= min(p.release, 0.5 * max(guard[0, lane], 0.0))
+                # released below a quarter of the depth at which it acts again, so that no pair hovers between
+                guard[0, lane] -= min(0.25 * p.release, 0.5 * max(guard[0, lane], 0.0))
         elif mode[lane] != OFF:
             second = True
         guard[0, lane] = max(guard[0, lane], 0.0)
     return second
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:  # type: ignore[no-untyped-def]
     """Write the second guard of a penetrating pair to `w.scratch[0]`; return whether it has one."""
     g, mode = w.scratch[0], state.mode[pair]
@@ -124,8 +122,9 @@ def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:  # type: i
     sign = 1.0 if mode == ON else -1.0
     g[order] = 0.0
     if mode == RELEASED:
-        for k in range(order):
-            g[k] = -w.rate[pair, k]
+        for k in range(order + 1):
+            g[k] = -w.gap[k, pair]
+        g[0] += p.release
     elif viscous is not None:
         for k in range(order):
             g[k] = sign * (w.gap[k, pair] + viscous / p.stiffness * w.rate[pair, k])
@@ -138,7 +137,7 @@ def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:  # type: i
     return True
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@kernel(fast=True)
 def _unsafe_lanes(guard, order, h):  # type: ignore[no-untyped-def]
     """Return a bit for each guard that |g_0| > sum |g_k| h^k does not prove to keep its sign on [0, h]."""
     bits = 0
@@ -152,8 +151,8 @@ def _unsafe_lanes(guard, order, h):  # type: ignore[no-untyped-def]
     return bits
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _first_event(p, state, w, order, sigma, active, count, viscous, factor):  # type: ignore[no-untyped-def]
+@kernel()
+def _first_event(p, state, w, order, sigma, active, count, viscous, factor, fraction):  # type: ignore[no-untyped-def]
     """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
     has_second = _guards(p, state, w, order, viscous)
     best, event, target = sigma, -1, 0
@@ -175,9 +174,11 @@ def _first_event(p, state, w, order, sigma, active, count, viscous, factor):  # 
                     mode = state.mode[pair]
                     best, event = root, pair
                     if mode == OFF:
-                        target = ON
-                    elif mode == ON:
-                        target = CLIPPED if viscous is not None else (RELEASED if p.release > 0.0 else OFF)
+                        target = ON if fraction is None or fraction == 1.5 else RELEASED
+                    elif mode == ON and viscous is not None:
+                        target = CLIPPED
+                    elif mode == ON and fraction is not None:
+                        target = RELEASED
                     else:
                         target = OFF
     if has_second:
@@ -197,27 +198,36 @@ def _first_event(p, state, w, order, sigma, active, count, viscous, factor):  # 
     return best, event, target
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
-def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
-    """Return the sigma over which the series meets the step's share of the tolerance, at most `hard`."""
-    series = w.series
+@kernel(inline=True)
+def _term_size(p, series, k):  # type: ignore[no-untyped-def]
+    """Return the size of order k as a velocity."""
     weight = p.radius * p.velocity_tolerance / p.position_tolerance
-    admissible = STEP_SHARE * p.velocity_tolerance
+    size = abs(series[k, VX]) + abs(series[k, VY]) + p.radius * abs(series[k, OMEGA])
+    return size + weight * (abs(series[k, COS]) + abs(series[k, SIN]))
+
+
+@kernel()
+def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
+    """Return the sigma over which the series meets the step's share of the tolerance, at most `hard`; NaN if not finite.
+
+    Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
+    test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are looked at, since single ones can vanish.
+    """
     length = hard
-    for back in range(2):
-        k = order - back
-        size = abs(series[k, VX]) + abs(series[k, VY]) + p.radius * abs(series[k, OMEGA])
-        size += weight * (abs(series[k, COS]) + abs(series[k, SIN]))
+    for k in range(order, order - max(p.lacuna, 2), -1):
+        size = _term_size(p, w.series, k)
         if not (size <= 1e300):
             return math.nan
-        # an error of velocity becomes one of position over the step
-        size *= max(1.0, length * p.velocity_tolerance / p.position_tolerance / (k + 1)) if length < hard else 1.0
-        if size * length**k > admissible:
-            length = min(length, math.exp(math.log(admissible / size) / k))
+        if size * length**k > p.threshold[k]:
+            length = math.exp(math.log(p.threshold[k] / size) / k)
+    # an error of velocity becomes one of position over a long step
+    stretch = length * p.velocity_tolerance / (p.position_tolerance * (order + 1))
+    if stretch > 1.0 and length < hard:
+        length *= math.exp(-math.log(stretch) / order)
     return length
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free) -> bool:  # type: ignore[no-untyped-def]  # noqa: E501
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step, mode = state.clock, state.step, state.mode
@@ -246,7 +256,7 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     limited = span < LONGEST_STEP
     clock[ALPHA], clock[BETA] = 1.0, 0.0
     hard = span
-    if step[TOUCHING] >= 0:
+    if step[TOUCHING] != 0:
         # a force that starts like d^1.5 is analytic in the square root of time
         clock[ALPHA], clock[BETA] = 0.0, 2.0
         hard = math.sqrt(span)
@@ -264,7 +274,7 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     if not math.isfinite(sigma):
         return False
     limited = limited and sigma == hard
-    end, pair, target = _first_event(p, state, w, order, sigma, active, count, viscous, factor)
+    end, pair, target = _first_event(p, state, w, order, sigma, active, count, viscous, factor, fraction)
     if pair >= 0 and step[STALL] > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.count[RECOVERIES] += 1
@@ -280,7 +290,7 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     return True
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline=True)
 def sigma_at(state, used):  # type: ignore[no-untyped-def]
     """Return sigma at `used` seconds into the step."""
     clock = state.clock
@@ -289,7 +299,7 @@ def sigma_at(state, used):  # type: ignore[no-untyped-def]
     return used if clock[BETA] == 0.0 else math.sqrt(2.0 * used / clock[BETA])
 
 
-@numba.njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@kernel(fast=True)
 def evaluate(state, w, sigma, out) -> None:  # type: ignore[no-untyped-def]
     """Write the body-coordinate state at sigma to `out`, shape (8,)."""
     order, series = state.step[ORDER], w.series
@@ -300,7 +310,7 @@ def evaluate(state, w, sigma, out) -> None:  # type: ignore[no-untyped-def]
             out[i] = out[i] * sigma + series[k, i]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def pose_of(y, offset, q, v) -> None:  # type: ignore[no-untyped-def]
     """Write pose and rate of the cavity's centre in world axes from body coordinates; inverse of `body_state`."""
     c, s, x, yy, vx, vy, om = y[COS], y[SIN], y[0], y[1], y[VX], y[VY], y[OMEGA]
@@ -311,7 +321,7 @@ def pose_of(y, offset, q, v) -> None:  # type: ignore[no-untyped-def]
     v[0], v[1], v[2] = c * vx - s * vy, s * vx + c * vy, om
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def pair_outputs(p, state, y, penetration, rate, force) -> None:  # type: ignore[no-untyped-def]
     """Write penetration, rate and force of the eight pairs in body coordinates y, shape (8,) each."""
     A = p.gap
@@ -324,7 +334,7 @@ def pair_outputs(p, state, y, penetration, rate, force) -> None:  # type: ignore
             force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def account(state, w, low, high, totals) -> None:  # type: ignore[no-untyped-def]
     """Add what happened between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
     order, clock = state.step[ORDER] - 1, state.clock
@@ -356,7 +366,7 @@ def account(state, w, low, high, totals) -> None:  # type: ignore[no-untyped-def
             totals.set_time[sense, sets[sense]] += elapsed
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def finish(p, state, w, totals, log, wear, fraction) -> None:  # type: ignore[no-untyped-def]
     """Move the state to the step's end and switch the mode that its event changes."""
     clock, step, y = state.clock, state.step, state.y
@@ -380,29 +390,38 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:  # type: ignore[no
         clock[T0] = clock[HARD_END]
     clock[LENGTH] = -1.0
     clock[USED] = 0.0
-    step[TOUCHING] = -1
+    at_once = clock[T0] - before <= 1e-15 * (1.0 + abs(before))
+    touching = step[TOUCHING] if at_once else 0
+    step[TOUCHING] = 0
     pair = step[EVENT_PAIR]
     if pair < 0:
         step[STALL] = 0
         return
-    step[STALL] = step[STALL] + 1 if clock[T0] - before <= 1e-13 * (1.0 + abs(before)) else 0
+    step[STALL] = step[STALL] + 1 if at_once else 0
     old, new = state.mode[pair], step[EVENT_TO]
     state.mode[pair] = new
     state.count[EVENTS] += 1
+    if fraction is not None:
+        step[TOUCHING] = touching & ~(1 << pair)
     if old == OFF:
         touch(p, state, pair)
         totals.makes[pair] += 1
-        if fraction is not None and fraction == 1.5 and gap_and_rate(p, state, pair)[1] > 0.0:
-            step[TOUCHING] = pair
-    if log is not None and new != RELEASED:
+        if fraction is not None and new == ON:
+            if gap_and_rate(p, state, pair)[1] > 0.0:
+                step[TOUCHING] |= 1 << pair
+            else:
+                state.mode[pair] = RELEASED
+    # to the outside a released pair is on
+    old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
+    if log is not None and old != new:
         i = log.length[0]
         log.time[i], log.pair[i] = clock[T0], pair
-        log.mode_from[i], log.mode_to[i] = ON if old == RELEASED else old, new
+        log.mode_from[i], log.mode_to[i] = old, new
         log.rate[i] = gap_and_rate(p, state, pair)[1]
         log.length[0] = i + 1
 
 
-@numba.njit(cache=True, error_model="numpy")
+@kernel()
 def within_range(p, state) -> bool:  # type: ignore[no-untyped-def]
     """Tell whether the model still holds: |theta| <= 45 degrees and no penetration beyond half the cavity."""
     if abs(state.y[THETA]) > 0.7853981633974483:
