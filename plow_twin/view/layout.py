@@ -14,7 +14,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.view.columns import ROS_TIME, STEP
-from plow_twin.view.section import ARROW_MM_PER_N, PAIR_COLORS, Section
+from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
 
 FORCE: Final = tuple(f"force/{name}" for name in PAIR_NAMES)
 FORCE_AT_STAMP: Final = tuple(f"force_at_stamp/{name}" for name in PAIR_NAMES)
@@ -24,7 +24,7 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
-_LOAD_COLORS: Final = ((204, 121, 167), (86, 180, 233), (200, 200, 200))
+_LOAD_COLORS: Final = (LOAD_COLOR, (86, 180, 233), (200, 200, 200))
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
 
 
@@ -37,8 +37,9 @@ def blueprint(section: Section) -> rrb.Blueprint:
         visual_bounds=rrb.VisualBounds2D(x_range=(-half_x, half_x), y_range=(-half_y, half_y)),
         background=(24, 26, 30),
     )
+    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     below = rrb.Tabs(
-        rrb.TextLogView(origin="events", name="Events"),
+        rrb.TextLogView(origin="events", name="Events", columns=columns),
         rrb.TextDocumentView(origin="about", name="About this run"),
         rrb.TimeSeriesView(origin="quality", name="Data quality [ms]"),
         active_tab=0,
@@ -52,10 +53,10 @@ def blueprint(section: Section) -> rrb.Blueprint:
             _plot("wear", "Wear depth of the pads with 5..95 % interval [mm]"),
             active_tab=0,
         ),
-        row_shares=[4, 3, 3],
+        row_shares=[5, 3, 3],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(picture, below, row_shares=[3, 1]), curves, column_shares=[1, 1]),
+        rrb.Horizontal(rrb.Vertical(picture, below, row_shares=[7, 2]), curves, column_shares=[5, 6]),
         rrb.TimePanel(state="collapsed", timeline=ROS_TIME),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -116,7 +117,7 @@ The head ({scene.head.mass_kg:g} kg) moves about the fixed frame of the guide
 Where a corner of the frame meets a wall of the cavity, an arrow shows the force on the head (100 kN are
 {1e5 * ARROW_MM_PER_N:g} mm long), in the colour of its curve. Everything is to scale but the outer outline of the head.
 
-- grey: frame, with its corners; white: the cavity and, schematically, the body of the head
+- grey: frame, with its corners; white: the cavity and, schematically, the body of the head; violet: the load on it
 - force curves: the largest force between two messages, no peak is left out (`force_at_stamp`: the force at the stamp)
 - the cross-section is thinned in time; curves keep every row
 - timelines: `{ROS_TIME}` is the stamp, `{STEP}` counts the advances of the model

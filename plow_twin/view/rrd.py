@@ -21,13 +21,14 @@ from plow_twin.stream.journal import Hold, Sample
 from plow_twin.view import layout
 from plow_twin.view.columns import Batches, Curves, buffers
 from plow_twin.view.events import Events
-from plow_twin.view.section import PAIR_COLORS, Section
+from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
 
 #: The cross-section moves at this rate [Hz]; curves keep every row.
 SECTION_HZ: Final = 100.0
 #: Stamps further than that from the recorder's clock [ns] are on another clock: no age is drawn.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
+_WHITE: Final = (235, 235, 235)
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,8 @@ class _Run:
         self.head = Batches(stream, "section/head", rr.LineStrips2D, ("strips",))
         self.corners = Batches(stream, "section/corners", rr.Points2D, ("positions", "radii"))
         self.arrows = Batches(stream, "section/force", rr.Arrows2D, ("origins", "vectors", "colors", "labels"))
+        self.names = Batches(stream, "section/head/name", rr.Points2D, ("positions",))
+        self.load_arrow = Batches(stream, "section/load", rr.Arrows2D, ("origins", "vectors", "labels"))
         self.events = Events(stream)
         self.slow: tuple[Curves, Curves] | None = None
         self.section_rows = 0
@@ -121,6 +124,7 @@ class _Run:
         self._first_ns: int | None = None
         self._sample_ns: int | None = None
         self._contact: JointState | None = None
+        self._wrench = (0.0, 0.0, 0.0)
         self._handlers: dict[str, Callable[[OutputRecord, Any], None]] = {
             header.topic("contact_forces"): self._contact_forces,
             header.topic("contact_peaks"): self._contact_peaks,
@@ -139,13 +143,17 @@ class _Run:
         layout.style_curves(self.stream)
         outline = self.section.frame_strip()
         self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
-        if any(self.section.labels):
-            places, names = 0.8 * self.section.corners(), self.section.labels
-            labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
-            self.stream.log("section/labels", labels, static=True)
-        self.stream.log("section/head", rr.LineStrips2D.from_fields(colors=[(235, 235, 235)], radii=[0.9]), static=True)
-        self.stream.log("section/corners", rr.Points2D.from_fields(colors=[(235, 235, 235)]), static=True)
+        places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.43 * self.section.frame[1]]]))
+        names = (*self.section.labels, "frame (fixed)")
+        labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
+        self.stream.log("section/frame/names", labels, static=True)
+        self.stream.log("section/head", rr.LineStrips2D.from_fields(colors=[_WHITE], radii=[0.9]), static=True)
+        self.stream.log("section/corners", rr.Points2D.from_fields(colors=[_WHITE]), static=True)
         self.stream.log("section/force", rr.Arrows2D.from_fields(radii=[2.2], show_labels=True), static=True)
+        name = rr.Points2D.from_fields(labels=["head (moves)"], radii=[0.1], colors=[_WHITE], show_labels=True)
+        self.stream.log("section/head/name", name, static=True)
+        load = rr.Arrows2D.from_fields(radii=[2.2], colors=[LOAD_COLOR], show_labels=True)
+        self.stream.log("section/load", load, static=True)
         document = rr.TextDocument(layout.about(scene, self.header, source), media_type=rr.MediaType.MARKDOWN)
         self.stream.log("about", document, static=True)
 
@@ -158,7 +166,7 @@ class _Run:
             self._stamp_ns = stamp_ns
             self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
         if isinstance(entry, Sample):
-            fx, fy, moment = entry.wrench
+            fx, fy, moment = self._wrench = entry.wrench
             self.load.add(stamp_ns, self.step, (fx / 1e3, fy / 1e3, moment / 1e3))
             self._quality(stamp_ns, record.log_time_ns)
         self.events.entry(stamp_ns, max(self.step, 0), entry, self.header.excitation_source)
@@ -196,12 +204,23 @@ class _Run:
         theta = 2.0 * math.atan2(message.orientation[2], message.orientation[3])
         pose = (message.position[0], message.position[1], theta)
         self.head.add(stamp_ns, self.step, strips=list(self.section.head_strips(pose)))
+        self._load(stamp_ns, pose)
         radii = self.section.corner_radii(contact.effort)
         self.corners.add(stamp_ns, self.step, positions=self.section.corners(), radii=radii)
         origins, vectors, pairs = self.section.arrows(theta, contact.effort)
         colors = [PAIR_COLORS[pair] for pair in pairs]
         labels = [f"{contact.effort[pair] / 1e3:.0f} kN" for pair in pairs]
         self.arrows.add(stamp_ns, self.step, origins=origins, vectors=vectors, colors=colors, labels=labels)
+
+    def _load(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
+        """Draw the head's name and the sampled load at its centre; the scene's own loads are not journalled."""
+        centre, name = self.section.head_points(pose)
+        self.names.add(stamp_ns, self.step, positions=[name])
+        fx, fy, moment = self._wrench
+        if self.header.excitation_source != "scene":
+            vector = (ARROW_MM_PER_N * fx, -ARROW_MM_PER_N * fy)
+            label = f"load {math.hypot(fx, fy) / 1e3:.0f} kN, {moment / 1e3:+.0f} kN m"
+            self.load_arrow.add(stamp_ns, self.step, origins=[centre], vectors=[vector], labels=[label])
 
     def _clearance(self, record: OutputRecord, message: JointState) -> None:
         pads = np.array([name.startswith("pad_") for name in message.name])

@@ -27,6 +27,7 @@ BODY_MARGIN_MM: Final = 60.0
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
 PAIR_COLORS: Final = tuple(color for pair in zip(_HUES, _LIGHTER, strict=True) for color in pair)
+LOAD_COLOR: Final = (204, 121, 167)
 
 _SQUARE: Final[Array] = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
 _FLIP: Final[Array] = np.array([1.0, -1.0])
@@ -63,12 +64,12 @@ class Section:
 
     def head_strips(self, pose: Iterable[float]) -> Array:
         """Outlines of the cavity and of the body at a pose x, y [m], theta [rad], shape (2, 5, 2)."""
-        x, y, theta = pose
         sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
-        points = 0.5 * sides[:, None, :] * _SQUARE
-        turn = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
-        strips: Array = (points @ turn + _MM * np.array([x, y])) * _FLIP
-        return strips
+        return _placed(0.5 * sides[:, None, :] * _SQUARE, pose)
+
+    def head_points(self, pose: Iterable[float]) -> Array:
+        """Centre of the cavity and the place of the head's name, shape (2, 2)."""
+        return _placed(np.array([[0.0, 0.0], [0.0, 0.5 * self.cavity[1] + 0.5 * BODY_MARGIN_MM]]), pose)
 
     def arrows(self, theta: float, force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
         """Origins and vectors of the forces on the head, shape (k, 2), and the pairs that they belong to, (k,)."""
@@ -83,3 +84,11 @@ class Section:
         """Radius of each corner's mark [mm]: larger where the corner carries force, shape (4,)."""
         total = force.reshape(PAIR_COUNT // 2, 2).sum(axis=1)
         return np.where(total >= FAINT_N, 7.0, 3.0)
+
+
+def _placed(points: Array, pose: Iterable[float]) -> Array:
+    """Return points of the head, shape (..., 2) [mm], where the pose x, y [m], theta [rad] puts them, y downwards."""
+    x, y, theta = pose
+    turn = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
+    placed: Array = (points @ turn + _MM * np.array([x, y])) * _FLIP
+    return placed
