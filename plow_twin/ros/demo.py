@@ -1,0 +1,312 @@
+"""The main job, live: publisher, node and recorder in processes of their own, watched and summed up."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import IO, Any, Final
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, corner_of
+from plow_twin.ros.run_summary import SENSES, RunSummary, corner_letters, summarise
+
+DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
+#: Compiling the solver for the first time takes some 20 s on a small machine [s].
+_START_TIMEOUT_S: Final = 300.0
+_STOP_TIMEOUT_S: Final = 10.0
+_RATE_HZ: Final = 1000.0
+#: Without progress for so long, the run has failed [s].
+_STUCK_S: Final = 30.0
+
+
+class DemoError(PlowTwinError):
+    """A process of the demo failed; the message says which one and what it said."""
+
+
+@dataclass
+class Watch:
+    """The newest figures of `/diagnostics`, by part and key."""
+
+    parts: dict[str, dict[str, str]] = field(default_factory=dict)
+    reports: int = 0
+
+    def take(self, message: Any) -> None:
+        """Take in one DiagnosticArray."""
+        for status in message.status:
+            part = status.name.partition(": ")[2]
+            self.parts[part] = {value.key: value.value for value in status.values}
+        self.reports += 1
+
+    def text(self, part: str, key: str) -> str:
+        """Return one figure, empty before the first report."""
+        return self.parts.get(part, {}).get(key, "")
+
+    def number(self, part: str, key: str) -> float:
+        """Return one figure as a number, 0 when there is none."""
+        return float(self.text(part, key) or 0.0)
+
+
+def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
+    """Run the twin on the paper's load and print what happened.
+
+    Parameters
+    ----------
+    speed
+        `real`: by the clock of the machine; `fast`: under /clock, as fast as the machine goes.
+    seconds
+        Machine time to run [s].
+    out
+        Folder in which a new one is made for this run: recording, view, logs.
+    quiet
+        No progress and no table.
+
+    Returns
+    -------
+    int
+        0 done, 1 failed, 3 done with counted loss.
+    """
+    folder = out / datetime.now().strftime("%Y%m%d_%H%M%S_%f")
+    folder.mkdir(parents=True)
+    _set_environment(folder)
+    console = Console(stderr=True)
+    try:
+        watch, sent = _run(speed, seconds, folder, console, quiet)
+        summary = summarise(folder / "run")
+        view = _view(folder)
+    except PlowTwinError as error:
+        console.print(f"demo failed: {error}", style="red", markup=False, highlight=False)
+        return FAILED
+    lost = _losses(watch, sent, summary)
+    if not quiet:
+        _print(Console(), watch, summary, sent, lost)
+        _print_places(Console(), folder / "run", view)
+    return DONE_WITH_LOSS if any(lost.values()) else DONE
+
+
+def _set_environment(folder: Path) -> None:
+    """Keep the demo's processes to themselves: this machine only, a domain of their own."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    # domains above 101 share their ports with outgoing connections
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)
+    os.environ.setdefault("ROS_LOG_DIR", str((folder / "log").resolve()))
+
+
+def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool) -> tuple[Watch, int]:
+    """Run both processes to their end; return the node's last figures and the number of samples sent."""
+    node = [
+        *("plow_twin.ros.main", "--ros-args"),
+        *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
+        # the last sample is followed by the stop, not by the hold policy
+        *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
+    ]
+    publisher = ["plow_twin.ros.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
+    with _progress(console, quiet) as bar, _watching() as (watch, spin), _process(node, folder / "node.log") as twin:
+        task = bar.add_task("compiling the solver", total=None)
+        _until(lambda: watch.text("state", "lifecycle") == "active", spin, twin, _START_TIMEOUT_S)
+        bar.update(task, description="running", total=seconds, completed=0.0)
+        with _process([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
+            _follow(source, twin, watch, spin, bar, task)
+            sent = int(json.loads(source.output().splitlines()[-1])["sent"])
+        reports = watch.reports
+        _until(lambda: watch.reports > reports, spin, twin, _STOP_TIMEOUT_S)
+        twin.stop()
+    return watch, sent
+
+
+def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, task: TaskID) -> None:
+    """Show the model's time until the publisher has ended."""
+    moved, reached = time.monotonic(), 0.0
+    while source.running:
+        spin()
+        twin.check()
+        now = watch.number("state", "model_time_s")
+        if now > reached:
+            moved, reached = time.monotonic(), now
+        elif time.monotonic() - moved > _STUCK_S:
+            raise DemoError(f"no progress for {_STUCK_S:g} s at model time {reached:g} s\n{twin.output()}")
+        bar.update(task, completed=reached)
+    source.check(allowed=(0, 3))
+
+
+def _until(reached: Any, spin: Any, twin: Child, timeout_s: float) -> None:
+    give_up = time.monotonic() + timeout_s
+    while not reached():
+        spin()
+        twin.check()
+        if time.monotonic() > give_up:
+            raise DemoError(f"the node did not get there within {timeout_s:g} s\n{twin.output()}")
+
+
+class Child:
+    """A process of the demo; its output goes to a file."""
+
+    def __init__(self, arguments: list[str], log: Path) -> None:
+        self._name = arguments[0]
+        self._log = log
+        self._stream: IO[bytes] = log.open("wb")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", *arguments], stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
+        )
+
+    @property
+    def running(self) -> bool:
+        """Whether the process has not ended yet."""
+        return self._process.poll() is None
+
+    def output(self) -> str:
+        """Return what the process has said so far."""
+        return self._log.read_text(errors="replace").strip()
+
+    def check(self, allowed: tuple[int, ...] = ()) -> None:
+        """Raise when the process has ended with another code than those allowed."""
+        code = self._process.poll()
+        if code is not None and code not in allowed:
+            raise DemoError(f"{self._name} ended with code {code}\n{self.output()}")
+
+    def stop(self) -> None:
+        """Ask for a clean stop and insist on one."""
+        if self.running:
+            self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(_STOP_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            raise DemoError(f"{self._name} did not stop within {_STOP_TIMEOUT_S:g} s\n{self.output()}") from None
+        self.check(allowed=(0,))
+
+    def end(self) -> None:
+        """End the process whatever it does."""
+        if self.running:
+            self._process.terminate()
+            try:
+                self._process.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        self._stream.close()
+
+
+@contextmanager
+def _process(arguments: list[str], log: Path) -> Iterator[Child]:
+    child = Child(arguments, log)
+    try:
+        yield child
+    finally:
+        child.end()
+
+
+@contextmanager
+def _watching() -> Iterator[tuple[Watch, Any]]:
+    """Listen to /diagnostics; yields the figures and a function that waits a little for news."""
+    import rclpy.utilities
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.signals import SignalHandlerOptions
+
+    from plow_twin.ros.main import make_executor
+    from plow_twin.ros.qos import DIAGNOSTICS
+
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        watch, node, executor = Watch(), rclpy.create_node("plow_twin_demo"), make_executor()
+        node.create_subscription(DiagnosticArray, "/diagnostics", watch.take, DIAGNOSTICS)
+        executor.add_node(node)
+        yield watch, lambda: executor.spin_once(timeout_sec=0.1)
+        executor.remove_node(node)
+        node.destroy_node()
+    finally:
+        rclpy.utilities.try_shutdown()
+
+
+@contextmanager
+def _progress(console: Console, quiet: bool) -> Iterator[Progress]:
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.1f} s"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=quiet) as bar:
+        yield bar
+
+
+def _view(folder: Path) -> Path | None:
+    """Make the .rrd where rerun is installed."""
+    try:
+        import rerun  # noqa: F401
+
+        from plow_twin.view import to_rrd
+    except ModuleNotFoundError:
+        return None
+    path = folder / "run.rrd"
+    to_rrd(folder / "run", path)
+    return path
+
+
+def _losses(watch: Watch, sent: int, summary: RunSummary) -> dict[str, int]:
+    """Return all counted loss of the run: nothing of it is forgiven."""
+    published = int(watch.number("output", "published"))
+    return {
+        "sent, not used": sent - int(watch.number("input", "samples_used")),
+        "lost by the middleware": int(watch.number("input", "messages_lost")),
+        "not published": int(watch.number("output", "withheld")),
+        "published, not recorded": published - summary.frames,
+        "failed advances": int(watch.number("state", "solver_failures")),
+    }
+
+
+def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost: dict[str, int]) -> None:
+    console.print(_force_table(summary))
+    for sense, shares in summary.contact_sets.items():
+        sets = "  ".join(f"{corners} {share:.1%}" for corners, share in shares.items() if share >= 0.001)
+        console.print(f"contact sets {sense}: {sets or 'none'}", highlight=False, soft_wrap=True)
+    for name, (value, low, high) in summary.clearance.items():
+        interval = f"prior {low * 1e3:.4f} .. {high * 1e3:.4f} mm"
+        console.print(f"{name} clearance {value * 1e3:.4f} mm ({interval})", highlight=False)
+    wear = (
+        "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e6:.4f} um, deepest pad"
+    )
+    console.print(f"wear {wear}", highlight=False)
+    used, out = watch.text("input", "samples_used"), watch.text("output", "published")
+    console.print(f"samples sent {sent}, used {used}, frames out {out}, lost {sum(lost.values())}", highlight=False)
+    for name, count in lost.items():
+        if count:
+            console.print(f"  {name}: {count}", style="red", highlight=False)
+    factor = watch.text("state", "real_time_factor_mean")
+    p50, p99 = watch.text("output", "latency_p50_ms"), watch.text("output", "latency_p99_ms")
+    console.print(f"real-time factor {factor}; latency p50 {p50} ms, p99 {p99} ms", highlight=False)
+
+
+def _force_table(summary: RunSummary) -> Table:
+    table = Table(title="Contact forces in kN: largest, mean in contact, touches")
+    letters = corner_letters(summary.scene)
+    table.add_column("corner", no_wrap=True)
+    for sense in SENSES:
+        for column in ("max", "mean", "touches"):
+            table.add_column(f"{sense} {column}", justify="right", no_wrap=True)
+    for corner in CORNER_NAMES:
+        pairs = [pair for pair in range(PAIR_COUNT) if corner_of(pair) == corner]
+        cells = []
+        for mask in SENSES.values():
+            pair = next(pair for pair in pairs if mask[pair])
+            cells += [f"{summary.largest[pair] / 1e3:.1f}", f"{summary.mean_in_contact[pair] / 1e3:.1f}"]
+            cells.append(f"{summary.touches[pair]:.0f}")
+        table.add_row(f"{letters[corner]} {corner.replace('_', ' ')}", *cells)
+    return table
+
+
+def _print_places(console: Console, recording: Path, view: Path | None) -> None:
+    console.print(f"recording  {recording}", highlight=False, soft_wrap=True)
+    console.print(f"  again, bit for bit:  plow-twin replay {recording}", highlight=False, soft_wrap=True)
+    if view is None:
+        console.print("no view: rerun is not installed (pip install 'plow_twin[view]')", markup=False, highlight=False)
+        return
+    console.print(f"view       {view}", highlight=False, soft_wrap=True)
+    console.print(f"  look at it:          rerun {view}", highlight=False, soft_wrap=True)
