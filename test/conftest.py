@@ -1,9 +1,8 @@
-"""Set-up of every test process: ROS kept to this machine, compiled kernels shared, skips accounted for."""
+"""Set-up of every test process: ROS kept to this machine, skips accounted for."""
 
 from __future__ import annotations
 
 import atexit
-import hashlib
 import os
 import shutil
 import tempfile
@@ -18,7 +17,7 @@ SKIPS = ROOT / "test" / "skips.txt"
 
 
 def _prepare_environment() -> None:
-    """Set what child processes inherit; runs before rclpy or numba are imported anywhere."""
+    """Set what child processes inherit; runs before rclpy is imported anywhere."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
     # 1..101 keeps clear of the ephemeral ports; two runs at once get two domains
@@ -26,18 +25,6 @@ def _prepare_environment() -> None:
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
-    # numba misses a change in a function that another file inlines: one cache for each state of the sources
-    folder = Path(tempfile.gettempdir()) / f"plow_twin-numba-{os.getuid()}" / _source_hash()
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
-
-
-def _source_hash() -> str:
-    digest = hashlib.sha256()
-    for path in sorted((ROOT / "plow_twin").rglob("*.py")):
-        text = path.read_bytes()
-        if b"numba" in text:
-            digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + text)
-    return digest.hexdigest()[:16]
 
 
 _prepare_environment()

@@ -61,7 +61,7 @@ def _scene(target: str, as_json: bool) -> int:
         return DONE
     console = output_console()
     marks = table(f"{target}: what is stated", "number", "value", "unit", "mark")
-    marks.add_column("source", overflow="fold")
+    marks.add_column("source")
     for row in rows:
         marks.add_row(row["key"], f"{row['value']:g}", row["unit"], row["mark"], row["source"])
     console.print(marks)

@@ -48,7 +48,10 @@ def simulate(
     _check_usage(out, method, dt)
     result = _run(scene, quiet, t_end, output_dt, tol, method, dt)
     if out is not None:
-        write_samples(result, out)
+        try:
+            write_samples(result, out)
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(out)) from None
     if as_json:
         click.echo(json.dumps(as_plain(result, scene, t_end), indent=2, allow_nan=False))
     elif not quiet:

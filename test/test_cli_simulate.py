@@ -1,0 +1,157 @@
+"""The command line, run as a user runs it: files, JSON, exit codes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plow_twin import PAIR_NAMES, simulate
+from plow_twin.presets import scene_path
+from plow_twin.scene_file import dump_scene, load_scene
+
+RUN = ["simulate", "paper", "--t-end", "2", "--output-dt", "0.01"]
+
+
+def plow_twin(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "plow_twin", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=110, stdin=subprocess.DEVNULL)
+
+
+def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
+    done = plow_twin(*RUN, "--tol", "1e-10", "--out", "run.csv", "--json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    result = simulate(load_scene(scene_path("paper")), 2.0, 0.01, tol=1e-10)
+
+    with (tmp_path / "run.csv").open() as file:
+        header, *rows = csv.reader(file)
+    assert header == ["t", "x", "y", "theta", "vx", "vy", "omega", *(f"force_{name}" for name in PAIR_NAMES)]
+    expected = np.column_stack([result.t, result.q, result.v, result.force])
+    np.testing.assert_array_equal(np.array(rows, dtype=float), expected)  # 17 digits lose nothing
+
+    answer = json.loads(done.stdout)
+    assert answer.keys() == {"scene", "t_end", "pairs", "contact_sets", "solver", "wall_s", "compile_s"}
+    assert (answer["scene"], answer["t_end"]) == ("paper", 2.0)
+    assert tuple(answer["pairs"]) == PAIR_NAMES
+    assert answer["pairs"] == result.statistics
+    for row in answer["pairs"].values():
+        assert row.keys() == {"max", "mean_in_contact", "mean_over_time", "impulse", "time_in_contact", "makes"}
+    assert answer["contact_sets"] == result.contact_sets
+    assert answer["contact_sets"].keys() == {"ccw", "cw"}
+    assert sum(answer["contact_sets"]["cw"].values()) == pytest.approx(1.0)
+    assert answer["solver"].keys() >= {"method", "steps", "evaluations", "events"}
+    assert answer["wall_s"] > 0.0
+    assert answer["compile_s"] >= 0.0
+
+
+def test_npz_keeps_the_contract(tmp_path: Path) -> None:
+    done = plow_twin(*RUN, "--out", str(tmp_path / "run.npz"), "--quiet")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    result = simulate(load_scene(scene_path("paper")), 2.0, 0.01)
+    with np.load(tmp_path / "run.npz") as run:
+        assert set(run) == {
+            *("t", "q", "v", "force", "penetration"),
+            *("event_time", "event_pair", "event_from", "event_to", "event_rate"),
+        }
+        for name in ("t", "q", "v", "force", "penetration"):
+            np.testing.assert_array_equal(run[name], getattr(result, name))
+        assert run["q"].shape == (201, 3)
+        assert run["force"].shape == (201, 8)
+        np.testing.assert_array_equal(run["event_time"], result.events["time"])
+        np.testing.assert_array_equal(run["event_to"], result.events["mode_to"])
+        assert set(run["event_to"]) <= {0, 1, 2}
+        assert len(run["event_time"]) > 10
+
+
+def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
+    answers = {}
+    for method, extra in (("events", []), ("rk4", ["--dt", "1e-4"]), ("euler", ["--dt", "1e-5"])):
+        done = plow_twin("simulate", "bench_kv", "--t-end", "1", "--method", method, *extra, "--json")
+        assert done.returncode == 0, done.stderr
+        answers[method] = json.loads(done.stdout)
+        assert answers[method]["solver"]["method"] == method
+    assert answers["rk4"]["solver"]["steps"] == 10_000
+    exact = answers["events"]["pairs"]
+    largest = max(exact, key=lambda name: exact[name]["impulse"])
+    for method in ("rk4", "euler"):
+        assert answers[method]["pairs"][largest]["impulse"] == pytest.approx(exact[largest]["impulse"], rel=1e-3)
+        assert answers[method]["pairs"][largest]["max"] == pytest.approx(exact[largest]["max"], rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["simulate", "paper"], "--t-end"),
+        (["simulate", "paper", "--t-end", "nan"], "got 'nan', expected a finite number > 0"),
+        (["simulate", "paper", "--t-end", "1", "--out", "run.txt"], "expected a name that ends in .csv or .npz"),
+        (["simulate", "paper", "--t-end", "1", "--out", "no/run.csv"], "expected an existing folder"),
+        (["simulate", "paper", "--t-end", "1", "--method", "rk4"], "--dt"),
+        (["simulate", "paper", "--t-end", "1", "--dt", "1e-3"], "--dt"),
+        (
+            ["simulate", "paper", "--t-end", "1", "--method", "rk4", "--dt", "1e-3", "--output-dt", "0.0015"],
+            "output_dt",
+        ),
+        (["simulate", "missing.yaml", "--t-end", "1"], "missing.yaml"),
+        (["simulate", "bad.yaml", "--t-end", "1"], "head.mass: got 2430.0, expected a known key, nearest is mass_kg"),
+        (["replay", "missing.mcap"], "missing.mcap"),
+        (["demo", "--speed", "warp"], "warp"),
+        (["nonsense"], "nonsense"),
+    ],
+)
+def test_wrong_usage_and_wrong_scenes_exit_with_2(arguments: list[str], said: str, tmp_path: Path) -> None:
+    plain = dump_scene(replace(load_scene(scene_path("paper")), marks={}))
+    (tmp_path / "bad.yaml").write_text(plain.replace("mass_kg", "mass"))
+    done = plow_twin(*arguments, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+
+
+def test_what_cannot_be_done_exits_with_1(tmp_path: Path) -> None:
+    (tmp_path / "no.mcap").write_bytes(b"not a recording")
+    (tmp_path / "full.csv").symlink_to("/dev/full")
+    for arguments, said in (
+        (["info", "no.mcap"], "no.mcap"),
+        (["replay", "no.mcap"], "no.mcap"),
+        (["simulate", "paper", "--t-end", "0.1", "--out", "full.csv"], "full.csv: No space left on device"),
+    ):
+        done = plow_twin(*arguments, cwd=tmp_path)
+        assert done.returncode == 1, done.stderr
+        assert said in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:
+    (tmp_path / "mcap.py").write_text("raise ModuleNotFoundError(\"No module named 'mcap'\", name='mcap')")
+    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
+    done = plow_twin("replay", "run.mcap", cwd=tmp_path)  # -m puts the working directory first on the path
+    assert done.returncode == 1
+    assert "pip install 'plow_twin[record]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_info_lists_marks_and_versions() -> None:
+    done = plow_twin("info", "paper", "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    rows = {row["key"]: row for row in facts["numbers"]}
+    assert rows["contact.stiffness"] | {"source": ""} == {
+        "key": "contact.stiffness",
+        "value": 9.6975e6,
+        "unit": "N/m^exponent",
+        "mark": "reconstructed",
+        "source": "",
+    }
+    derived = {fact["quantity"]: fact["value"] for fact in facts["derived"]}
+    assert derived["constant moment of gravity"] == pytest.approx(-2430 * 9.81 * 0.255)
+    assert derived["fx1: amplitude of the moment"] == pytest.approx(-66240)
+    environment = plow_twin("info", "--json")
+    assert environment.returncode == 0, environment.stderr
+    assert json.loads(environment.stdout)["numpy"] == np.__version__

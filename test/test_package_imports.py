@@ -1,0 +1,90 @@
+"""The rooms of the package: who may import whom, and which library is let in where."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
+
+CORE = {"errors", "model", "solve", "twin", "simulate"}
+#: For each room of the package, the rooms it may import.
+ROOMS = {
+    "errors": set(),
+    "presets": set(),
+    "model": {"errors"},
+    "solve": {"errors", "model"},
+    "twin": {"errors", "model", "solve"},
+    "simulate": {"errors", "model", "solve"},
+    "scene_file": {"errors", "model"},
+    "stream": CORE,
+    "record": CORE | {"scene_file", "stream"},
+    "view": CORE | {"scene_file", "stream", "record"},
+    "study": CORE | {"scene_file", "presets"},
+    "ros": CORE | {"scene_file", "presets", "stream", "record", "view"},
+    "cli": CORE | {"scene_file", "presets", "stream", "record", "view", "study", "ros"},
+    "__init__": CORE,
+    "__main__": {"cli"},
+}
+MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std")}
+#: Libraries beside numpy, by room.
+LIBRARIES = {
+    "model": {"scipy", "numba"},
+    "solve": {"scipy", "numba"},
+    "twin": {"scipy", "numba"},
+    "simulate": {"scipy", "numba"},
+    "scene_file": {"yaml", "jsonschema"},
+    "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite"},
+    "view": {"rerun"},
+    "study": {"scipy", "numba"},
+    "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", "rich", *MESSAGES},
+    "cli": {"click", "rich"},
+}
+
+
+def _modules() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def _imports(path: Path) -> Iterator[str]:
+    """Yield the full name of every import, the lazy ones included."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: a relative import"
+            if node.module == "plow_twin":
+                yield from (f"plow_twin.{alias.name}" for alias in node.names)
+            else:
+                yield node.module or ""
+
+
+@pytest.mark.parametrize("path", _modules(), ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_imports_point_one_way(path: Path) -> None:
+    room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    rooms = {name.split(".")[1] for name in _imports(path) if name.startswith("plow_twin.")} - {room}
+    assert rooms <= ROOMS[room], f"{room} must not import {sorted(rooms - ROOMS[room])}"
+    libraries = {name.split(".")[0] for name in _imports(path)} - {"plow_twin", "numpy"} - sys.stdlib_module_names
+    allowed = LIBRARIES.get(room, set())
+    assert libraries <= allowed, f"{room} must not import {sorted(libraries - allowed)}"
+
+
+@pytest.mark.parametrize(
+    ("statement", "unwanted"),
+    [
+        ("import plow_twin", {"jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"}),
+        ("import plow_twin.stream.session", {"jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"}),
+        ("import plow_twin.cli, plow_twin.record.replay", {"mcap", "rosbags", "rerun", "rclpy"}),
+    ],
+)
+def test_heavy_libraries_are_imported_where_they_are_used(statement: str, unwanted: set[str]) -> None:
+    code = f"{statement}\nimport sys\nprint(*sys.modules)"
+    output = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    loaded = set(output.split())
+    assert "numpy" in loaded
+    assert not unwanted & loaded
