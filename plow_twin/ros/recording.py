@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Final
 
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
@@ -18,6 +19,8 @@ from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Frame
 from plow_twin.stream.session import Session
+
+_QUEUE_SIZE: Final = 20_000
 
 
 class Recording:
@@ -59,7 +62,9 @@ class Recording:
             clock="system" if clock is None else "ros",
             parameters=asdict(settings),
         )
-        self._recorder = Recorder(Path(settings.record_path), header, now_ns=clock or time.time_ns, on_error=on_error)
+        self._recorder = Recorder(
+            Path(settings.record_path), header, queue_size=_QUEUE_SIZE, now_ns=clock or time.time_ns, on_error=on_error
+        )
 
     @property
     def path(self) -> Path:
@@ -85,6 +90,11 @@ class Recording:
         level, message, values = report
         status = DiagnosticStatus(level[0], name, message, hardware_id, tuple(values.items()))
         self._recorder.output(self._topics["status"], stamp_ns, status)
+
+    @property
+    def behind(self) -> bool:
+        """Whether so much is queued that losses are near."""
+        return self._recorder.counters.queued > _QUEUE_SIZE // 2
 
     def renew(self, session: Session) -> None:
         """Journal a snapshot when entries were lost and there is room again."""

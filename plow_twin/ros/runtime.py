@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from plow_twin.ros.diagnostics import Part
     from plow_twin.ros.recording import Recording
     from plow_twin.twin import Advance
+
+_CATCH_UP_S: Final = 0.002
 
 
 class Runtime:
@@ -210,6 +212,9 @@ class Runtime:
             self._publish()
         if self.recording:
             self.recording.renew(self.driver.session)
+            if self.sim_time and self.recording.behind:
+                # under /clock nothing is late: a bounded pause lets the recorder's thread catch up
+                time.sleep(_CATCH_UP_S)
         self._changed()
 
     def _publish(self) -> None:

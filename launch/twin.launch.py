@@ -1,0 +1,47 @@
+"""Start the twin: `ros2 launch plow_twin twin.launch.py scene:=paper record_path:=runs/monday`.
+
+With `autostart:=false` the node waits for lifecycle requests (`ros2 lifecycle set /plow_twin configure`).
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
+
+ARGUMENTS = {
+    "namespace": ("", "namespace of the node and its topics"),
+    "params_file": (PathJoinSubstitution([FindPackageShare("plow_twin"), "config", "twin.yaml"]), "parameter file"),
+    "scene": ("paper", "scene file or preset"),
+    "record_path": ("", "folder to make for the recording; empty: none"),
+    "use_sim_time": ("false", "take the time from /clock"),
+    "autostart": ("true", "configure and activate at start"),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return one twin; arguments override the parameter file."""
+    given = {name: LaunchConfiguration(name) for name in ARGUMENTS}
+    overrides = {
+        "scene": ParameterValue(given["scene"], value_type=str),
+        "record_path": ParameterValue(given["record_path"], value_type=str),
+        "use_sim_time": ParameterValue(given["use_sim_time"], value_type=bool),
+        "autostart": ParameterValue(given["autostart"], value_type=bool),
+    }
+    twin = Node(
+        package="plow_twin",
+        executable="twin",
+        name="plow_twin",
+        namespace=given["namespace"],
+        parameters=[given["params_file"], overrides],
+        # the node closes its recording first, within 5 s
+        sigterm_timeout="6",
+        sigkill_timeout="6",
+        output="screen",
+    )
+    arguments = [
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in ARGUMENTS.items()
+    ]
+    return LaunchDescription([*arguments, twin])
