@@ -3,12 +3,13 @@
 With `autostart:=false` the node waits for lifecycle requests (`ros2 lifecycle set /plow_twin configure`).
 """
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
 
 ARGUMENTS = {
     "namespace": ("", "namespace of the node and its topics"),
