@@ -152,6 +152,7 @@ class Recorder:
                 return True
             self._snapshot_due = True
             if not (self._journal_gap and snapshot):
+                self._sequence += 1  # a lost entry leaves its number free: messages sent meanwhile point to it
                 self._journal_gap += 1
                 self._lost[JOURNAL] += 1
             return False

@@ -246,8 +246,8 @@ class _Replay:
         report = self.report
         report.status, report.damaged_chunks, report.wall_s = reader.status, reader.damaged_chunks, wall_s
         report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
-        if self.gaps:
-            report.lost["journal, damaged"] = self.gaps
+        if self.gaps > self.noted["journal"]:
+            report.lost["journal, unaccounted"] = self.gaps - self.noted["journal"]
         if self.first_ns is not None and self.session.stamp_ns is not None:
             report.span_s = (self.session.stamp_ns - self.first_ns) * 1e-9
         return report

@@ -73,9 +73,9 @@ def to_rrd(
     reader = RunReader(Path(path))
     scene = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
     section = Section.of(scene)
-    out.parent.mkdir(parents=True, exist_ok=True)
     stream = rr.RecordingStream("plow_twin")
     try:
+        out.parent.mkdir(parents=True, exist_ok=True)
         stream.save(out, default_blueprint=layout.blueprint(section))
     except Exception as error:  # the SDK raises RuntimeError and OSError alike
         raise RecordingError(f"{out}: cannot be written: {error}") from error

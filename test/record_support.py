@@ -1,0 +1,131 @@
+"""Recordings for the tests: a real twin, session and recorder in this process, and files rewritten."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+
+from plow_twin.presets import scene_path
+from plow_twin.record.header import RunHeader
+from plow_twin.record.messages import Message
+from plow_twin.record.outputs import frame_messages
+from plow_twin.record.recorder import LossReport, Recorder
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.stream.journal import Entry, Hold, Parameter, Reset, Sample, Travel
+from plow_twin.stream.session import Session
+from plow_twin.twin import Twin
+
+BASE_NS = 1_800_000_000_000_000_000
+STEP_NS = 1_000_000
+#: what the paper's loads are worth together: N, N, N m
+PAPER_AMPLITUDE = (32_000.0, -11_000.0, -45_495.0)
+
+
+def paper_sample(index: int, first_ns: int = BASE_NS) -> Sample:
+    """The paper's load at 1 kHz."""
+    phase = float(np.sin(2e-3 * index))
+    fx, fy, moment = (phase * amplitude for amplitude in PAPER_AMPLITUDE)
+    return Sample(first_ns + index * STEP_NS, (fx, fy, moment))
+
+
+def paper_entries(count: int) -> list[Entry]:
+    """Samples with one of each other kind of entry between them, and a reset half way."""
+    half = count // 2
+    entries: list[Entry] = [Parameter("hold", "hold"), *map(paper_sample, range(half))]
+    entries.insert(half // 2, Travel(BASE_NS, 2.5))
+    last_ns = BASE_NS + (half - 1) * STEP_NS
+    entries += [Hold(last_ns + 500_000_000), Reset(last_ns, "asked for"), Parameter("excitation_timeout", 0.25)]
+    return entries + [paper_sample(index, BASE_NS + 10**9 + 7) for index in range(count - half)]
+
+
+@dataclass
+class Run:
+    """A recording and all that went into it."""
+
+    folder: Path
+    file: Path
+    loss: LossReport
+    entries: list[Entry] = field(default_factory=list)
+    outputs: list[tuple[str, Message]] = field(default_factory=list)
+
+
+def record_run(
+    folder: Path, entries: Iterable[Entry], *, frame_every: int = 1, pause_every: int = 100, **options: Any
+) -> Run:
+    """Drive a twin of the paper's head by entries and record it as the node does."""
+    scene = load_scene(scene_path("paper"))
+    header = RunHeader(dump_scene(scene), parameters={"hold": "hold"})
+    recorder = Recorder(folder, header, **options)
+    run = Run(folder, recorder.path, LossReport({}, False, None))
+
+    def journal(entry: Entry) -> None:
+        run.entries.append(entry)
+        recorder.journal(entry)
+
+    session = Session(Twin(scene, excitation="sampled"), on_entry=journal)
+    session.start()
+    for index, entry in enumerate(entries):
+        session.apply(entry)
+        frame = session.outputs.take() if index % frame_every == 0 else None
+        messages = {} if frame is None else frame_messages(frame, header.frame_id, header.child_frame_id)
+        for name, message in messages.items():
+            run.outputs.append((header.topic(name), message))
+            recorder.output(header.topic(name), message.stamp_ns, message)  # type: ignore[union-attr]
+        if recorder.snapshot_wanted:
+            journal(session.snapshot())
+        if pause_every and index % pause_every == 0:
+            time.sleep(0.02)  # leaves the thread time to empty the queue
+    session.close()
+    run.loss = recorder.close()
+    return run
+
+
+def rewrite(
+    source: Path,
+    target: Path,
+    change: Callable[[str, Any], bytes | None] = lambda topic, message: None,
+    metadata: Callable[[dict[str, str]], dict[str, str]] = dict,
+) -> Path:
+    """Copy an MCAP file with other tools than the package's; `change` may return other bytes for a message."""
+    with source.open("rb") as stream, target.open("wb") as out:
+        writer = Writer(out, chunk_size=64 * 1024)
+        writer.start(profile="ros2", library="test")
+        reader = make_reader(stream)
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, metadata(dict(record.metadata)))
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                number = writer.register_channel(channel.topic, "cdr", schemas[schema.id], channel.metadata)
+                channels[channel.id] = number
+            data = change(channel.topic, message)
+            writer.add_message(
+                channels[channel.id],
+                message.log_time,
+                message.data if data is None else data,
+                message.publish_time,
+                message.sequence,
+            )
+        writer.finish()
+    return target
+
+
+def chunk_spans(file: Path) -> list[tuple[int, int]]:
+    """Offset and length of the data of each chunk of a file."""
+    spans = []
+    with file.open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if type(record).__name__ == "Chunk":
+                spans.append((stream.tell() - len(record.data), len(record.data)))
+    return spans

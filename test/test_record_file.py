@@ -1,0 +1,197 @@
+"""The recorded file: read by others, cut anywhere, damaged anywhere; the journal's entries come back exactly."""
+
+from __future__ import annotations
+
+import math
+import random
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from record_support import BASE_NS, Run, chunk_spans, paper_entries, record_run
+from rosbags.highlevel import AnyReader
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.cdr import decode, encode
+from plow_twin.record.journal_codec import Dropped, from_message, to_message
+from plow_twin.record.messages import JointState, Odometry, WrenchStamped
+from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
+from plow_twin.stream.journal import (
+    Digest,
+    Entry,
+    Hold,
+    Loss,
+    Parameter,
+    Reset,
+    Sample,
+    Snapshot,
+    Travel,
+)
+
+stamps = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9)
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+entries = st.one_of(
+    st.builds(Sample, stamps, st.tuples(numbers, numbers, numbers)),
+    st.builds(Hold, stamps),
+    st.builds(Travel, stamps, numbers),
+    st.builds(Reset, stamps, st.text()),
+    st.builds(Parameter, st.text(), st.one_of(st.booleans(), st.integers(), numbers, st.text())),
+    st.builds(Snapshot, stamps, st.binary()),
+    st.builds(Digest, stamps, st.text("0123456789abcdef", min_size=16, max_size=16)),
+    st.builds(Loss, st.integers(1)),
+    st.builds(Dropped, st.text(), st.integers(1)),
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return record_run(tmp_path_factory.mktemp("runs") / "paper", paper_entries(1500))
+
+
+@given(entries)
+def test_every_entry_comes_back_exactly(entry: Entry | Dropped) -> None:
+    message = to_message(entry, "slide_frame")
+    again = from_message(decode(encode(message), message.TYPE))
+    # repr tells -0.0 from 0.0 and 1 from 1.0 and True, which == does not
+    assert repr(again) == repr(entry)
+
+
+@given(st.lists(numbers, min_size=3, max_size=3), stamps)
+def test_equal_messages_have_equal_bytes(values: list[float], stamp_ns: int) -> None:
+    def build() -> list[bytes]:
+        three = (values[0], values[1], values[2])
+        state = JointState(stamp_ns, "é", ("a", "bb", "ccc"), velocity=np.array(values))
+        pose = Odometry(stamp_ns, "", "head", three, (0.0, 0.0, 0.6, 0.8), three, three)
+        return [encode(state), encode(pose), encode(WrenchStamped(stamp_ns, "f", three, three))]
+
+    assert build() == build()
+
+
+def test_journal_keeps_order_of_use_in_one_counter(run: Run) -> None:
+    reader = RunReader(run.folder)
+    records = list(reader)
+    journal = [record for record in records if isinstance(record, EntryRecord)]
+    assert [record.sequence for record in journal] == list(range(len(journal)))
+    assert [record.entry for record in journal] == run.entries
+    outputs = [record for record in records if isinstance(record, OutputRecord)]
+    assert [(record.topic, record.data) for record in outputs] == [(t, encode(m)) for t, m in run.outputs]
+    assert reader.status is FileStatus.COMPLETE
+    assert reader.counts.total() == len(records)
+    assert run.loss.complete
+
+
+def test_rosbags_reads_the_folder(run: Run) -> None:
+    sent = [message for topic, message in run.outputs if topic == "/contact_forces"]
+    with AnyReader([run.folder]) as reader:
+        assert {c.topic: c.msgcount for c in reader.connections} == Counter(
+            [topic for topic, _ in run.outputs]
+            + [f"/plow_twin/journal/{'samples' if isinstance(e, Sample) else 'entries'}" for e in run.entries]
+        )
+        chosen = [c for c in reader.connections if c.topic == "/contact_forces"]
+        received = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen)]
+    assert len(received) == len(sent)
+    for theirs, ours in zip(received, sent, strict=True):
+        assert isinstance(ours, JointState)
+        assert theirs.header.stamp.sec * 10**9 + theirs.header.stamp.nanosec == ours.stamp_ns
+        assert tuple(theirs.name) == ours.name
+        np.testing.assert_array_equal(theirs.effort, ours.effort)
+        np.testing.assert_array_equal(theirs.position, ours.position)
+
+
+def test_mcap_reader_finds_ros2_conventions(run: Run) -> None:
+    with run.file.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count == len(run.entries) + len(run.outputs)
+        assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+        for channel in summary.channels.values():
+            assert channel.message_encoding == "cdr"
+            assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
+            assert yaml.safe_load(channel.metadata["offered_qos_profiles"])[0]["reliability"] == "reliable"
+        previous = 0
+        for _, _, message in reader.iter_messages():
+            assert message.log_time >= previous
+            assert message.publish_time in (0, message.log_time) or message.publish_time >= BASE_NS
+            previous = message.log_time
+
+
+def test_metadata_yaml_is_that_of_rosbag2(run: Run) -> None:
+    bag = yaml.safe_load((run.folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert (bag["version"], bag["storage_identifier"], bag["ros_distro"]) == (9, "mcap", "jazzy")
+    assert bag["relative_file_paths"] == [run.file.name] == [file["path"] for file in bag["files"]]
+    assert bag["message_count"] == len(run.entries) + len(run.outputs)
+    assert bag["duration"]["nanoseconds"] > 0
+
+
+def test_rerun_checks_the_file(run: Run) -> None:
+    command = [str(Path(sys.executable).with_name("rerun")), "mcap", "check", str(run.file)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_a_file_cut_anywhere_gives_what_lies_before_the_cut(run: Run, tmp_path: Path) -> None:
+    data = run.file.read_bytes()
+    whole = list(RunReader(run.file))
+    rng = random.Random(1)
+    first_chunk = chunk_spans(run.file)[0][0]
+    cuts = {*rng.sample(range(first_chunk, len(data)), 60), *range(len(data) - 40, len(data) - 8)}
+    cut_file = tmp_path / "cut.mcap"
+    for cut in sorted(cuts):
+        cut_file.write_bytes(data[:cut])
+        reader = RunReader(cut_file)
+        records = list(reader)
+        assert records == whole[: len(records)]
+        assert reader.status is FileStatus.TRUNCATED, cut
+        assert reader.lost == {} and reader.damaged_chunks == 0
+
+
+def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path) -> None:
+    data = bytearray(run.file.read_bytes())
+    whole = list(RunReader(run.file))
+    spans = chunk_spans(run.file)
+    rng = random.Random(2)
+    for start, length in (spans[0], spans[len(spans) // 2], spans[-1]):
+        place = start + rng.randrange(length)
+        data[place] ^= 0x40
+        file = tmp_path / "damaged.mcap"
+        file.write_bytes(data)
+        data[place] ^= 0x40
+        reader = RunReader(file)
+        records = list(reader)
+        assert (reader.damaged_chunks, reader.status) == (1, FileStatus.DAMAGED)
+        rest = iter(whole)
+        assert 0 < len(records) < len(whole)
+        assert all(record in rest for record in records)  # in order, none invented
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"", "not an MCAP file"),
+        (b"something else entirely", "not an MCAP file"),
+        (b"\x89MCAP0\r\n", "is missing"),
+        (None, "no such recording"),
+    ],
+)
+def test_what_is_no_recording_is_named(content: bytes | None, expected: str, tmp_path: Path) -> None:
+    file = tmp_path / "notes.mcap"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(RecordingError, match=expected) as error:
+        RunReader(file)
+    assert str(file) in str(error.value)
+
+
+def test_a_sample_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    message = WrenchStamped(BASE_NS, "slide_frame", (math.nan, 0.0, 0.0), (0.0, 0.0, 0.0))
+    with pytest.raises(RecordingError, match=r"got \(nan, 0.0, 0.0\), expected finite"):
+        from_message(message)

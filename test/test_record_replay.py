@@ -1,0 +1,169 @@
+"""Replay computes: the same run gives the same bits, and whatever was changed in a recording is found where it is."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from record_support import BASE_NS, STEP_NS, Run, chunk_spans, paper_entries, paper_sample, record_run, rewrite
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.cdr import decode, encode
+from plow_twin.record.header import HEADER_RECORD
+from plow_twin.record.messages import JointState, WrenchStamped
+from plow_twin.record.outputs import FRAME_TOPICS
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.replay import replay
+from plow_twin.stream.journal import Digest, Sample
+
+COUNT = 2500
+SAMPLES = "/plow_twin/journal/samples"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """2.5 s of the paper's load without a break: samples only, a frame after each."""
+    return record_run(tmp_path_factory.mktemp("runs") / "paper", map(paper_sample, range(COUNT)))
+
+
+def flip_sample(index: int, bit: int) -> Any:
+    """Flip one bit of Fx in the sample with that index."""
+
+    def change(topic: str, message: Any) -> bytes | None:
+        if topic != SAMPLES or message.publish_time != BASE_NS + index * STEP_NS:
+            return None
+        wrench = decode(message.data, WrenchStamped.TYPE)
+        assert isinstance(wrench, WrenchStamped)
+        place = message.data.index(struct.pack("<d", wrench.force[0]))
+        data = bytearray(message.data)
+        data[place + bit // 8] ^= 1 << bit % 8
+        return bytes(data)
+
+    return change
+
+
+@pytest.mark.parametrize("frame_every", [1, 7])
+def test_the_same_build_gives_the_same_bits(frame_every: int, tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", paper_entries(COUNT), frame_every=frame_every)
+    shares: list[float] = []
+    report = replay(run.folder, shares.append)
+    assert (report.exit_code, report.first_divergence, report.divergences) == (0, None, 0)
+    assert report.status is FileStatus.COMPLETE and not report.loss and not report.build_differences
+    sent = Counter(topic.lstrip("/") for topic, _ in run.outputs)
+    assert report.compared == sent and set(sent) == set(FRAME_TOPICS) and not report.not_compared
+    assert report.digests_compared == sum(isinstance(entry, Digest) for entry in run.entries) >= COUNT // 100
+    assert report.entries == len(run.entries)
+    assert (report.samples, report.steps) == (COUNT, COUNT + 1)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    # the run is worth comparing: there was contact
+    assert max(m.effort.max() for _, m in run.outputs if isinstance(m, JointState) and m.effort.size) > 1e4
+
+
+@pytest.mark.parametrize("index", [1, 700, COUNT - 2])
+def test_a_flipped_sample_diverges_at_its_step(index: int, run: Run, tmp_path: Path) -> None:
+    changed = rewrite(run.file, tmp_path / "changed.mcap", flip_sample(index, 51))
+    report = replay(changed)
+    assert report.exit_code == 1 and report.first_divergence is not None
+    assert report.first_divergence.step == index
+    assert report.first_divergence.stamp_ns == BASE_NS + index * STEP_NS
+    assert report.first_divergence.topic in FRAME_TOPICS
+    assert report.first_divergence.recorded != report.first_divergence.computed
+
+
+def test_the_last_bit_of_a_sample_is_found_by_the_next_digest(run: Run, tmp_path: Path) -> None:
+    report = replay(rewrite(run.file, tmp_path / "changed.mcap", flip_sample(1234, 0)))
+    assert report.exit_code == 1 and report.first_divergence is not None
+    assert 1234 <= report.first_divergence.step < 1300
+
+
+def test_a_changed_output_is_found_and_does_not_spoil_the_rest(run: Run, tmp_path: Path) -> None:
+    index = 1111
+
+    def change(topic: str, message: Any) -> bytes | None:
+        if topic != "/contact_forces" or message.publish_time != BASE_NS + index * STEP_NS:
+            return None
+        state = decode(message.data, JointState.TYPE)
+        assert isinstance(state, JointState)
+        effort = state.effort.copy()
+        effort[3] += 1.0
+        return encode(JointState(state.stamp_ns, state.frame_id, state.name, state.position, state.velocity, effort))
+
+    report = replay(rewrite(run.file, tmp_path / "changed.mcap", change))
+    assert report.exit_code == 1 and report.divergences == 1 and report.first_divergence is not None
+    found = report.first_divergence
+    assert (found.step, found.topic, found.field) == (index, "contact_forces", "effort[3]")
+    assert float(found.recorded) == float(found.computed) + 1.0
+
+
+def test_a_missing_sample_diverges(run: Run, tmp_path: Path) -> None:
+    """One sample repeats the stamp before it: the model cannot be where the recorded messages are."""
+
+    def change(topic: str, message: Any) -> bytes | None:
+        if topic != SAMPLES or message.publish_time != BASE_NS + 900 * STEP_NS:
+            return None
+        wrench = decode(message.data, WrenchStamped.TYPE)
+        assert isinstance(wrench, WrenchStamped)
+        return encode(WrenchStamped(wrench.stamp_ns - STEP_NS, wrench.frame_id, wrench.force, wrench.torque))
+
+    report = replay(rewrite(run.file, tmp_path / "changed.mcap", change))
+    assert report.first_divergence is not None and report.first_divergence.step == 900
+
+
+def test_a_cut_file_is_replayed_as_far_as_it_goes(run: Run, tmp_path: Path) -> None:
+    data = run.file.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) // 2])
+    report = replay(cut)
+    assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.TRUNCATED, 0)
+    assert 0 < report.samples < COUNT and report.messages_compared > 0
+
+
+def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> None:
+    data = bytearray(run.file.read_bytes())
+    spans = chunk_spans(run.file)
+    start, length = spans[len(spans) // 2]
+    data[start + length // 2] ^= 0x01
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    report = replay(damaged)
+    assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.DAMAGED, 0)
+    assert report.lost["journal, unaccounted"] > 0
+    assert sum(report.not_compared.values()) > 0 and report.messages_compared > 0
+
+
+def test_replay_goes_on_from_the_snapshot_after_a_loss(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), queue_size=150, pause_every=400)
+    assert run.loss.closed and run.loss.lost["journal"] > 0
+    report = replay(run.folder)
+    assert (report.exit_code, report.divergences) == (3, 0)
+    assert report.lost == dict(run.loss.lost)
+    last = max(m.stamp_ns for _, m in run.outputs if isinstance(m, JointState))
+    reader = RunReader(run.folder)
+    kept = [record.entry for record in reader if hasattr(record, "entry")]
+    assert report.samples == sum(isinstance(entry, Sample) for entry in kept) < COUNT
+    assert report.span_s > 0 and last == BASE_NS + (COUNT - 1) * STEP_NS
+    assert report.messages_compared > 0 and report.digests_compared > 0
+
+
+def test_another_build_is_named(run: Run, tmp_path: Path) -> None:
+    def metadata(record: dict[str, str]) -> dict[str, str]:
+        if "build" in record:
+            record["build"] = json.dumps({**json.loads(record["build"]), "numba": "0.1.0"})
+        return record
+
+    report = replay(rewrite(run.file, tmp_path / "other.mcap", metadata=metadata))
+    assert list(report.build_differences) == ["numba"] and report.build_differences["numba"][0] == "0.1.0"
+    assert report.exit_code == 0
+
+
+def test_a_header_that_lacks_a_key_is_refused(run: Run, tmp_path: Path) -> None:
+    def metadata(record: dict[str, str]) -> dict[str, str]:
+        record.pop("tol", None)
+        return record
+
+    with pytest.raises(RecordingError, match=f"metadata '{HEADER_RECORD}': tol is missing"):
+        replay(rewrite(run.file, tmp_path / "other.mcap", metadata=metadata))

@@ -1,0 +1,132 @@
+"""The .rrd of a recording, read back with rerun's own reader."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
+from rerun.chunk import RrdReader
+
+from plow_twin.errors import RecordingError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.presets import scene_path
+from plow_twin.record.messages import JointState, Odometry
+from plow_twin.record.reader import FileStatus
+from plow_twin.scene_file import load_scene
+from plow_twin.view import ViewSummary, to_rrd
+from plow_twin.view.section import ARROW_MM_PER_N, Section
+
+COUNT = 1500
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return record_run(tmp_path_factory.mktemp("runs") / "paper", map(paper_sample, range(COUNT)))
+
+
+@pytest.fixture(scope="module")
+def view(run: Run) -> tuple[ViewSummary, dict[str, pa.Table]]:
+    summary = to_rrd(run.file, run.folder.parent / "paper.rrd")
+    return summary, read(summary.path)
+
+
+def read(path: Path) -> dict[str, pa.Table]:
+    """Return the rows in time of each entity of a .rrd."""
+    batches: dict[str, list[pa.RecordBatch]] = {}
+    for chunk in RrdReader(str(path)).stream():
+        if not chunk.is_static:
+            batches.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+    return {entity: pa.concat_tables([pa.Table.from_batches([b]) for b in rows]) for entity, rows in batches.items()}
+
+
+def scalars(table: pa.Table) -> np.ndarray:
+    return np.array(table["Scalars:scalars"].to_pylist(), dtype=np.float64).ravel()
+
+
+def test_rerun_verifies_the_file_and_finds_a_blueprint(view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:
+    path = view[0].path
+    assert [entry.application_id for entry in RrdReader(str(path)).blueprints()] == ["plow_twin"]
+    command = [str(Path(sys.executable).with_name("rerun")), "rrd", "verify", str(path)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+
+
+def test_no_peak_is_lost_from_the_force_curves(run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:
+    summary, tables = view
+    sent = [m for topic, m in run.outputs if topic == "/contact_peaks" and isinstance(m, JointState)]
+    efforts = np.array([message.effort for message in sent])
+    assert efforts.max() > 5e4
+    for pair, name in enumerate(PAIR_NAMES):
+        table = tables[f"/force/{name}"]
+        np.testing.assert_array_equal(scalars(table), efforts[:, pair] / 1e3)
+        times = table["ros_time"].combine_chunks().cast(pa.int64()).to_numpy()
+        np.testing.assert_array_equal(times, BASE_NS + STEP_NS * np.arange(COUNT))
+        np.testing.assert_array_equal(table["step"].to_numpy(), np.arange(COUNT))
+    assert summary.curve_rows == COUNT and summary.status is FileStatus.COMPLETE
+
+
+def test_curves_of_penetration_clearance_and_load(run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:
+    tables = view[1]
+    forces = [m for topic, m in run.outputs if topic == "/contact_forces" and isinstance(m, JointState)]
+    np.testing.assert_array_equal(
+        scalars(tables["/penetration/bottom_right_bottom"]), [1e3 * message.position[4] for message in forces]
+    )
+    for name in ("horizontal", "horizontal/p05", "horizontal/p95"):
+        np.testing.assert_allclose(scalars(tables[f"/clearance/{name}"]), 25.0, atol=1e-9)
+    assert set(tables) >= {"/wear/pad_top_left_top", "/wear/pad_top_left_top/p95", "/quality/sample_interval_ms"}
+    np.testing.assert_array_equal(scalars(tables["/load/fx"]), [paper_sample(i).wrench[0] / 1e3 for i in range(COUNT)])
+    assert set(scalars(tables["/quality/sample_interval_ms"])) == {1.0}
+
+
+def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:
+    summary, tables = view
+    poses = [message for _, message in run.outputs if isinstance(message, Odometry)][::10]
+    head = tables["/section/head"]
+    assert len(head) == summary.section_rows == len(poses) == COUNT // 10
+    cavity = np.array([355.0, 300.0])
+    for strips, pose in zip(head["LineStrips2D:strips"].to_pylist(), poses, strict=True):
+        inner = np.array(strips[0])[:4]
+        # drawn in mm with y down: the centre is the pose, the first side is the top one, turned by theta
+        centre = inner.mean(axis=0)
+        np.testing.assert_allclose(centre, [1e3 * pose.position[0], -1e3 * pose.position[1]], atol=1e-3)
+        top = inner[1] - inner[0]
+        theta = 2.0 * np.arctan2(pose.orientation[2], pose.orientation[3])
+        np.testing.assert_allclose(top, cavity[0] * np.array([np.cos(theta), -np.sin(theta)]), atol=1e-3)
+    arrows = [len(row or []) for row in tables["/section/force"]["Arrows2D:vectors"].to_pylist()]
+    assert max(arrows) >= 2 and len(arrows) == len(head)
+
+
+def test_an_arrow_pushes_the_wall_off_its_corner() -> None:
+    section = Section.of(load_scene(scene_path("paper")))
+    force = np.zeros(8)
+    force[2] = 1e5  # top right corner, top wall: the head is pushed up, which is towards -y on the screen
+    origins, vectors, pairs = section.arrows(0.0, force)
+    np.testing.assert_allclose(origins, [[165.0, -135.0]])
+    np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)
+    assert list(pairs) == [2]
+
+
+def test_events_tell_touches_and_how_the_file_ended(
+    run: Run, view: tuple[ViewSummary, dict[str, pa.Table]], tmp_path: Path
+) -> None:
+    summary, tables = view
+    lines = [text[0] for text in tables["/events"]["TextLog:text"].to_pylist()]
+    assert len(lines) == summary.events and any("touches" in line for line in lines)
+    data = run.file.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: 2 * len(data) // 3])
+    short = to_rrd(cut, tmp_path / "cut.rrd")
+    assert short.status is FileStatus.TRUNCATED and 0 < short.curve_rows < COUNT
+    assert "truncated" in read(short.path)["/events"]["TextLog:text"].to_pylist()[-1][0]
+
+
+def test_a_place_that_cannot_be_written_is_named(run: Run, tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(RecordingError, match="cannot be written"):
+        to_rrd(run.file, blocked / "run.rrd")
