@@ -1,0 +1,117 @@
+"""Silence, jumps, failures and the scene's own loads: what becomes of them in the journal and in the motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from plow_twin.presets import scene_path
+from plow_twin.scene_file import load_scene
+from plow_twin.stream.driver import Driver, Policy, State, counters
+from plow_twin.stream.intake import NS_PER_S, Intake
+from plow_twin.stream.journal import Entry, Hold, Reset, Sample
+from plow_twin.stream.session import Session
+from plow_twin.twin import Status, Twin
+
+SCENE = load_scene(scene_path("paper"))
+T0 = 1_795_000_000_000_000_000
+MS = NS_PER_S // 1000
+LOAD = (32e3, 0.0, -45e3)
+
+
+class Bench:
+    """A driver on a real twin, with its journal."""
+
+    def __init__(self, policy: Policy | None = None, excitation: str = "sampled") -> None:
+        self.journal: list[Entry] = []
+        twin = Twin(SCENE, excitation="sampled" if excitation == "sampled" else "scene")
+        session = Session(twin, on_entry=self.journal.append)
+        self.driver = Driver(session, Intake(), policy or Policy())
+
+    def kinds(self) -> list[str]:
+        return [type(entry).__name__ for entry in self.journal]
+
+
+@pytest.mark.parametrize("hold", ["hold", "zero"])
+def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
+    bench = Bench(Policy(excitation_timeout_s=0.1, hold=hold))
+    driver = bench.driver
+    assert driver.silence(5 * NS_PER_S) is None
+    driver.sample(T0, LOAD, now_ns=0)
+    driver.sample(T0 + MS, LOAD, now_ns=MS)
+    assert driver.silence(101 * MS) is None
+    for now_ms in (121, 131):
+        assert driver.silence(now_ms * MS) is not None
+    held = bench.journal[2:]
+    first: Entry = Sample(T0 + 21 * MS, (0.0, 0.0, 0.0)) if hold == "zero" else Hold(T0 + 21 * MS)
+    assert held == [first, Hold(T0 + 31 * MS)]
+    assert driver.state is State.STALE
+
+    # what the model has passed is late, the next one is used at once
+    assert driver.sample(T0 + 31 * MS, LOAD, now_ns=132 * MS) is None
+    assert driver.sample(T0 + 32 * MS, LOAD, now_ns=132 * MS) is not None
+    assert driver.state is State.RUNNING
+    assert counters(driver)["dropped_late"] == 1
+    assert counters(driver)["holds"] == 2
+
+
+def test_a_long_silence_is_caught_up_by_bounded_calls() -> None:
+    bench = Bench(Policy(excitation_timeout_s=0.1))
+    bench.driver.sample(T0, LOAD, now_ns=0)
+    for _ in range(3):
+        bench.driver.silence(3600 * NS_PER_S)
+    assert [entry.stamp_ns - T0 for entry in bench.journal[1:]] == [NS_PER_S, 2 * NS_PER_S, 3 * NS_PER_S]
+
+
+def test_time_spent_inactive_is_not_caught_up() -> None:
+    bench = Bench(Policy(excitation_timeout_s=0.1))
+    bench.driver.sample(T0, LOAD, now_ns=0)
+    bench.driver.resume(100 * NS_PER_S)
+    assert bench.driver.silence(100 * NS_PER_S + 50 * MS) is None
+
+
+@pytest.mark.parametrize(("jump_ns", "key"), [(-5 * NS_PER_S, "jumps_back"), (60 * NS_PER_S, "jumps_forward")])
+def test_a_jump_of_the_stamps_starts_the_model_anew(jump_ns: int, key: str) -> None:
+    bench = Bench()
+    for index in range(300):
+        bench.driver.sample(T0 + index * MS, LOAD, now_ns=index * MS)
+    fresh = Bench()
+    for index in range(50):
+        jumped = bench.driver.sample(T0 + jump_ns + index * MS, LOAD, now_ns=(400 + index) * MS)
+        direct = fresh.driver.sample(T0 + jump_ns + index * MS, LOAD, now_ns=index * MS)
+    assert jumped is not None and direct is not None
+    assert (jumped.q == direct.q).all() and (jumped.force == direct.force).all()
+    assert bench.kinds().count("Reset") == counters(bench.driver)[key] == counters(bench.driver)["resets"] == 1
+
+
+def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_reset() -> None:
+    bench = Bench(Policy(failure_limit=3))
+    driver = bench.driver
+    for index in range(20):
+        driver.sample(T0 + index * MS, LOAD, now_ns=index * MS)
+    good = driver.session.outputs.take()
+    assert good is not None and good.finite
+    for index in range(20, 23):
+        advance = driver.sample(T0 + index * MS, (1e200, -1e200, 1e200), now_ns=index * MS)
+        assert advance is not None and advance.status is not Status.OK
+        assert np.isfinite(advance.q).all() and np.isfinite(advance.force).all()
+        assert driver.session.outputs.take() is None
+    assert driver.failures == 3
+    assert driver.failure
+    assert isinstance(bench.journal[-1], Reset)
+    recovered = driver.sample(T0 + 30 * MS, LOAD, now_ns=30 * MS)
+    assert recovered is not None and recovered.status is Status.OK
+    assert driver.state is State.RUNNING
+
+
+def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:
+    bench = Bench(excitation="scene")
+    stamps = [T0, T0 + 250 * MS, T0 + 250 * MS, T0 + 1700 * MS]
+    advances = [bench.driver.clock_tick(stamp, now_ns=0) for stamp in stamps]
+    assert advances[2] is None  # a paused clock moves nothing
+    direct = Twin(SCENE)
+    for stamp, advance in zip(stamps, advances, strict=True):
+        if advance is not None:
+            assert (advance.q == direct.advance((stamp - T0) * 1e-9).q).all()
+    bench.driver.clock_tick(T0 - 100 * NS_PER_S, now_ns=0)
+    assert isinstance(bench.journal[-2], Reset)

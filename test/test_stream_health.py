@@ -1,0 +1,43 @@
+"""Figures of the running system against numpy on the same numbers."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from plow_twin.stream.health import DurationHistogram, RealTimeFactor
+
+
+@given(st.lists(st.floats(2e-6, 90.0), min_size=1, max_size=300), st.sampled_from((0.5, 0.9, 0.99, 1.0)))
+def test_quantiles_are_good_to_half_a_bin(durations: list[float], share: float) -> None:
+    histogram = DurationHistogram()
+    for duration in durations:
+        histogram.add(duration)
+    exact = np.quantile(durations, share, method="inverted_cdf")
+    assert histogram.quantile(share) == pytest.approx(exact, rel=0.024)
+    assert histogram.largest_s == max(durations)
+    assert histogram.count == len(durations)
+
+
+def test_durations_out_of_range_stay_counted_and_nonsense_does_not() -> None:
+    histogram = DurationHistogram()
+    assert math.isnan(histogram.quantile(0.5))
+    for duration in (0.0, 1e-9, 1e9, -1.0, math.nan):
+        histogram.add(duration)
+    assert histogram.count == 3
+    assert histogram.quantile(1.0) > 90.0
+
+
+def test_real_time_factor_is_model_time_over_wall_time() -> None:
+    factor = RealTimeFactor()
+    assert factor.mean() == factor.recent(5) == 0.0
+    for second in range(11):
+        factor.advanced(0.0 if second == 0 else 3.0, second * 1_000_000_000)
+    assert factor.mean() == pytest.approx(3.0)
+    assert factor.recent(20_000_000_000) == pytest.approx(1.5)
+    factor.advanced(1.0, 21_000_000_000)
+    assert factor.recent(22_000_000_000) == pytest.approx(0.5)

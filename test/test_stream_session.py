@@ -1,0 +1,191 @@
+"""The machine that live node and replay drive: same entries, same bits; nothing lost between two frames."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import Scene, Wear
+from plow_twin.presets import scene_path
+from plow_twin.scene_file import load_scene
+from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Reset, Sample, Snapshot, Travel
+from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, Frame, Outputs, prior_points
+from plow_twin.stream.session import DIGEST_INTERVAL, Session
+from plow_twin.twin import Twin
+
+T0 = 1_795_000_000_123_456_789
+MS = 1_000_000
+STEPS = 900
+
+
+def _scene() -> Scene:
+    wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0, prior_m2_n=(2e-15, 5e-14))
+    return replace(load_scene(scene_path("paper")), wear=wear)
+
+
+SCENE = _scene()
+WRENCH = compile_loads(SCENE.loads).at(np.arange(STEPS) * 2e-3)
+
+
+def _sample(index: int) -> Sample:
+    return Sample(T0 + 2 * index * MS, tuple(WRENCH[index].tolist()))
+
+
+def _entries() -> list[Entry]:
+    """Cover every kind of entry that changes the motion."""
+    entries: list[Entry] = [_sample(index) for index in range(STEPS)]
+    entries[700:700] = [Hold(T0 + 1398 * MS + 500_000), Travel(T0, 3.5)]
+    entries[200:200] = [Reset(T0 + 398 * MS, "test"), Hold(T0 + 399 * MS)]
+    return entries
+
+
+class Run:
+    """One session, all that it emitted and published."""
+
+    def __init__(self) -> None:
+        self.emitted: list[Entry] = []
+        self.frames: list[Frame] = []
+        self.session = Session(Twin(SCENE, excitation="sampled"), on_entry=self.emitted.append)
+
+    def apply(self, entries: list[Entry], take: bool = True) -> Run:
+        for entry in entries:
+            self.session.apply(entry)
+            frame = self.session.outputs.take() if take else None
+            if frame is not None:
+                self.frames.append(frame)
+        return self
+
+
+def _bits(frame: Frame) -> bytes:
+    parts = [frame.penetration, frame.rate, frame.force, frame.touches, frame.impulse, frame.peak, frame.q, frame.v]
+    if frame.slow is not None:
+        parts += [frame.slow.clearance, frame.slow.wear_rate]
+    return frame.stamp_ns.to_bytes(8, "little") + b"".join(part.tobytes() for part in parts)
+
+
+@pytest.fixture(scope="module")
+def reference() -> Run:
+    run = Run()
+    run.session.start()
+    run.apply(_entries())
+    run.session.close()
+    return run
+
+
+def test_the_emitted_journal_repeats_the_run_bit_for_bit(reference: Run) -> None:
+    emitted = reference.emitted
+    again = Run().apply([entry for entry in emitted if not isinstance(entry, Snapshot)])
+    again.session.close()
+    assert [_bits(frame) for frame in again.frames] == [_bits(frame) for frame in reference.frames]
+    assert again.emitted == [entry for entry in emitted if not isinstance(entry, Snapshot)]
+    digests = [entry for entry in emitted if isinstance(entry, Digest)]
+    assert len(digests) == (STEPS + 2) // DIGEST_INTERVAL + 1
+    assert len({entry.digest for entry in digests}) == len(digests)
+
+
+def test_one_flipped_bit_of_a_sample_changes_every_digest_after_it(reference: Run) -> None:
+    entries = _entries()
+    index = 350
+    sample = entries[index]
+    assert isinstance(sample, Sample)
+    flipped = float((np.array(sample.wrench[0]).view(np.int64) ^ 1).view(np.float64))
+    entries[index] = replace(sample, wrench=(flipped, *sample.wrench[1:]))
+    run = Run().apply(entries)
+    pairs = zip(
+        [entry for entry in reference.emitted if isinstance(entry, Digest)],
+        [entry for entry in run.emitted if isinstance(entry, Digest)],
+        strict=False,
+    )
+    for ours, theirs in pairs:
+        assert (ours == theirs) == (ours.stamp_ns < sample.stamp_ns)
+
+
+def test_frames_carry_the_twins_own_numbers(reference: Run) -> None:
+    twin = Twin(SCENE, excitation="sampled")
+    series = twin.advance_samples(np.arange(200) * 2 * MS * 1e-9, WRENCH[:200])
+    for index, frame in enumerate(reference.frames[:200]):
+        for name in ("penetration", "rate", "force", "impulse", "peak", "q", "v"):
+            assert getattr(frame, name).tobytes() == getattr(series, name)[index].tobytes()
+    touches = np.cumsum(series.makes, axis=0)
+    assert touches[-1].sum() > 0
+    assert (np.array([frame.touches for frame in reference.frames[:200]]) == touches).all()
+
+
+@settings(max_examples=8)
+@given(st.sets(st.integers(1, STEPS - 1), max_size=12))
+def test_nothing_is_lost_however_rarely_frames_are_taken(cuts: set[int]) -> None:
+    every, rare = Run(), Run()
+    entries = [_sample(index) for index in range(STEPS)]
+    every.apply(entries)
+    bounds = [0, *sorted(cuts), STEPS]
+    for begin, end in itertools.pairwise(bounds):
+        rare.apply(entries[begin : end - 1], take=False)
+        rare.apply(entries[end - 1 : end])
+    assert len(rare.frames) == len(bounds) - 1
+    assert (rare.frames[-1].touches == every.frames[-1].touches).all()
+    for frame, begin, end in zip(rare.frames, bounds, bounds[1:], strict=False):
+        part = every.frames[begin:end]
+        assert (frame.peak == np.max([single.peak for single in part], axis=0)).all()
+        np.testing.assert_allclose(frame.impulse, np.sum([single.impulse for single in part], axis=0), rtol=1e-12)
+        assert _bits(frame)[:200] == _bits(part[-1])[:200]
+
+
+@pytest.mark.parametrize("at", [0, 1, 333, 801])
+def test_a_snapshot_goes_on_with_the_same_bits(reference: Run, at: int) -> None:
+    before = Run().apply(_entries()[:at])
+    after = Run().apply([Loss(at), before.session.snapshot(), *_entries()[at:]])
+    # an entry that makes no advance makes no frame
+    frames = reference.frames[len(before.frames) :]
+    assert [_bits(frame) for frame in after.frames] == [_bits(frame) for frame in frames]
+    assert after.session.twin.digest() == reference.session.twin.digest()
+
+
+def test_an_entry_that_cannot_be_applied_changes_nothing(reference: Run) -> None:
+    run = Run().apply([_sample(0), _sample(5)])
+    emitted, digest = len(run.emitted), run.session.twin.digest()
+    with pytest.raises(ValueError, match="expected at least the time reached"):
+        run.session.apply(_sample(4))
+    assert (len(run.emitted), run.session.twin.digest()) == (emitted, digest)
+
+
+def test_clearance_is_base_plus_mean_wear_of_each_side_with_the_priors_interval() -> None:
+    outputs = Outputs(SCENE)
+    twin = Twin(SCENE, excitation="sampled")
+    advance = twin.advance(0.0, np.zeros(3))
+    depth = np.arange(1.0, 9.0) * 1e-3
+    outputs.add(T0, replace(advance, wear_depth=depth))
+    frame = outputs.take()
+    assert frame is not None and frame.slow is not None
+    named = dict(zip(CLEARANCE_NAMES, frame.slow.clearance, strict=True))
+    # pads 1, 7 left; 3, 5 right; 0, 2 top; 4, 6 bottom
+    assert named["horizontal"] == pytest.approx(0.025 + (2e-3 + 8e-3) / 2 + (4e-3 + 6e-3) / 2)
+    assert named["vertical"] == pytest.approx(0.030 + (1e-3 + 3e-3) / 2 + (5e-3 + 7e-3) / 2)
+    assert named["pad_top_right_right"] == 4e-3
+    assert named["pad_top_right_right/p05"] == pytest.approx(4e-3 * 0.2)
+    assert named["pad_top_right_right/p95"] == pytest.approx(4e-3 * 5.0)
+    assert named["horizontal/p95"] == pytest.approx(0.025 + 5.0 * 0.010)
+
+
+def test_without_wear_the_interval_is_the_value() -> None:
+    scene = replace(SCENE, wear=None)
+    depth = np.zeros(8)
+    assert prior_points(scene, depth) == (depth, depth)
+
+
+def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
+    slow = [frame for frame in reference.frames[:200] if frame.slow is not None]
+    assert [frame.stamp_ns // SLOW_PERIOD_NS for frame in slow] == sorted(
+        {frame.stamp_ns // SLOW_PERIOD_NS for frame in reference.frames[:200]}
+    )
+    for before, after in itertools.pairwise(slow):
+        assert before.slow is not None and after.slow is not None
+        grown = after.slow.clearance[2:10] - before.slow.clearance[2:10]
+        seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
+        np.testing.assert_allclose(after.slow.wear_rate * seconds, grown, atol=1e-18)
+    assert max(frame.slow.wear_rate.max() for frame in slow if frame.slow is not None) > 0.0
