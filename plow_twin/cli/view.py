@@ -12,7 +12,7 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, progress, quiet_option
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but the recording is cut off or damaged.")
 @click.argument("recording", type=click.Path(path_type=Path, exists=True))
 @click.option(
-    "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; beside the .mcap by default."
+    "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; by default beside the .mcap."
 )
 @quiet_option
 def view(recording: Path, out: Path | None, quiet: bool) -> int:

@@ -1,0 +1,80 @@
+"""Environments and clean sources for the tests that install the package."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SOURCES = (
+    "plow_twin",
+    "config",
+    "launch",
+    "resource",
+    "setup.py",
+    "setup.cfg",
+    "package.xml",
+    "pyproject.toml",
+    "LICENSE",
+)
+
+
+def copy_sources(target: Path) -> Path:
+    """Copy what a build reads, without anything that an earlier build or run left behind."""
+    target.mkdir(parents=True)
+    for name in SOURCES:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
+        else:
+            shutil.copy2(ROOT / name, target / name)
+    return target
+
+
+def clean_environment(**extra: str) -> dict[str, str]:
+    """Return this process's variables without those that would let another installation shine through."""
+    hidden = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "AMENT_PREFIX_PATH", "COLCON_PREFIX_PATH")
+    # the ROS wheels restart Python with these; a child in another environment must not inherit them
+    hidden += ("LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "NUMBA_CACHE_DIR")
+    return {key: value for key, value in os.environ.items() if key not in hidden} | extra
+
+
+def run(*command: str | Path, cwd: Path, env: dict[str, str] | None = None, code: int = 0) -> str:
+    """Run a command that ends with `code` and return its standard output (error if code); else show all it said."""
+    done = subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env=env if env is not None else clean_environment(),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        stdin=subprocess.DEVNULL,
+    )
+    assert done.returncode == code, f"{command} ended with {done.returncode}\n{done.stdout}\n{done.stderr}"
+    return done.stderr if code else done.stdout
+
+
+def make_environment(folder: Path, *requirements: str) -> Path:
+    """Make a virtual environment with these requirements, at the locked versions, and return its Python."""
+    run(sys.executable, "-m", "venv", folder, cwd=folder.parent)
+    python = folder / "bin" / "python"
+    install(python, *requirements)
+    return python
+
+
+def install(python: Path, *requirements: str) -> None:
+    """Install into an environment at the locked versions."""
+    pip = ("-m", "pip", "install", "--quiet", "--no-compile", "-c", ROOT / "requirements" / "constraints.txt")
+    run(python, *pip, *requirements, cwd=python.parent)
+
+
+def build_wheel(folder: Path) -> Path:
+    """Build the package's wheel from clean sources with this environment's setuptools."""
+    source = copy_sources(folder / "source")
+    wheels = folder / "wheels"
+    pip = (sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation")
+    run(*pip, "--wheel-dir", wheels, ".", cwd=source)
+    (wheel,) = wheels.glob("*.whl")
+    return wheel

@@ -1,0 +1,87 @@
+"""The package in environments of its own: with numpy, scipy and numba alone, and with the base dependencies."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from installing import build_wheel, install, make_environment, run
+
+from plow_twin.presets import PRESETS
+
+pytestmark = [pytest.mark.package, pytest.mark.timeout(400)]
+
+CORE_ONLY = """
+import json, sys
+from importlib.metadata import distributions
+from importlib.util import find_spec
+import plow_twin
+from plow_twin import Clearance, Contact, Frame, Gravity, Head, Scene, Twin, simulate
+
+for name in ("yaml", "jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"):
+    assert find_spec(name) is None, name
+# a ball of 1 kg falls 1 m onto a table: the paper's head with x and theta held
+scene = Scene(
+    head=Head(mass_kg=1.0, inertia_kg_m2=1.0),
+    frame=Frame(width_m=1.0, height_m=1.0),
+    clearance=Clearance(horizontal_m=1.0, vertical_m=2.0),
+    contact=Contact("kelvin_voigt", stiffness=1e6, damping=0.0),
+    gravity=Gravity(9.81),
+    locked=("x", "theta"),
+)
+result = simulate(scene, 1.0, 0.1)
+twin = Twin(scene)
+twin.advance(1.0)
+print(json.dumps({
+    "file": plow_twin.__file__,
+    "y": result.q[:, 1].tolist(),
+    "twin": float(twin.advance(1.0).q[1]),
+    "makes": sum(row["makes"] for row in result.statistics.values()),
+    "distributions": sorted({d.metadata["Name"] for d in distributions()}),
+}))
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_wheel(tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory, wheel: Path) -> Path:
+    """One environment, first with the core's three libraries, later with all base dependencies."""
+    folder = tmp_path_factory.mktemp("environment")
+    python = make_environment(folder / "venv", "numpy", "scipy", "numba")
+    install(python, "--no-deps", str(wheel))
+    return python
+
+
+def test_model_and_twin_need_numpy_scipy_and_numba_alone(environment: Path, tmp_path: Path) -> None:
+    answer = json.loads(run(environment, "-c", CORE_ONLY, cwd=tmp_path))
+    assert set(answer["distributions"]) <= {"numpy", "scipy", "numba", "llvmlite", "pip", "setuptools", "plow_twin"}
+    assert Path(answer["file"]).is_relative_to(environment.parent.parent)
+    fall = np.arange(5) * 0.1
+    np.testing.assert_allclose(answer["y"][:5], -0.5 * 9.81 * fall**2, atol=1e-9)
+    assert answer["makes"] == 2  # the cavity's top meets both upper corners of the frame, once in this second
+    assert answer["twin"] == pytest.approx(answer["y"][-1], abs=1e-8)
+
+
+def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel: Path, tmp_path: Path) -> None:
+    install(environment, str(wheel))
+    programs, prefix = environment.parent, environment.parent.parent
+    assert {"plow-twin", "twin", "excitation_publisher"} <= {path.name for path in programs.iterdir()}
+    share = prefix / "share"
+    assert (share / "ament_index" / "resource_index" / "packages" / "plow_twin").is_file()
+    assert {path.stem for path in (share / "plow_twin" / "config").glob("*.yaml")} >= set(PRESETS)
+    assert (share / "plow_twin" / "package.xml").is_file()
+    answer = json.loads(run(programs / "plow-twin", "simulate", "paper", "--t-end", "1", "--json", cwd=tmp_path))
+    assert answer["pairs"]["top_right_top"]["max"] > 1e4
+    facts = json.loads(run(programs / "plow-twin", "info", "--json", cwd=tmp_path))
+    assert (facts["mcap"], facts["rclpy"]) == ("not installed", "not installed")
+    said = run(programs / "plow-twin", "demo", cwd=tmp_path, code=1)
+    assert "pip install 'plow_twin[ros]'" in said
+    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
+    assert "pip install 'plow_twin[record]'" in run(programs / "plow-twin", "replay", "run.mcap", cwd=tmp_path, code=1)
+    assert "pip install 'plow_twin[view]'" in run(programs / "plow-twin", "view", "run.mcap", cwd=tmp_path, code=1)
