@@ -15,7 +15,19 @@ from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive, fixed
 from plow_twin.solve.compiled import Compiled, compile_scene
-from plow_twin.solve.layout import COEFFICIENTS, EVENTS, STEPS, Log, State, Status, Totals, new_log, new_totals, new_work
+from plow_twin.solve.layout import (
+    COEFFICIENTS,
+    EVENTS,
+    STEPS,
+    TOTALS,
+    Log,
+    State,
+    Status,
+    Totals,
+    new_log,
+    new_record,
+    new_work,
+)
 
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
@@ -159,7 +171,7 @@ def _grid(t_end: float, output_dt: float) -> Array:
 def _new_motion(compiled: Compiled, rows: int) -> _Motion:
     three, eight = (rows, 3), (rows, PAIR_COUNT)
     return _Motion(
-        compiled.initial_state(), new_totals(), new_log(_FIRST_LOG),
+        compiled.initial_state(), new_record(TOTALS), new_log(_FIRST_LOG),
         np.zeros(three), np.zeros(three), np.zeros(eight), np.zeros(eight),
     )  # fmt: skip
 

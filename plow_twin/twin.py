@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive
 from plow_twin.solve.compiled import Compiled, compile_scene, per_mass
-from plow_twin.solve.layout import LENGTH, STEPS, T0, USED, State, Status, new_totals, new_work
+from plow_twin.solve.layout import LENGTH, STATE, STEPS, T0, TOTALS, USED, Status, new_record, new_work
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
@@ -125,7 +125,7 @@ class Twin:
         self._compiled: Compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
         self._parts = self._compiled.parts
         self._work = new_work()
-        self._totals = new_totals()
+        self._totals = new_record(TOTALS)
         self._state = self._compiled.initial_state(start)
         self._wrench = np.zeros(3)
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
@@ -205,23 +205,20 @@ class Twin:
         self._check_times(np.array([self.time if not np.isfinite(t) else max(t, self.time)]))
         if not np.isfinite(t):
             raise ValueError(f"t: got {t!r}, expected a finite time in s")
-        _copy_state(self._compiled.initial_state(t), self._state)
+        self._state = self._compiled.initial_state(t)
         self._wrench = np.zeros(3)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face from here on; only wear depends on it."""
         if not np.isfinite(speed_m_s):
             raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
-        wear = self.scene.wear
-        if wear is None or self._parts.wear is None:
-            return
-        self._end_step()
-        self._travel_speed = abs(float(speed_m_s))
-        self._parts.wear[:] = wear.coefficient_m2_n * self._travel_speed / wear.pad_area_m2
+        if self._parts.wear is not None:
+            self._end_step()
+            self._set_wear_rate(abs(float(speed_m_s)))
 
     def snapshot(self) -> bytes:
         """Return the exact state as bytes, to be restored by a twin of the same scene, tolerance and excitation."""
-        return b"".join(part.tobytes() for part in (*self._state, self._wrench, np.array([self._travel_speed])))
+        return self._state.tobytes() + self._wrench.tobytes() + np.float64(self._travel_speed).tobytes()
 
     def restore(self, data: bytes) -> None:
         """Take over a state saved by `snapshot`.
@@ -231,18 +228,16 @@ class Twin:
         ValueError
             When the data has not the size of a snapshot.
         """
-        parts = (*self._state, self._wrench, np.zeros(1))
-        size = sum(part.nbytes for part in parts)
-        if len(data) != size:
-            raise ValueError(f"snapshot: got {len(data)} bytes, expected {size}")
-        offset = 0
-        for part in parts:
-            part[:] = np.frombuffer(data, part.dtype, part.size, offset)
-            offset += part.nbytes
-        used = float(self._state.clock[USED])
-        self._set_speed_exactly(float(parts[-1][0]))
+        if len(data) != STATE.itemsize + 32:
+            raise ValueError(f"snapshot: got {len(data)} bytes, expected {STATE.itemsize + 32}")
+        saved = np.frombuffer(data[: STATE.itemsize], STATE)[0]
+        for name in STATE.names or ():
+            self._state[name] = saved[name]
+        wrench_and_speed = np.frombuffer(data[STATE.itemsize :])
+        self._wrench = wrench_and_speed[:3].copy()
+        self._set_wear_rate(float(wrench_and_speed[3]))
         if self._state.clock[LENGTH] >= 0.0:
-            drive.lay_out_again(self._compiled.params, self._parts, self._state, self._work, used)
+            drive.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
 
     def digest(self) -> str:
         """Return 16 hexadecimal digits that stand for the exact state."""
@@ -273,7 +268,7 @@ class Twin:
     def _end_step(self) -> None:
         drive.end_step(self._compiled.params, self._parts, self._state, self._work, self._totals)
 
-    def _set_speed_exactly(self, speed: float) -> None:
+    def _set_wear_rate(self, speed: float) -> None:
         self._travel_speed = speed
         wear = self.scene.wear
         if wear is not None and self._parts.wear is not None:
@@ -291,10 +286,3 @@ def _empty_series(times: NDArray[np.float64]) -> AdvanceSeries:
 
 def _columns(out: AdvanceSeries) -> tuple[NDArray[np.float64] | NDArray[np.int64], ...]:
     return tuple(getattr(out, name) for name in (*_ROW_FIELDS, "steps", "status"))
-
-
-def _copy_state(source: State, target: State) -> None:
-    for part, value in zip(target, source, strict=True):
-        part[:] = value
-
-

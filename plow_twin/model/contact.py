@@ -31,18 +31,20 @@ def normal_force(
 
 @kernel(fast=True)
 def power_term(
-    base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float, shift: int
+    base: NDArray[np.float64], power: NDArray[np.float64], lane: int, k: int, exponent: float, shift: int
 ) -> float:
-    """Return coefficient k of base(t)^exponent and store it in `power`, both shape (order + 1,).
+    """Return coefficient k of base(t)^exponent for one column, series of shape (n, 8) with orders in rows.
 
     Recurrence  b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j}  (Knuth, TAOCP 2, sec. 4.7). A base that starts with
-    t^shift is divided by it first, `power` is then the series of (base / t^shift)^exponent.
+    t^shift is divided by it first; its power then starts with t^(shift exponent).
     """
+    offset = int(shift * exponent)
+    if k < offset:
+        return 0.0
+    k -= offset
     if k == 0:
-        power[0] = base[shift] ** exponent
-        return power[0]
+        return float(base[shift, lane] ** exponent)
     total = 0.0
     for j in range(1, k + 1):
-        total += (exponent * j - (k - j)) * base[j + shift] * power[k - j]
-    power[k] = total / (k * base[shift])
-    return power[k]
+        total += (exponent * j - (k - j)) * base[j + shift, lane] * power[k - j + offset, lane]
+    return total / (k * base[shift, lane])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,19 @@ from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import DOF_NAMES, Contact, Scene
-from plow_twin.solve.layout import MAX_ORDER, Array, Harmonics, Law, Params, Parts, Segments, State, new_state
+from plow_twin.solve.layout import (
+    MAX_ORDER,
+    PARAMS,
+    STATE,
+    Array,
+    Harmonics,
+    Law,
+    Params,
+    Parts,
+    Segments,
+    State,
+    new_record,
+)
 from plow_twin.solve.step import settle_modes
 
 #: Tightest and loosest tolerance.
@@ -34,7 +47,7 @@ class Compiled:
 
     def initial_state(self, time: float = 0.0) -> State:
         """Return the scene's initial state."""
-        state = new_state()
+        state = new_record(STATE)
         state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
         state.factor[:] = self.scene.contact.damping or 0.0
         if self.scene.wear is not None:
@@ -73,8 +86,9 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     law, factor = law_of(scene.contact)
     length = geometry.length_scale(scene)
     speed = _velocity_scale(scene, loads, length)
-    order = order_for(tol)
-    params = Params(
+    order, radius = order_for(tol), geometry.half_diagonal(scene)
+    params = new_record(PARAMS)
+    values: dict[str, Any] = dict(
         gap=geometry.penetration_rows(scene),
         arm=geometry.arm_rows(scene),
         enabled=np.array([name in scene.pairs for name in PAIR_NAMES], dtype=np.int64),
@@ -90,14 +104,17 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         direction=direction,
         order=order,
         lacuna=_lacuna(law),
-        threshold=speed * (STEP_SHARE * tol) ** (np.arange(order + 1) / order),
+        threshold=speed * (STEP_SHARE * tol) ** (np.arange(MAX_ORDER + 1) / order),
         velocity_tolerance=tol * speed,
         position_tolerance=tol * length,
-        radius=geometry.half_diagonal(scene),
+        weight=radius * speed / length,
+        radius=radius,
         release=0.0 if law.fraction is None else _release(scene, tol * speed, speed, law.fraction),
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
+    for name, value in values.items():
+        params[name] = value
     offset = np.array(scene.head.com_offset_m, dtype=np.float64) if any(scene.head.com_offset_m) else None
     free = np.array([float(name not in scene.locked) for name in DOF_NAMES]) if scene.locked else None
     segments = segments_of(scene, loads.pieces) if loads.pieces is not None else None

@@ -57,10 +57,11 @@ def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:  # t
 @kernel()
 def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth) -> None:  # type: ignore[no-untyped-def]
     """Write row i: the state at the present time and the totals, which are cleared."""
-    y = state.y
+    y = w.moved
     if state.clock[LENGTH] >= 0.0:
-        y = np.empty(8)
         evaluate(state, w, sigma_at(state, state.clock[USED]), y)
+    else:
+        y[:] = state.y
     pose_of(y, parts.offset, q[i], v[i])
     pair_outputs(p, state, y, penetration[i], rate[i], force[i])
     for pair in range(8):
@@ -113,9 +114,9 @@ def end_step(p, parts, state, w, totals) -> None:  # type: ignore[no-untyped-def
 
 
 @kernel()
-def lay_out_again(p, parts, state, w, used) -> None:  # type: ignore[no-untyped-def]
+def lay_out_again(p, parts, state, w) -> None:  # type: ignore[no-untyped-def]
     """Compute the step under way once more after a restore: its series are not part of the state."""
-    count = state.count.copy()
+    used, count = state.clock[USED], state.count.copy()
     _lay_out(p, parts, state, w, np.inf)
     state.count[:] = count
     state.clock[USED] = used

@@ -6,6 +6,7 @@ would serve them is not compiled at all.
 
 from __future__ import annotations
 
+import math
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -22,6 +23,9 @@ IntArray = NDArray[np.int64]
 MAX_ORDER: Final = 30
 #: Depth to which an interval is halved when a root or a maximum is isolated.
 MAX_HALVINGS: Final = 48
+
+# indices into Work.lanes
+ACTS, DAMPS, SIGN, RATIO, SUM, FIRST, SECOND = range(7)
 
 # contact modes; the first three are public
 OFF: Final = 0
@@ -67,31 +71,95 @@ _STATUS_TEXT: Final = {
 }
 
 
-class Params(NamedTuple):
-    """Constants of one scene and one tolerance, per mass and inertia where that saves work."""
+# Records rather than tuples of arrays: a kernel gets one pointer, shapes are constants, and nothing is reference counted.
 
-    gap: Array  #: (5, 8) penetration rows for c, s, X, Y, 1
-    arm: Array  #: (4, 8) arm rows for c, s, X, Y
-    enabled: IntArray  #: (8,) 1 where the pair can touch
-    inverse_mass: float
-    inverse_inertia: float
-    stiffness: float
-    exponent: float
-    viscous: float  #: C in N s/m, 0 without
-    damping_factor: float  #: D of lambda = D / v0, or a negative number when lambda is constant
-    speed_floor: float  #: smallest v0
-    gravity: float
-    constant: Array  #: (3,) Fx/m, Fy/m - g, M/I of all that does not change
-    direction: Array  #: (2, 2) directions (x, y) of the harmonic forces S1, S2
-    order: int
-    lacuna: int  #: orders in a row that may vanish while the series goes on
-    threshold: Array  #: (order + 1,) admissible size of term k of a velocity over a step
-    velocity_tolerance: float  #: admissible local error of a velocity
-    position_tolerance: float  #: admissible local error of a position
-    radius: float  #: turns angles into lengths
-    release: float  #: penetration below which the force is negligible
-    half_cavity: float  #: penetration that ends the model's range
-    max_events: int  #: events at one instant before recovery
+_ROWS: Final = MAX_ORDER + 1
+_WIDE: Final = (_ROWS, PAIR_COUNT)
+
+#: Constants of one scene and one tolerance, per mass and inertia where that saves work.
+PARAMS: Final = np.dtype(
+    [
+        ("gap", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
+        ("arm", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
+        ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
+        ("inverse_mass", "f8"),
+        ("inverse_inertia", "f8"),
+        ("stiffness", "f8"),
+        ("exponent", "f8"),
+        ("viscous", "f8"),  # C in N s/m, 0 without
+        ("damping_factor", "f8"),  # D of lambda = D / v0, or a negative number when lambda is constant
+        ("speed_floor", "f8"),  # smallest v0
+        ("gravity", "f8"),
+        ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
+        ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
+        ("order", "i8"),
+        ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
+        ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
+        ("velocity_tolerance", "f8"),  # admissible error of a velocity
+        ("position_tolerance", "f8"),  # admissible error of a position
+        ("weight", "f8"),  # turns cos and sin into velocities
+        ("radius", "f8"),  # turns angles into lengths
+        ("release", "f8"),  # penetration below which the force is negligible
+        ("half_cavity", "f8"),  # penetration that ends the model's range
+        ("max_events", "i8"),  # events at one instant before recovery
+    ]
+)
+
+#: Everything that the future depends on, and the step under way.
+STATE: Final = np.dtype(
+    [
+        ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
+        ("factor", "f8", (PAIR_COUNT,)),  # lambda of each pair
+        ("depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad
+        ("mode", "i8", (PAIR_COUNT,)),
+        ("clock", "f8", (7,)),
+        ("step", "i8", (7,)),
+        ("count", "i8", (5,)),
+    ]
+)
+
+#: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes.
+WORK: Final = np.dtype(
+    [
+        ("series", "f8", _WIDE),  # state
+        ("left", "f8", _WIDE),  # factors of the Cauchy products
+        ("right", "f8", _WIDE),
+        ("product", "f8", _WIDE),
+        ("gap", "f8", _WIDE),  # penetration
+        ("rate", "f8", _WIDE),  # its rate in time
+        ("arm", "f8", _WIDE),
+        ("damped", "f8", _WIDE),  # elastic part times rate
+        ("force", "f8", _WIDE),
+        ("torque", "f8", _WIDE),
+        ("worn", "f8", _WIDE),  # growth of the wear depth
+        ("guard", "f8", _WIDE),
+        ("bernstein", "f8", _WIDE),
+        ("power", "f8", (4, *_WIDE)),  # powers of the penetration
+        ("load", "f8", (3, _ROWS)),  # S1, S2, M
+        ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
+        ("column", "f8", (2, _ROWS)),  # one polynomial
+        ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
+        ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
+        ("lanes", "f8", (7, PAIR_COUNT)),  # masks and sums of the eight pairs
+        ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
+        ("moved", "f8", (STATE_SIZE,)),
+        ("inverse", "f8", (_ROWS + 2,)),  # 1/k
+        ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
+    ]
+)
+
+#: What is summed over the motion since it was last cleared.
+TOTALS: Final = np.dtype(
+    [
+        ("peak", "f8", (PAIR_COUNT,)),
+        ("impulse", "f8", (PAIR_COUNT,)),
+        ("time_in_contact", "f8", (PAIR_COUNT,)),
+        ("makes", "i8", (PAIR_COUNT,)),
+        ("set_time", "f8", (2, 16)),  # time in each set of corners, counter-clockwise and clockwise pairs
+    ]
+)
+
+Params = State = Work = Totals = np.record
 
 
 class Harmonics(NamedTuple):
@@ -131,51 +199,6 @@ class Parts(NamedTuple):
     free: Array | None  #: (3,) 1 free, 0 locked
 
 
-class State(NamedTuple):
-    """Everything that the future depends on, and the step under way."""
-
-    y: Array  #: (8,) body coordinates at the step's start
-    factor: Array  #: (8,) lambda of each pair
-    depth: Array  #: (8,) wear depth of each pad
-    mode: IntArray  #: (8,)
-    clock: Array  #: (7,)
-    step: IntArray  #: (7,)
-    count: IntArray  #: (5,)
-
-
-class Work(NamedTuple):
-    """Scratch space: series of one step. Rows are orders, columns components or pairs."""
-
-    series: Array  #: (n, 8) state
-    left: Array  #: (n, 8)
-    right: Array  #: (n, 8)
-    gap: Array  #: (n, 8) penetration
-    guard: Array  #: (n, 8)
-    bernstein: Array  #: (n, 8)
-    load: Array  #: (3, n) S1, S2, M
-    force: Array  #: (8, n)
-    rate: Array  #: (8, n)
-    arm: Array  #: (8, n)
-    power: Array  #: (8, 4, n)
-    worn: Array  #: (8, n)
-    scratch: Array  #: (2, n)
-    world: Array  #: (2, n)
-    halves: Array  #: (MAX_HALVINGS + 2, n)
-    bounds: Array  #: (MAX_HALVINGS + 2, 2)
-    inverse: Array  #: (n + 1,) 1/k
-    binomial: Array  #: (n, n) 1 / C(order, k)
-
-
-class Totals(NamedTuple):
-    """What is summed over the motion since it was last cleared."""
-
-    peak: Array  #: (8,)
-    impulse: Array  #: (8,)
-    time_in_contact: Array  #: (8,)
-    makes: IntArray  #: (8,)
-    set_time: Array  #: (2, 16) time in each set of corners, counter-clockwise and clockwise pairs
-
-
 class Log(NamedTuple):
     """Contact events in order of time."""
 
@@ -187,37 +210,19 @@ class Log(NamedTuple):
     length: IntArray  #: (1,)
 
 
-def new_state() -> State:
-    """Return an empty state."""
-    return State(
-        np.zeros(STATE_SIZE), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT, np.int64), np.zeros(7),
-        np.zeros(7, np.int64), np.zeros(5, np.int64),
-    )  # fmt: skip
+def new_record(dtype: np.dtype[np.void]) -> np.record:
+    """Return a record of zeros."""
+    record: np.record = np.zeros(1, dtype).view(np.recarray)[0]
+    return record
 
 
 def new_work() -> Work:
     """Return scratch space for series up to `MAX_ORDER`."""
-    n = MAX_ORDER + 1
-    binomial = np.ones((n, n))
-    for order in range(n):
-        value = 1.0
-        for k in range(1, order + 1):
-            value *= (order - k + 1) / k
-            binomial[order, k] = 1.0 / value
-    inverse = np.zeros(n + 1)
-    inverse[1:] = 1.0 / np.arange(1, n + 1)
-    wide, rows = (n, PAIR_COUNT), (PAIR_COUNT, n)
-    return Work(
-        *(np.zeros(wide) for _ in range(6)), np.zeros((3, n)), *(np.zeros(rows) for _ in range(3)),
-        np.zeros((PAIR_COUNT, 4, n)), np.zeros(rows), np.zeros((2, n)), np.zeros((2, n)), np.zeros((MAX_HALVINGS + 2, n)),
-        np.zeros((MAX_HALVINGS + 2, 2)), inverse, binomial,
-    )  # fmt: skip
-
-
-def new_totals() -> Totals:
-    """Return cleared sums."""
-    eight = PAIR_COUNT
-    return Totals(np.zeros(eight), np.zeros(eight), np.zeros(eight), np.zeros(eight, np.int64), np.zeros((2, 16)))
+    work = new_record(WORK)
+    work.inverse[1:] = 1.0 / np.arange(1, _ROWS + 2)
+    for order in range(_ROWS):
+        work.binomial[order, : order + 1] = [1.0 / math.comb(order, k) for k in range(order + 1)]
+    return work
 
 
 def new_log(size: int) -> Log:

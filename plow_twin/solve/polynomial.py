@@ -10,18 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.kernel import kernel
-from plow_twin.solve.layout import MAX_HALVINGS, Work
+from plow_twin.solve.layout import MAX_HALVINGS
 
 Array = NDArray[np.float64]
-
-
-@kernel(inline=True)
-def horner(g: Array, n: int, x: float) -> float:
-    """Return the value at x of the polynomial with coefficients g[0..n]."""
-    value = g[n]
-    for k in range(n - 1, -1, -1):
-        value = value * x + g[k]
-    return value
 
 
 @kernel()
@@ -34,21 +25,6 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
     for r in range(1, n + 1):
         for j in range(n, r - 1, -1):
             b[j] += b[j - 1]
-
-
-@kernel(fast=True)
-def columns_to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
-    """Do the same for eight polynomials side by side, coefficients in rows."""
-    power = 1.0
-    for k in range(n + 1):
-        scale = power * inverse_binomial[k]
-        power *= h
-        for lane in range(8):
-            b[k, lane] = g[k, lane] * scale
-    for r in range(1, n + 1):
-        for j in range(n, r - 1, -1):
-            for lane in range(8):
-                b[j, lane] += b[j - 1, lane]
 
 
 @kernel(inline=True)
@@ -84,7 +60,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
 
 
 @kernel()
-def first_root(g: Array, n: int, h: float, w: Work) -> float:
+def first_root(g: Array, n: int, h: float, w) -> float:  # type: ignore[no-untyped-def]
     """Return where g first turns negative in [0, h), or infinity; g[0] >= 0.
 
     Intervals whose Bernstein coefficients show no negative value are left out, one sign change is one root, the rest is
@@ -128,7 +104,7 @@ def first_root(g: Array, n: int, h: float, w: Work) -> float:
 
 
 @kernel()
-def maximum(g: Array, n: int, h: float, floor: float, w: Work) -> float:
+def maximum(g: Array, n: int, h: float, floor: float, w) -> float:  # type: ignore[no-untyped-def]
     """Return the larger of `floor` and the maximum of g on [0, h], to 1e-12 of it."""
     b = w.halves
     to_bernstein(g, n, h, w.binomial[n], b[0])
@@ -150,10 +126,10 @@ def maximum(g: Array, n: int, h: float, floor: float, w: Work) -> float:
 
 
 @kernel()
-def shift(g: Array, n: int, x: float, out: Array) -> None:
-    """Write the coefficients of g(x + .) to `out`."""
+def shift_column(g: Array, lane: int, n: int, x: float, out: Array) -> None:
+    """Write the coefficients of g(x + .) of one column to the same column of `out`."""
     for k in range(n + 1):
-        out[k] = g[k]
+        out[k, lane] = g[k, lane]
     for r in range(n):
         for j in range(n - 1, r - 1, -1):
-            out[j] += x * out[j + 1]
+            out[j, lane] += x * out[j + 1, lane]

@@ -18,11 +18,12 @@ import math
 from plow_twin.model.contact import power_term
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import (
+    ACTS,
     ALPHA,
     BETA,
     COS,
+    DAMPS,
     OMEGA,
-    ON,
     SIN,
     THETA,
     TOUCHING,
@@ -59,43 +60,145 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:  # ty
             sine, cosine = new_sine, new_cosine
 
 
+# The eight columns of these arrays are SIMD lanes. The lanes are written out and stored last: a store between two loads
+# could touch what is loaded, and the compiler would not dare to put them side by side.
+
+
 @kernel(fast=True)
-def expand(p, state, w, active, count, start, slope, hard, harmonics, second, viscous, factor, integer, fraction, wear, offset, free):  # type: ignore[no-untyped-def]  # noqa: E501
+def _multiply(a, b, k, out) -> None:  # type: ignore[no-untyped-def]
+    """Write order k of the eight products of the columns of a and b to row k of `out`."""
+    t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
+    for j in range(k + 1):
+        i = k - j
+        t0 += a[j, 0] * b[i, 0]
+        t1 += a[j, 1] * b[i, 1]
+        t2 += a[j, 2] * b[i, 2]
+        t3 += a[j, 3] * b[i, 3]
+        t4 += a[j, 4] * b[i, 4]
+        t5 += a[j, 5] * b[i, 5]
+        t6 += a[j, 6] * b[i, 6]
+        t7 += a[j, 7] * b[i, 7]
+    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
+    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
+
+
+@kernel(fast=True)
+def _combine(rows, c, s, x, y, k, out) -> None:  # type: ignore[no-untyped-def]
+    """Write rows . (c, s, x, y) to row k of `out`."""
+    t0 = rows[0, 0] * c + rows[1, 0] * s + rows[2, 0] * x + rows[3, 0] * y
+    t1 = rows[0, 1] * c + rows[1, 1] * s + rows[2, 1] * x + rows[3, 1] * y
+    t2 = rows[0, 2] * c + rows[1, 2] * s + rows[2, 2] * x + rows[3, 2] * y
+    t3 = rows[0, 3] * c + rows[1, 3] * s + rows[2, 3] * x + rows[3, 3] * y
+    t4 = rows[0, 4] * c + rows[1, 4] * s + rows[2, 4] * x + rows[3, 4] * y
+    t5 = rows[0, 5] * c + rows[1, 5] * s + rows[2, 5] * x + rows[3, 5] * y
+    t6 = rows[0, 6] * c + rows[1, 6] * s + rows[2, 6] * x + rows[3, 6] * y
+    t7 = rows[0, 7] * c + rows[1, 7] * s + rows[2, 7] * x + rows[3, 7] * y
+    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
+    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
+
+
+@kernel(fast=True)
+def _weigh(a, weight_a, b, weight_b, k, out) -> None:  # type: ignore[no-untyped-def]
+    """Write weight_a a + weight_b b, lane by lane, to row k of `out`."""
+    t0 = weight_a[0] * a[k, 0] + weight_b[0] * b[k, 0]
+    t1 = weight_a[1] * a[k, 1] + weight_b[1] * b[k, 1]
+    t2 = weight_a[2] * a[k, 2] + weight_b[2] * b[k, 2]
+    t3 = weight_a[3] * a[k, 3] + weight_b[3] * b[k, 3]
+    t4 = weight_a[4] * a[k, 4] + weight_b[4] * b[k, 4]
+    t5 = weight_a[5] * a[k, 5] + weight_b[5] * b[k, 5]
+    t6 = weight_a[6] * a[k, 6] + weight_b[6] * b[k, 6]
+    t7 = weight_a[7] * a[k, 7] + weight_b[7] * b[k, 7]
+    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
+    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
+
+
+@kernel(fast=True)
+def _raise(w, k, touching, exponent) -> None:  # type: ignore[no-untyped-def]
+    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`, by `contact.power_term`."""
+    for lane in range(8):
+        if w.lanes[ACTS, lane] != 0.0:
+            shift = 2 if touching >> lane & 1 else 0
+            w.power[0, k, lane] = power_term(w.gap, w.power[0], lane, k, exponent, shift)
+        else:
+            w.power[0, k, lane] = 0.0
+
+
+@kernel(fast=True)
+def _damp(elastic, w, k, factor) -> None:  # type: ignore[no-untyped-def]
+    """Write order k of K elastic (1 + lambda d') to `w.force`."""
+    if factor is not None:
+        _multiply(elastic, w.rate, k, w.damped)
+    _weigh(elastic, w.lanes[ACTS], w.damped, w.lanes[DAMPS], k, w.force)
+
+
+@kernel(fast=True)
+def _push(state, w, k, viscous, factor, integer, fraction) -> None:  # type: ignore[no-untyped-def]
+    """Write order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
+
+    Row ACTS of `w.lanes` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
+    """
+    if viscous is not None:
+        _weigh(w.gap, w.lanes[ACTS], w.rate, w.lanes[DAMPS], k, w.force)
+    elif integer is not None:
+        _multiply(w.gap, w.gap, k, w.power[0])
+        for degree in range(1, integer - 1):
+            _multiply(w.power[degree - 1], w.gap, k, w.power[degree])
+        _damp(w.power[integer - 2], w, k, factor)
+    elif fraction is not None:
+        _raise(w, k, state.step[TOUCHING], fraction)
+        _damp(w.power[0], w, k, factor)
+    else:
+        _damp(w.gap, w, k, factor)
+
+
+@kernel(fast=True)
+def _hold(w, k, free, fx, fy):  # type: ignore[no-untyped-def]
+    """Return order k of the force per mass in head axes without what acts along a locked world axis."""
+    w.world[0, k], w.world[1, k] = fx, fy
+    right, world = w.right, w.world
+    along_x = along_y = 0.0
+    for j in range(k + 1):
+        along_x += right[k - j, 5] * world[0, j] - right[k - j, 4] * world[1, j]
+        along_y += right[k - j, 4] * world[0, j] + right[k - j, 5] * world[1, j]
+    world[2, k], world[3, k] = free[0] * along_x, free[1] * along_y
+    fx = fy = 0.0
+    for j in range(k + 1):
+        fx += right[k - j, 5] * world[2, j] + right[k - j, 4] * world[3, j]
+        fy += right[k - j, 5] * world[3, j] - right[k - j, 4] * world[2, j]
+    return fx, fy
+
+
+@kernel(fast=True)
+def expand(p, state, w, penetrating, hard, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free):  # type: ignore[no-untyped-def]  # noqa: E501
     """Write the series of state, penetration, rate and force to `w`; return the order used.
 
-    `active` holds the `count` pairs that penetrate; `start` and `slope` (3,) are the wrench that is linear in time, per
-    mass and inertia; `hard` is the longest sigma of interest: orders whose terms vanish there are not computed.
+    Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. `hard` is the longest sigma of
+    interest: orders whose terms vanish there are not computed.
     """
-    y, mode, clock = state.y, state.mode, state.clock
-    alpha, beta = clock[ALPHA], clock[BETA]
-    series, left, right, gap, force, rate, arm = w.series, w.left, w.right, w.gap, w.force, w.rate, w.arm
-    load, inverse, depth = w.load, w.inverse, state.depth
-    A, B = p.gap, p.arm
-    im, ii, K = p.inverse_mass, p.inverse_inertia, p.stiffness
-    touching = state.step[TOUCHING]
+    y, alpha, beta = state.y, state.clock[ALPHA], state.clock[BETA]
+    series, left, right, product, gap, force = w.series, w.left, w.right, w.product, w.gap, w.force
+    load, inverse, worn = w.load, w.inverse, w.worn
+    A, B, start, slope = p.gap, p.arm, w.wrench[0], w.wrench[1]
+    im, ii = p.inverse_mass, p.inverse_inertia
     d0x, d0y, d1x, d1y = p.direction[0, 0], p.direction[0, 1], p.direction[1, 0], p.direction[1, 1]
-    x, yy, vx, vy, om, c, s = y[X], y[Y], y[VX], y[VY], y[OMEGA], y[COS], y[SIN]
-    theta = y[THETA]
+    x, yy, vx, vy, om, c, s, theta = y[X], y[Y], y[VX], y[VY], y[OMEGA], y[COS], y[SIN], y[THETA]
+    # rates of the order before, for the sigma term of the time map
     px = py = pvx = pvy = pom = pc = ps = pth = 0.0
     c1 = s1 = c2 = s2 = 0.0
-    weight = p.radius * p.velocity_tolerance / p.position_tolerance
-    small = 0.02 * p.velocity_tolerance
-    quiet, reach = 0, 1.0
-    order = p.order
+    small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, p.order
     for k in range(order + 1):
         series[k, X], series[k, Y], series[k, VX], series[k, VY] = x, yy, vx, vy
         series[k, OMEGA], series[k, COS], series[k, SIN], series[k, THETA] = om, c, s, theta
-        for lane in range(8):
-            gap[k, lane] = A[0, lane] * c + A[1, lane] * s + A[2, lane] * x + A[3, lane] * yy
+        _combine(A, c, s, x, yy, k, gap)
         if k == 0:
             for lane in range(8):
-                gap[0, lane] += A[4, lane] - depth[lane]
-        elif wear is not None:
-            for i in range(count):
-                gap[k, active[i]] -= w.worn[active[i], k]
-        if k > 0:
+                gap[0, lane] += A[4, lane] - state.depth[lane]
+        else:
+            if wear is not None and penetrating:
+                for lane in range(8):
+                    gap[k, lane] -= worn[k, lane]
             reach *= hard
-            size = abs(vx) + abs(vy) + p.radius * abs(om) + weight * (abs(c) + abs(s))
+            size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
             quiet = quiet + 1 if size * reach < small else 0
             if quiet == p.lacuna and k >= 4:
                 order = k
@@ -107,30 +210,22 @@ def expand(p, state, w, active, count, start, slope, hard, harmonics, second, vi
         left[k, 0] = left[k, 1] = left[k, 2] = left[k, 3] = left[k, 4] = left[k, 5] = om
         if harmonics is not None:
             left[k, 6] = left[k, 7] = load[0, k]
-        a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
-        for j in range(k + 1):
-            i = k - j
-            a0 += left[j, 0] * right[i, 0]
-            a1 += left[j, 1] * right[i, 1]
-            a2 += left[j, 2] * right[i, 2]
-            a3 += left[j, 3] * right[i, 3]
-            a4 += left[j, 4] * right[i, 4]
-            a5 += left[j, 5] * right[i, 5]
-            a6 += left[j, 6] * right[i, 6]
-            a7 += left[j, 7] * right[i, 7]
-        dx, dy, dc, ds = vx + a0, vy - a1, -a4, a5
+        _multiply(left, right, k, product)
+        dx, dy, dc, ds = vx + product[k, 0], vy - product[k, 1], -product[k, 4], product[k, 5]
         # loads, turned into head axes
-        fx = start[0] * c + start[1] * s
-        fy = start[1] * c - start[0] * s
+        fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
         moment = start[2] if k == 0 else 0.0
-        if slope is not None:
+        if segments is not None:
             # wrench start + slope t(sigma): its own series has the terms alpha slope and beta slope / 2
             fx += alpha * (slope[0] * c1 + slope[1] * s1) + 0.5 * beta * (slope[0] * c2 + slope[1] * s2)
             fy += alpha * (slope[1] * c1 - slope[0] * s1) + 0.5 * beta * (slope[1] * c2 - slope[0] * s2)
-            moment += (alpha * slope[2] if k == 1 else 0.0) + (0.5 * beta * slope[2] if k == 2 else 0.0)
+            if k == 1:
+                moment += alpha * slope[2]
+            elif k == 2:
+                moment += 0.5 * beta * slope[2]
         if harmonics is not None:
-            fx += d0x * a6 + d0y * a7
-            fy += d0y * a6 - d0x * a7
+            fx += d0x * product[k, 6] + d0y * product[k, 7]
+            fy += d0y * product[k, 6] - d0x * product[k, 7]
             moment += load[2, k]
             if second is not None:
                 b6 = b7 = 0.0
@@ -142,75 +237,29 @@ def expand(p, state, w, active, count, start, slope, hard, harmonics, second, vi
         if offset is not None:
             # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
             moment -= (offset[0] * (fy + p.gravity * c) - offset[1] * (fx + p.gravity * s)) * ii / im
-        # contact forces along the walls' normals
-        for i in range(count):
-            pair = active[i]
-            d = gap[k, pair]
-            r = A[0, pair] * dc + A[1, pair] * ds + A[2, pair] * dx + A[3, pair] * dy
-            rate[pair, k] = r
-            f = 0.0
-            if mode[pair] == ON:
-                if viscous is not None:
-                    f = K * d + viscous * r
-                else:
-                    power = w.power[pair]
-                    if integer is not None:
-                        power[0, k] = d
-                        for degree in range(1, integer):
-                            total = 0.0
-                            for j in range(k + 1):
-                                total += power[degree - 1, j] * power[0, k - j]
-                            power[degree, k] = total
-                        base = power[integer - 1]
-                        elastic = base[k]
-                    elif fraction is not None:
-                        base, bare = power[1], power[2]
-                        power[0, k] = d
-                        if touching >> pair & 1:
-                            # d = sigma^2 (...): d^1.5 = sigma^3 (...)^1.5
-                            base[k] = 0.0 if k < 3 else power_term(power[0], bare, k - 3, fraction, 2)
-                        else:
-                            base[k] = power_term(power[0], base, k, fraction, 0)
-                        elastic = base[k]
-                    else:
-                        base = power[0]
-                        base[k] = d
-                        elastic = d
-                    f = elastic
-                    if factor is not None:
-                        total = 0.0
-                        for j in range(k + 1):
-                            total += base[j] * rate[pair, k - j]
-                        f += state.factor[pair] * total
-                    f *= K
-                force[pair, k] = f
-                arm[pair, k] = B[0, pair] * c + B[1, pair] * s + B[2, pair] * x + B[3, pair] * yy
-                torque = 0.0
-                for j in range(k + 1):
-                    torque += arm[pair, j] * force[pair, k - j]
-                fx -= A[2, pair] * f * im
-                fy -= A[3, pair] * f * im
-                moment += ii * torque
-                if wear is not None:
-                    before = force[pair, k - 1] if k > 0 else 0.0
-                    w.worn[pair, k + 1] = wear[pair] * (alpha * f + beta * before) * inverse[k + 1]
-            elif wear is not None:
-                w.worn[pair, k + 1] = 0.0
+        if penetrating:
+            _combine(A, dc, ds, dx, dy, k, w.rate)
+            _combine(B, c, s, x, yy, k, w.arm)
+            _push(state, w, k, viscous, factor, integer, fraction)
+            push_x = push_y = 0.0
+            for lane in range(8):
+                push_x += A[2, lane] * force[k, lane]
+                push_y += A[3, lane] * force[k, lane]
+            fx -= push_x * im
+            fy -= push_y * im
+            _multiply(w.arm, force, k, w.torque)
+            torque = 0.0
+            for lane in range(8):
+                torque += w.torque[k, lane]
+            moment += ii * torque
+            if wear is not None:
+                for lane in range(8):
+                    before = force[k - 1, lane] if k > 0 else 0.0
+                    worn[k + 1, lane] = wear[lane] * (alpha * force[k, lane] + beta * before) * inverse[k + 1]
         if free is not None:
             moment *= free[2]
-            if free[0] * free[1] == 0.0:
-                # hold world axes: turn the force to world axes, drop what is locked, turn back
-                w.scratch[0, k], w.scratch[1, k] = fx, fy
-                wx = wy = 0.0
-                for j in range(k + 1):
-                    wx += right[k - j, 5] * w.scratch[0, j] - right[k - j, 4] * w.scratch[1, j]
-                    wy += right[k - j, 4] * w.scratch[0, j] + right[k - j, 5] * w.scratch[1, j]
-                w.world[0, k], w.world[1, k] = free[0] * wx, free[1] * wy
-                fx = fy = 0.0
-                for j in range(k + 1):
-                    fx += right[k - j, 5] * w.world[0, j] + right[k - j, 4] * w.world[1, j]
-                    fy += right[k - j, 5] * w.world[1, j] - right[k - j, 4] * w.world[0, j]
-        dvx, dvy = fx + a2, fy - a3
+            fx, fy = _hold(w, k, free, fx, fy)
+        dvx, dvy = fx + product[k, 2], fy - product[k, 3]
         c2, s2, c1, s1 = c1, s1, c, s
         q = inverse[k + 1]
         x, px = (alpha * dx + beta * px) * q, dx

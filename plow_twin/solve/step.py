@@ -13,15 +13,18 @@ import numpy as np
 from plow_twin.model.contact import normal_force
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import (
+    ACTS,
     ALPHA,
     AT_HARD_END,
     BETA,
     CLIPPED,
     COEFFICIENTS,
     COS,
+    DAMPS,
     EVENT_PAIR,
     EVENT_TO,
     EVENTS,
+    FIRST,
     GUARD_ROOTS,
     HARD_END,
     LENGTH,
@@ -30,12 +33,16 @@ from plow_twin.solve.layout import (
     ON,
     ORDER,
     PIECE,
+    RATIO,
     RECOVERIES,
     RELEASED,
+    SECOND,
     SIGMA,
+    SIGN,
     SIN,
     STALL,
     STEPS,
+    SUM,
     T0,
     THETA,
     TOUCHING,
@@ -43,7 +50,7 @@ from plow_twin.solve.layout import (
     VX,
     VY,
 )
-from plow_twin.solve.polynomial import columns_to_bernstein, first_root, maximum, shift
+from plow_twin.solve.polynomial import first_root, maximum, shift_column
 from plow_twin.solve.series import expand, expand_harmonics
 
 #: Longest step in s; keeps every power of it finite.
@@ -83,116 +90,112 @@ def settle_modes(p, state) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def _guards(p, state, w, order, viscous) -> bool:  # type: ignore[no-untyped-def]
-    """Write each pair's first guard to `w.guard`; return whether some pair has a second one."""
-    gap, guard, mode = w.gap, w.guard, state.mode
+def _guards(p, state, w, order, penetrating, viscous) -> None:  # type: ignore[no-untyped-def]
+    """Write each pair's first guard to `w.guard`.
+
+    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 where the law is viscous, else d >= 0 (or a small depth); others: d >= 0.
+    """
+    gap, rate, guard, lanes = w.gap, w.rate, w.guard, w.lanes
     for lane in range(8):
-        sign = -1.0 if mode[lane] == OFF else 1.0
-        for k in range(order + 1):
-            guard[k, lane] = sign * gap[k, lane]
-    second = False
+        mode = state.mode[lane]
+        lanes[SIGN, lane] = 0.0 if p.enabled[lane] == 0 else -1.0 if mode == OFF else 1.0
+        lanes[RATIO, lane] = 0.0
+        if viscous is not None and mode == ON:
+            lanes[RATIO, lane] = viscous / p.stiffness
+    for k in range(order + 1):
+        for lane in range(8):
+            guard[k, lane] = lanes[SIGN, lane] * gap[k, lane]
+    if viscous is not None and penetrating:
+        for k in range(order):
+            for lane in range(8):
+                guard[k, lane] += lanes[RATIO, lane] * rate[k, lane]
     for lane in range(8):
-        if p.enabled[lane] == 0:
-            for k in range(1, order + 1):
-                guard[k, lane] = 0.0
-            guard[0, lane] = 1.0
-            continue
-        if mode[lane] == ON:
-            if viscous is not None:
-                # F / K = d + (C / K) d'
-                ratio = viscous / p.stiffness
-                for k in range(order):
-                    guard[k, lane] += ratio * w.rate[lane, k]
-            else:
-                second = True
-                # released below a quarter of the depth at which it acts again, so that no pair hovers between
-                guard[0, lane] -= min(0.25 * p.release, 0.5 * max(guard[0, lane], 0.0))
-        elif mode[lane] != OFF:
-            second = True
-        guard[0, lane] = max(guard[0, lane], 0.0)
-    return second
+        first = max(guard[0, lane], 0.0)
+        if state.mode[lane] == ON:
+            # released below a quarter of the depth at which it acts again, so that no pair hovers between
+            first -= min(0.25 * p.release, 0.5 * first)
+        guard[0, lane] = first if p.enabled[lane] == 1 else 1.0
 
 
 @kernel()
 def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:  # type: ignore[no-untyped-def]
-    """Write the second guard of a penetrating pair to `w.scratch[0]`; return whether it has one."""
-    g, mode = w.scratch[0], state.mode[pair]
-    if mode == ON and factor is None:
-        return False
-    sign = 1.0 if mode == ON else -1.0
+    """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
+
+    on: 1 + lambda d' >= 0; clipped: the force would pull; released: d <= p.release.
+    """
+    g, mode = w.column[0], state.mode[pair]
     g[order] = 0.0
     if mode == RELEASED:
         for k in range(order + 1):
             g[k] = -w.gap[k, pair]
         g[0] += p.release
     elif viscous is not None:
+        if mode == ON:
+            return False
         for k in range(order):
-            g[k] = sign * (w.gap[k, pair] + viscous / p.stiffness * w.rate[pair, k])
+            g[k] = -(w.gap[k, pair] + viscous / p.stiffness * w.rate[k, pair])
     else:
-        scale = sign * state.factor[pair]
+        if factor is None:
+            return False
+        sign = 1.0 if mode == ON else -1.0
         for k in range(order):
-            g[k] = scale * w.rate[pair, k]
+            g[k] = sign * state.factor[pair] * w.rate[k, pair]
         g[0] += sign
     g[0] = max(g[0], 0.0)
     return True
 
 
 @kernel(fast=True)
-def _unsafe_lanes(guard, order, h):  # type: ignore[no-untyped-def]
-    """Return a bit for each guard that |g_0| > sum |g_k| h^k does not prove to keep its sign on [0, h]."""
-    bits = 0
-    total = np.zeros(8)
-    for k in range(order, 0, -1):
+def _unsafe_lanes(w, order, h):  # type: ignore[no-untyped-def]
+    """Return a bit for each guard that g_0 > sum |g_k| h^k does not prove to stay positive on [0, h]."""
+    guard, total = w.guard, w.lanes[SUM]
+    for lane in range(8):
+        total[lane] = abs(guard[order, lane]) * h
+    for k in range(order - 1, 0, -1):
         for lane in range(8):
             total[lane] = (total[lane] + abs(guard[k, lane])) * h
+    bits = 0
     for lane in range(8):
         if guard[0, lane] < total[lane]:
             bits |= 1 << lane
     return bits
 
 
+@kernel(inline=True)
+def _next_mode(mode, viscous, fraction):  # type: ignore[no-untyped-def]
+    """Return the mode that follows when a pair's first guard ends it."""
+    if mode == OFF:
+        return ON if fraction is None or fraction == 1.5 else RELEASED
+    if mode == ON and viscous is not None:
+        return CLIPPED
+    return RELEASED if mode == ON and fraction is not None else OFF
+
+
 @kernel()
-def _first_event(p, state, w, order, sigma, active, count, viscous, factor, fraction):  # type: ignore[no-untyped-def]
+def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fraction):  # type: ignore[no-untyped-def]
     """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
-    has_second = _guards(p, state, w, order, viscous)
+    _guards(p, state, w, order, penetrating, viscous)
     best, event, target = sigma, -1, 0
-    unsafe = _unsafe_lanes(w.guard, order, sigma)
-    if unsafe != 0:
-        columns_to_bernstein(w.guard, order, sigma, w.binomial[order], w.bernstein)
-        for pair in range(8):
-            if unsafe >> pair & 1 == 0:
-                continue
-            lowest = 0.0
+    unsafe = _unsafe_lanes(w, order, sigma)
+    column = w.column[0]
+    for pair in range(8):
+        if unsafe >> pair & 1:
             for k in range(order + 1):
-                lowest = min(lowest, w.bernstein[k, pair])
-            if lowest < 0.0:
-                for k in range(order + 1):
-                    w.scratch[0, k] = w.guard[k, pair]
-                state.count[GUARD_ROOTS] += 1
-                root = first_root(w.scratch[0], order, best, w)
-                if root < best:
-                    mode = state.mode[pair]
-                    best, event = root, pair
-                    if mode == OFF:
-                        target = ON if fraction is None or fraction == 1.5 else RELEASED
-                    elif mode == ON and viscous is not None:
-                        target = CLIPPED
-                    elif mode == ON and fraction is not None:
-                        target = RELEASED
-                    else:
-                        target = OFF
-    if has_second:
-        for i in range(count):
-            pair = active[i]
-            if not _second_guard(p, state, w, order, pair, viscous, factor):
+                column[k] = w.guard[k, pair]
+            state.count[GUARD_ROOTS] += 1
+            root = first_root(column, order, best, w)
+            if root < best:
+                best, event, target = root, pair, _next_mode(state.mode[pair], viscous, fraction)
+    if penetrating:
+        for pair in range(8):
+            if state.mode[pair] == OFF or not _second_guard(p, state, w, order, pair, viscous, factor):
                 continue
-            g = w.scratch[0]
             reach = 0.0
             for k in range(order, 0, -1):
-                reach = (reach + abs(g[k])) * best
-            if g[0] < reach:
+                reach = (reach + abs(column[k])) * best
+            if column[0] < reach:
                 state.count[GUARD_ROOTS] += 1
-                root = first_root(g, order, best, w)
+                root = first_root(column, order, best, w)
                 if root < best:
                     best, event, target = root, pair, CLIPPED if state.mode[pair] == ON else ON
     return best, event, target
@@ -201,9 +204,8 @@ def _first_event(p, state, w, order, sigma, active, count, viscous, factor, frac
 @kernel(inline=True)
 def _term_size(p, series, k):  # type: ignore[no-untyped-def]
     """Return the size of order k as a velocity."""
-    weight = p.radius * p.velocity_tolerance / p.position_tolerance
     size = abs(series[k, VX]) + abs(series[k, VY]) + p.radius * abs(series[k, OMEGA])
-    return size + weight * (abs(series[k, COS]) + abs(series[k, SIN]))
+    return size + p.weight * (abs(series[k, COS]) + abs(series[k, SIN]))
 
 
 @kernel()
@@ -218,8 +220,8 @@ def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
         size = _term_size(p, w.series, k)
         if not (size <= 1e300):
             return math.nan
-        if size * length**k > p.threshold[k]:
-            length = math.exp(math.log(p.threshold[k] / size) / k)
+        if size > 0.0:
+            length = min(length, math.exp(math.log(p.threshold[k] / size) / k))
     # an error of velocity becomes one of position over a long step
     stretch = length * p.velocity_tolerance / (p.position_tolerance * (order + 1))
     if stretch > 1.0 and length < hard:
@@ -228,29 +230,39 @@ def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
 
 
 @kernel()
+def _linear_load(segments, step, t0, w):  # type: ignore[no-untyped-def]
+    """Add the linear load at t0 to `w.wrench` and return the time up to which it is linear."""
+    piece = step[PIECE]
+    while piece + 1 < segments.knots.size and segments.knots[piece + 1] <= t0:
+        piece += 1
+    step[PIECE] = piece
+    if t0 < segments.knots[piece]:
+        for j in range(3):
+            w.wrench[0, j] += segments.start[piece, j]
+            w.wrench[1, j] = 0.0
+        return segments.knots[piece]
+    for j in range(3):
+        w.wrench[1, j] = segments.slope[piece, j]
+        w.wrench[0, j] += segments.start[piece, j] + segments.slope[piece, j] * (t0 - segments.knots[piece])
+    return segments.knots[piece + 1] if piece + 1 < segments.knots.size else np.inf
+
+
+@kernel()
 def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free) -> bool:  # type: ignore[no-untyped-def]  # noqa: E501
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step, mode = state.clock, state.step, state.mode
     t0 = clock[T0]
-    active = np.empty(8, np.int64)
-    count = 0
+    penetrating = False
     for pair in range(8):
-        if mode[pair] != OFF:
-            active[count] = pair
-            count += 1
-    start, slope = p.constant.copy(), None
+        penetrating = penetrating or mode[pair] != OFF
+        w.lanes[ACTS, pair] = p.stiffness if mode[pair] == ON else 0.0
+        w.lanes[DAMPS, pair] = 0.0
+        if mode[pair] == ON:
+            w.lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
+    for j in range(3):
+        w.wrench[0, j] = p.constant[j]
     if segments is not None:
-        piece = step[PIECE]
-        while piece + 1 < segments.knots.size and segments.knots[piece + 1] <= t0:
-            piece += 1
-        step[PIECE] = piece
-        slope = np.zeros(3)
-        ahead = segments.knots[0]
-        if t0 >= segments.knots[piece]:
-            slope = segments.slope[piece]
-            ahead = segments.knots[piece + 1] if piece + 1 < segments.knots.size else np.inf
-        start = start + segments.start[piece] + slope * max(t0 - segments.knots[piece], 0.0)
-        hard_time = min(hard_time, ahead)
+        hard_time = min(hard_time, _linear_load(segments, step, t0, w))
     clock[HARD_END] = hard_time
     span = min(hard_time - t0, LONGEST_STEP)
     limited = span < LONGEST_STEP
@@ -263,7 +275,7 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     if harmonics is not None:
         expand_harmonics(harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
     order = expand(
-        p, state, w, active, count, start, slope, hard, harmonics, second, viscous, factor, integer, fraction, wear, offset, free
+        p, state, w, penetrating, hard, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
     )
     state.count[STEPS] += 1
     state.count[COEFFICIENTS] += order
@@ -274,7 +286,7 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     if not math.isfinite(sigma):
         return False
     limited = limited and sigma == hard
-    end, pair, target = _first_event(p, state, w, order, sigma, active, count, viscous, factor, fraction)
+    end, pair, target = _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fraction)
     if pair >= 0 and step[STALL] > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.count[RECOVERIES] += 1
@@ -334,36 +346,64 @@ def pair_outputs(p, state, y, penetration, rate, force) -> None:  # type: ignore
             force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous)
 
 
+@kernel(fast=True)
+def _sums(w, order, h) -> None:  # type: ignore[no-untyped-def]
+    """Write bound and integrals of each force over [0, h]: sum |f_k| h^k, sum f_k h^k / (k+1), sum f_k h^k / (k+2)."""
+    force, bound, first, second, inverse = w.force, w.lanes[SUM], w.lanes[FIRST], w.lanes[SECOND], w.inverse
+    for lane in range(8):
+        bound[lane] = first[lane] = second[lane] = 0.0
+    for k in range(order, -1, -1):
+        for lane in range(8):
+            bound[lane] = bound[lane] * h + abs(force[k, lane])
+            first[lane] = first[lane] * h + force[k, lane] * inverse[k + 1]
+            second[lane] = second[lane] * h + force[k, lane] * inverse[k + 2]
+
+
 @kernel()
 def account(state, w, low, high, totals) -> None:  # type: ignore[no-untyped-def]
     """Add what happened between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
+    mode = state.mode
+    acting = 0
+    for pair in range(8):
+        acting += 1 if mode[pair] == ON else 0
+    if acting == 0:
+        return
     order, clock = state.step[ORDER] - 1, state.clock
     alpha, beta = clock[ALPHA] + clock[BETA] * low, clock[BETA]
     h = high - low
     elapsed = alpha * h + 0.5 * beta * h * h
-    sets = np.zeros(2, np.int64)
+    if low > 0.0:
+        for pair in range(8):
+            shift_column(w.force, pair, order, low, w.bernstein)
+        _swap_rows(w.force, w.bernstein, order)
+    _sums(w, order, h)
+    ccw = cw = 0
     for pair in range(8):
-        if state.mode[pair] != ON:
+        if mode[pair] != ON:
             continue
-        f = w.force[pair]
-        if low > 0.0:
-            shift(f, order, low, w.scratch[1])
-            f = w.scratch[1]
-        bound, first, second = 0.0, 0.0, 0.0
-        for k in range(order, -1, -1):
-            bound = bound * h + abs(f[k])
-            first = first * h + f[k] * w.inverse[k + 1]
-            second = second * h + f[k] * w.inverse[k + 2]
-        totals.impulse[pair] += max(0.0, (alpha * first + beta * h * second) * h)
-        if bound > totals.peak[pair]:
-            totals.peak[pair] = maximum(f, order, h, totals.peak[pair], w)
+        totals.impulse[pair] += max(0.0, (alpha * w.lanes[FIRST, pair] + beta * h * w.lanes[SECOND, pair]) * h)
+        if w.lanes[SUM, pair] > totals.peak[pair]:
+            for k in range(order + 1):
+                w.column[0, k] = w.force[k, pair]
+            totals.peak[pair] = maximum(w.column[0], order, h, totals.peak[pair], w)
         totals.time_in_contact[pair] += elapsed
         # pairs 0, 3, 4, 7 stop a counter-clockwise swing, the others a clockwise one
         corner = pair // 2
-        sets[(pair + corner) % 2] |= 1 << corner
-    for sense in range(2):
-        if sets[sense] != 0:
-            totals.set_time[sense, sets[sense]] += elapsed
+        if (pair + corner) % 2 == 0:
+            ccw |= 1 << corner
+        else:
+            cw |= 1 << corner
+    if low > 0.0:
+        _swap_rows(w.force, w.bernstein, order)
+    totals.set_time[0, ccw] += elapsed if ccw != 0 else 0.0
+    totals.set_time[1, cw] += elapsed if cw != 0 else 0.0
+
+
+@kernel()
+def _swap_rows(a, b, order) -> None:  # type: ignore[no-untyped-def]
+    for k in range(order + 1):
+        for lane in range(8):
+            a[k, lane], b[k, lane] = b[k, lane], a[k, lane]
 
 
 @kernel()
@@ -375,14 +415,11 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:  # type: ignore[no
         for pair in range(8):
             if state.mode[pair] == ON:
                 # coefficients 1..order of the depth; coefficient 0 is the depth itself
-                worn = w.worn[pair]
-                value = worn[order]
+                value = w.worn[order, pair]
                 for k in range(order - 1, 0, -1):
-                    value = value * sigma + worn[k]
+                    value = value * sigma + w.worn[k, pair]
                 state.depth[pair] += value * sigma
-    moved = np.empty(8)
-    evaluate(state, w, sigma, moved)
-    y[:] = moved
+    evaluate(state, w, sigma, y)
     y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
     before = clock[T0]
     clock[T0] = before + clock[LENGTH]
