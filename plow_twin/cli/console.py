@@ -63,7 +63,8 @@ def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=error_console(), transient=True, disable=quiet) as bar:
+    console = error_console()
+    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0)
 
         def on_progress(share: float) -> None:

@@ -1,0 +1,83 @@
+"""`replay`, `view` and `info` on recordings: what they say and how they end."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from record_support import Run, paper_sample, record_run, rewrite
+
+SAMPLES = 600
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return record_run(tmp_path_factory.mktemp("recording") / "run", map(paper_sample, range(SAMPLES)))
+
+
+def plow_twin(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "plow_twin", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=110, stdin=subprocess.DEVNULL)
+
+
+def test_replay_of_an_untouched_recording_ends_with_0(run: Run) -> None:
+    done = plow_twin("replay", run.folder, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    facts = json.loads(done.stdout)
+    assert (facts["result"], facts["samples"], facts["divergences"]) == ("the same", SAMPLES, 0)
+    assert facts["messages_compared"]["contact_forces"] == SAMPLES
+    quiet = plow_twin("replay", run.file, "--quiet")
+    assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
+
+
+def test_replay_of_a_flipped_sample_ends_with_1_and_names_the_step(run: Run, tmp_path: Path) -> None:
+    flipped = 321
+    seen = 0
+
+    def flip(topic: str, message: Any) -> bytes | None:
+        nonlocal seen
+        if not topic.endswith("journal/samples"):
+            return None
+        seen += 1
+        if seen - 1 != flipped:
+            return None
+        fx = struct.pack("<d", paper_sample(flipped).wrench[0])
+        place = message.data.index(fx)
+        return bytes(message.data[:place] + struct.pack("<d", -struct.unpack("<d", fx)[0]) + message.data[place + 8 :])
+
+    done = plow_twin("replay", rewrite(run.file, tmp_path / "flipped.mcap", flip))
+    assert done.returncode == 1
+    assert f"diverged: step {flipped}," in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_cut_recording_ends_with_3_in_every_verb(run: Run, tmp_path: Path) -> None:
+    data = run.file.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    for verb in ("replay", "view", "info"):
+        done = plow_twin(verb, tmp_path / "cut.mcap")
+        assert done.returncode == 3, f"{verb}: {done.stderr}"
+        assert "truncated" in done.stdout + done.stderr
+    assert (tmp_path / "cut.rrd").stat().st_size > 10_000
+
+
+def test_info_counts_what_a_recording_holds(run: Run) -> None:
+    done = plow_twin("info", run.file, "--json")
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["status"] == "complete"
+    assert facts["lost"] == {}
+    assert facts["messages"]["/plow_twin/journal/samples"] == SAMPLES
+    assert facts["messages"]["/contact_forces"] == SAMPLES
+
+
+def test_view_writes_where_it_is_told(run: Run, tmp_path: Path) -> None:
+    done = plow_twin("view", run.folder, "--out", tmp_path / "picture.rrd")
+    assert done.returncode == 0, done.stderr
+    assert f"{SAMPLES} force rows" in done.stdout
+    assert (tmp_path / "picture.rrd").read_bytes()[:4] == b"RRF2"
