@@ -89,6 +89,16 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "pads": "the same of the pads' wear",
 }
 
+
+def markdown_tables() -> dict[str, str]:
+    """Return the tables of the keys of `status` and of each part of `/diagnostics` for the documentation."""
+    tables = {"status": STATUS_KEYS, **KEYS}
+    return {
+        part: "\n".join(["| key | meaning |", "|---|---|", *(f"| `{key}` | {text} |" for key, text in keys.items())])
+        for part, keys in tables.items()
+    }
+
+
 _LEVELS: Final = {State.WAITING: OK, State.RUNNING: OK, State.STALE: WARN, State.FAILED: ERROR}
 
 

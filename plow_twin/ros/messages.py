@@ -78,10 +78,9 @@ class JointStateWriter:
         self.message.header.frame_id = frame_id
         self._views = []
         for quantity in quantities:
-            numbers = array("d", bytes(8 * len(names)))
-            setattr(self.message, quantity, numbers)
-            # the view writes into the message's own array
-            self._views.append(np.frombuffer(numbers))
+            setattr(self.message, quantity, array("d", bytes(8 * len(names))))
+            # the message's own array, which need not be the one that was set
+            self._views.append(np.frombuffer(getattr(self.message, quantity)))
 
     def write(self, stamp: int, *values: ArrayLike) -> JointState:
         """Return the message with the values of its quantities, in order of `quantities`."""

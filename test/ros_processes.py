@@ -1,0 +1,199 @@
+"""Real processes and a real node to look at them with, for the tests of the ROS side."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from rclpy.context import Context
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from plow_twin.ros.messages import set_stamp
+from plow_twin.ros.qos import LATCHED
+
+with warnings.catch_warnings():
+    # the wheels' parser of message definitions uses a deprecated module of the standard library
+    warnings.simplefilter("ignore", DeprecationWarning)
+    import rosidl_generator_py  # noqa: F401
+
+ROOT = Path(__file__).resolve().parent.parent
+#: Long enough for the solver's first compilation on a slow machine [s].
+START_S = 100.0
+WAIT_S = 20.0
+_numbers = itertools.count()
+
+
+class Process:
+    """A program of the package in a process of its own."""
+
+    def __init__(self, module: str, arguments: Sequence[str], log: Path) -> None:
+        self._log = log
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+        environment["AMENT_PREFIX_PATH"] = environment.get("AMENT_PREFIX_PATH") or sys.prefix
+        with log.open("wb") as stream:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments], env=environment, stdout=stream, stderr=subprocess.STDOUT
+            )
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def output(self) -> str:
+        return self._log.read_text(errors="replace")
+
+    def wait(self, timeout_s: float = START_S) -> int:
+        return self._process.wait(timeout_s)
+
+    def stop(self, number: signal.Signals = signal.SIGINT) -> int:
+        """Ask for a stop; more than 5 s is a failure."""
+        self._process.send_signal(number)
+        return self._process.wait(5.0)
+
+    def close(self) -> None:
+        if self.running:
+            self._process.kill()
+        self._process.wait()
+
+
+class Probe:
+    """A node of the test process: publishes, listens, calls, waits."""
+
+    def __init__(self, namespace: str) -> None:
+        self.context = Context()
+        self.context.init(args=[])
+        self.node = rclpy.create_node("probe", namespace=namespace, context=self.context)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self.status: list[DiagnosticStatus] = []
+        self.reports: list[dict[str, DiagnosticStatus]] = []
+        self.node.create_subscription(DiagnosticStatus, "status", self.status.append, LATCHED)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)
+
+    def _report(self, message: DiagnosticArray) -> None:
+        self.reports.append({status.name: status for status in message.status})
+
+    def listen(self, kind: type, topic: str) -> list[Any]:
+        """Return the list that all messages from now on are added to."""
+        heard: list[Any] = []
+        self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
+        self.until(lambda: self.node.count_publishers(topic) > 0, f"a publisher of {topic}")
+        return heard
+
+    def until(self, reached: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> None:
+        """Wait for something to be true."""
+        give_up = time.monotonic() + timeout_s
+        while not reached():
+            assert time.monotonic() < give_up, f"{what}: not within {timeout_s} s; last status {self.status[-1:]}"
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def until_lifecycle(self, state: str, timeout_s: float = WAIT_S) -> None:
+        self.until(lambda: self.status and value(self.status[-1], "lifecycle") == state, state, timeout_s)
+
+    def figures(self, part: str) -> dict[str, str]:
+        """Return the figures of a report that was sent after this call."""
+        count = len(self.reports)
+        name = f"plow_twin: {part}"
+        self.until(lambda: any(name in report for report in self.reports[count:]), f"diagnostics {part}")
+        return {item.key: item.value for item in self.reports[-1][name].values}
+
+    def until_figure(self, part: str, key: str, expected: str) -> None:
+        """Wait until a figure of the diagnostics has the value."""
+        name = f"plow_twin: {part}"
+        self.until(
+            lambda: self.reports and name in self.reports[-1] and value(self.reports[-1][name], key) == expected,
+            f"{part} {key} = {expected}",
+        )
+
+    def excitation(self, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> Callable[..., None]:
+        """Return a function that publishes a sample, once the twin reads it."""
+        profile = QoSProfile(depth=5000, reliability=reliability)
+        publisher = self.node.create_publisher(WrenchStamped, "excitation", profile)
+        self.until(lambda: publisher.get_subscription_count() > 0, "a reader of excitation")
+        self.pause(0.3)
+
+        def send(stamp_ns: int, wrench: Sequence[float], **components: float) -> None:
+            message = WrenchStamped()
+            set_stamp(message.header, stamp_ns)
+            message.wrench.force.x, message.wrench.force.y, message.wrench.torque.z = wrench
+            for name, number in components.items():
+                part, axis = name.split("_")
+                setattr(getattr(message.wrench, part), axis, number)
+            publisher.publish(message)
+
+        return send
+
+    def pause(self, seconds: float) -> None:
+        """Give discovery on the other side its time."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def call(self, kind: type, service: str, request: Any) -> Any:
+        client = self.node.create_client(kind, service)
+        self.until(client.service_is_ready, service)
+        future = client.call_async(request)
+        self.until(future.done, f"an answer of {service}", START_S)
+        self.node.destroy_client(client)
+        return future.result()
+
+    def close(self) -> None:
+        self._executor.remove_node(self.node)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+class Bench:
+    """A twin in a process of its own, in a namespace of its own, and a probe beside it."""
+
+    def __init__(self, folder: Path, parameters: dict[str, Any], arguments: Sequence[str] = ()) -> None:
+        self.namespace = f"/t{os.getpid()}_{next(_numbers)}"
+        # {ns} in a name of a parameter stands for the namespace
+        named = {name.replace("{ns}", self.namespace): given for name, given in parameters.items()}
+        self.folder = folder
+        self._publishers: list[Process] = []
+        self.probe = Probe(self.namespace)
+        settings = itertools.chain.from_iterable(("-p", f"{name}:={given}") for name, given in named.items())
+        given = ["--ros-args", "-r", f"__ns:={self.namespace}", *settings, *arguments]
+        self.twin = Process("plow_twin.ros.main", given, folder / "twin.log")
+
+    def publisher(self, *arguments: str) -> Process:
+        """Start the excitation publisher."""
+        given = [*arguments, "--ros-args", "-r", f"__ns:={self.namespace}"]
+        self._publishers.append(Process("plow_twin.ros.excitation_publisher", given, self.folder / "publisher.log"))
+        return self._publishers[-1]
+
+    def close(self) -> None:
+        """End what still runs."""
+        self.probe.close()
+        for process in (self.twin, *self._publishers):
+            process.close()
+
+
+@contextmanager
+def bench(folder: Path, lifecycle: str = "active", arguments: Sequence[str] = (), **parameters: Any) -> Iterator[Bench]:
+    """Start a twin and wait until it is in the given state."""
+    running = Bench(folder, parameters, arguments)
+    try:
+        running.probe.until_lifecycle(lifecycle, START_S)
+        yield running
+    finally:
+        running.close()
+
+
+def value(status: DiagnosticStatus, key: str) -> str:
+    """Return the value of a key of a status."""
+    return {item.key: item.value for item in status.values}[key]

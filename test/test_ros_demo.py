@@ -1,0 +1,67 @@
+"""The main job, live, as a user starts it: publisher, node and recorder as processes, summed up from the recording."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_processes import ROOT
+
+from plow_twin.model.loads import compile_loads
+from plow_twin.presets import scene_path
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.ros.run_summary import summarise
+from plow_twin.scene_file import load_scene
+from plow_twin.twin import Twin
+
+
+def _demo(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "plow_twin", "demo", "--out", str(folder), *arguments]
+    return subprocess.run(command, cwd=ROOT, env=dict(os.environ), capture_output=True, text=True, timeout=110)
+
+
+@pytest.mark.parametrize("speed", ["real", "fast"])
+def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> None:
+    done = _demo(tmp_path, "--speed", speed, "--seconds", "3")
+    assert done.returncode == 0, done.stderr
+    for line in (
+        "samples sent 3000, used 3000, frames out 3000, lost 0",
+        "contact sets ccw: ",
+        "horizontal clearance 25.0000 mm",
+        "real-time factor ",
+        "plow-twin replay ",
+        "rerun ",
+    ):
+        assert line in done.stdout, done.stdout
+    (folder,) = tmp_path.iterdir()
+    reader = RunReader(folder / "run")
+    assert sum(1 for _ in reader) > 12000
+    assert reader.status is FileStatus.COMPLETE and not reader.lost
+    assert (folder / "run.rrd").stat().st_size > 10_000
+    assert json.loads((folder / "publisher.log").read_text().splitlines()[-1])["stalls"] == 0
+    assert "Traceback" not in (folder / "node.log").read_text()
+
+    # the summary against the twin itself
+    scene = load_scene(scene_path("paper"))
+    times = np.arange(3000) * 1e-3
+    series = Twin(scene, excitation="sampled").advance_samples(times, compile_loads(scene.loads).at(times))
+    summary = summarise(folder / "run")
+    np.testing.assert_allclose(summary.largest, series.peak.max(axis=0), rtol=1e-6)
+    assert (summary.touches == series.makes.sum(axis=0)).all()
+    in_contact = (series.impulse > 0.0).sum(axis=0) * 1e-3
+    mean = np.divide(series.impulse.sum(axis=0), in_contact, out=np.zeros(8), where=in_contact > 0.0)
+    np.testing.assert_allclose(summary.mean_in_contact, mean, rtol=1e-3)
+    for shares in summary.contact_sets.values():
+        assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_a_demo_whose_node_cannot_start_fails_and_says_why(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = _demo(tmp_path / "file" / "below", "--seconds", "1", "--quiet")
+    assert done.returncode != 0
+    assert "file" in done.stderr and "Traceback" not in done.stderr

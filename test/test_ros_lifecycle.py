@@ -1,0 +1,180 @@
+"""Lifecycle and parameters through the services that any manager uses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from geometry_msgs.msg import WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_processes import Bench, Process, bench, value
+from sensor_msgs.msg import JointState
+
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.ros.parameters import SPECS, Effect
+
+T0 = 1_795_000_000_000_000_000
+
+
+def _change(running: Bench, transition: int) -> bool:
+    request = ChangeState.Request(transition=Transition(id=transition))
+    return bool(running.probe.call(ChangeState, f"{running.namespace}/plow_twin/change_state", request).success)
+
+
+def _state(running: Bench) -> str:
+    answer = running.probe.call(GetState, f"{running.namespace}/plow_twin/get_state", GetState.Request())
+    return str(answer.current_state.label)
+
+
+def _set(running: Bench, name: str, given: Any) -> Any:
+    kinds = {bool: "bool", int: "integer", float: "double", str: "string"}
+    kind = kinds[type(given)]
+    number = getattr(ParameterType, f"PARAMETER_{kind.upper()}")
+    parameter = Parameter(name=name, value=ParameterValue(type=number, **{f"{kind}_value": given}))
+    request = SetParameters.Request(parameters=[parameter])
+    return running.probe.call(SetParameters, f"{running.namespace}/plow_twin/set_parameters", request).results[0]
+
+
+def test_a_managed_node_waits_refuses_nonsense_and_goes_through_all_states(tmp_path: Path) -> None:
+    with bench(tmp_path, "unconfigured", autostart="false", scene="no/such.yaml") as running:
+        probe = running.probe
+        assert _state(running) == "unconfigured"
+        assert not _change(running, Transition.TRANSITION_ACTIVATE)
+        assert not _change(running, Transition.TRANSITION_CONFIGURE)
+        assert _state(running) == "unconfigured"
+        assert "no/such.yaml" in probe.status[-1].message and probe.status[-1].level == b"\x02"
+        assert "no/such.yaml" in probe.figures("state")["reason"]
+
+        assert _set(running, "scene", "paper").successful
+        assert _set(running, "record_path", str(tmp_path / "first")).successful
+        assert _change(running, Transition.TRANSITION_CONFIGURE)
+        assert _state(running) == "inactive"
+        forces = probe.listen(JointState, "contact_forces")
+        send = probe.excitation()
+        send(T0, (1.0, 2.0, 3.0))
+        probe.until_figure("input", "dropped_inactive", "1")
+        assert _change(running, Transition.TRANSITION_ACTIVATE)
+        send(T0 + 1_000_000, (1.0, 2.0, 3.0))
+        probe.until(lambda: forces, "an answer of the active node")
+        assert not _change(running, Transition.TRANSITION_CONFIGURE)
+        assert not _set(running, "scene", "bench_kv").successful
+        assert _change(running, Transition.TRANSITION_DEACTIVATE)
+        assert _change(running, Transition.TRANSITION_CLEANUP)
+        reader = RunReader(tmp_path / "first")
+        assert [type(getattr(record, "entry", None)).__name__ for record in reader].count("Sample") == 1
+        assert reader.status is FileStatus.COMPLETE
+        probe.until(lambda: probe.node.count_publishers("contact_forces") == 0, "released publishers")
+
+        # around once more, on another scene, and out by shutdown
+        assert _set(running, "scene", "bench_kv").successful
+        assert _set(running, "record_path", "").successful
+        assert _change(running, Transition.TRANSITION_CONFIGURE)
+        assert _change(running, Transition.TRANSITION_ACTIVATE)
+        probe.until_figure("state", "scene", "bench_kv")
+        assert _change(running, Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert _state(running) == "finalized"
+        assert running.twin.stop() == 0
+        assert "Traceback" not in running.twin.output()
+
+
+def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
+    given = ["excitation_source:=drum", "tolerance:=.nan", "jump_back:=-3", "input_depth:=5.5", "autostart:=1"]
+    settings = [word for item in given for word in ("-p", item)]
+    twin = Process("plow_twin.ros.main", ["--ros-args", *settings], tmp_path / "twin.log")
+    assert twin.wait() == 2
+    said = twin.output()
+    twin.close()
+    for name, got in (
+        ("excitation_source", "'drum'"),
+        ("tolerance", "nan"),
+        ("jump_back", "-3"),
+        ("input_depth", "5.5"),
+        ("autostart", "1"),
+    ):
+        assert f"{name}: got {got}, expected " in said
+    assert "expected a number from 0 to 3600 [s]" in said
+    assert "Traceback" not in said
+
+
+def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
+    path = tmp_path / "twin.yaml"
+    path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"excitation_timeout": 2, "hold_polcy": "zero"}}}))
+    with bench(tmp_path, arguments=("--params-file", str(path))) as running:
+        request = GetParameters.Request(names=["excitation_timeout"])
+        service = f"{running.namespace}/plow_twin/get_parameters"
+        found = running.probe.call(GetParameters, service, request).values[0]
+        assert (found.type, found.double_value) == (ParameterType.PARAMETER_DOUBLE, 2.0)
+        assert "unknown parameter hold_polcy: 'zero' is not used; did you mean hold_policy?" in running.twin.output()
+
+
+@pytest.fixture(scope="module")
+def active(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    with bench(tmp_path_factory.mktemp("active"), excitation_timeout=60.0) as running:
+        yield running
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "accepted"),
+    [
+        ("excitation_timeout", 0.25, True),
+        ("excitation_timeout", 3, True),
+        ("excitation_timeout", float("nan"), False),
+        ("excitation_timeout", 1e9, False),
+        ("excitation_timeout", "soon", False),
+        ("hold_policy", "zero", True),
+        ("hold_policy", "guess", False),
+        ("failure_limit", 5, True),
+        ("failure_limit", 5.0, False),
+        ("autostart", False, False),
+        ("tolerance", 1e-8, False),
+        ("no_such_parameter", 1.0, False),
+    ],
+)
+def test_changes_at_run_time_are_taken_or_refused_with_a_reason(
+    active: Bench, name: str, given: Any, accepted: bool
+) -> None:
+    result = _set(active, name, given)
+    assert result.successful is accepted, result.reason
+    assert accepted or result.reason
+    assert active.twin.running
+
+
+def test_a_changed_timeout_works_at_once(active: Bench) -> None:
+    forces = active.probe.listen(JointState, "contact_forces")
+    assert _set(active, "excitation_timeout", 3600.0).successful
+    active.probe.excitation()(T0, (1.0, 2.0, 3.0))
+    active.probe.until(lambda: forces and value(active.probe.status[-1], "stream") == "running", "an answer")
+    assert _set(active, "excitation_timeout", 0.05).successful
+    active.probe.until(lambda: value(active.probe.status[-1], "stream") == "stale", "the hold policy")
+
+
+def test_every_parameter_has_a_descriptor_with_meaning_range_and_effect(active: Bench) -> None:
+    request = DescribeParameters.Request(names=list(SPECS))
+    service = f"{active.namespace}/plow_twin/describe_parameters"
+    found = active.probe.call(DescribeParameters, service, request).descriptors
+    assert [item.name for item in found] == list(SPECS)
+    for item in found:
+        spec = SPECS[item.name]
+        assert spec.metadata["doc"] in item.description
+        assert item.read_only == (spec.metadata["effect"] is Effect.START)
+        if item.type == ParameterType.PARAMETER_DOUBLE:
+            bounds = item.floating_point_range[0]
+            assert (bounds.from_value, bounds.to_value) == (spec.metadata["low"], spec.metadata["high"])
+            assert f"[{spec.metadata['unit']}]" in item.description
+        if item.type == ParameterType.PARAMETER_INTEGER:
+            assert item.integer_range[0].to_value == spec.metadata["high"]
+
+
+def test_quality_of_service_of_an_input_can_be_overridden(tmp_path: Path) -> None:
+    overrides = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
+    with bench(tmp_path, **overrides) as running:
+        offered = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+        running.probe.node.create_publisher(WrenchStamped, "excitation", offered)
+        running.probe.until_figure("input", "refused_publishers", "1")
+        assert "incompatible quality of service" in running.twin.output()

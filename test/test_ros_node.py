@@ -1,0 +1,325 @@
+"""The node as its users meet it: real processes, real topics."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import WrenchStamped
+from nav_msgs.msg import Odometry
+from rclpy.qos import ReliabilityPolicy
+from ros_processes import ROOT, bench, value
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from plow_twin.model.loads import compile_loads
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Scene, Wear
+from plow_twin.presets import scene_path
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.replay import replay
+from plow_twin.ros.diagnostics import KEYS, STATUS_KEYS
+from plow_twin.ros.messages import stamp_ns
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.stream.outputs import CLEARANCE_NAMES
+from plow_twin.twin import AdvanceSeries, Twin
+
+T0 = 1_795_000_000_000_000_000
+MS = 1_000_000
+PAPER = load_scene(scene_path("paper"))
+WEAR = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
+
+
+def _scene_file(folder: Path, scene: Scene) -> Path:
+    path = folder / "scene.yaml"
+    path.write_text(dump_scene(scene), encoding="utf-8")
+    return path
+
+
+def _column(messages: list[JointState], name: str) -> np.ndarray:
+    return np.array([getattr(message, name) for message in messages])
+
+
+def _offline(scene: Scene, stamps: list[int], wrench: np.ndarray) -> AdvanceSeries:
+    times = np.array([(stamp - stamps[0]) * 1e-9 for stamp in stamps])
+    return Twin(scene, excitation="sampled").advance_samples(times, wrench)
+
+
+def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path: Path) -> None:
+    scene = replace(PAPER, wear=WEAR)
+    with bench(tmp_path, scene=_scene_file(tmp_path, scene), expected_rate=1000.0, excitation_timeout=60.0) as running:
+        probe = running.probe
+        forces, peaks = probe.listen(JointState, "contact_forces"), probe.listen(JointState, "contact_peaks")
+        heads, clearances = probe.listen(Odometry, "head_state"), probe.listen(JointState, "clearance")
+        publisher = running.publisher("--seconds", "2")
+        samples = probe.listen(WrenchStamped, "excitation")
+        probe.until(lambda: not publisher.running, "the end of the publisher", 100.0)
+        assert publisher.wait() == 0, publisher.output()
+        assert json.loads(publisher.output().splitlines()[-1])["sent"] == 2000
+        probe.until(lambda: len(samples) == 2000 and len(heads) >= 2000, "all messages")
+        figures = probe.figures("input")
+        assert (figures["samples_used"], figures["samples_missing"]) == ("2000", "0")
+
+    stamps = [stamp_ns(message.header) for message in samples]
+    assert (np.diff(stamps) == MS).all()
+    wrench = np.array([(m.wrench.force.x, m.wrench.force.y, m.wrench.torque.z) for m in samples])
+    assert (wrench == compile_loads(scene.loads).at(np.arange(2000) * 1e-3)).all()
+    series = _offline(scene, stamps, wrench)
+    assert [stamp_ns(message.header) for message in forces[:2000]] == stamps
+    assert tuple(forces[0].name) == PAIR_NAMES == tuple(peaks[0].name)
+    for messages, names in (
+        (forces, ("penetration", "rate", "force")),
+        (peaks, (None, "impulse", "peak")),
+    ):
+        for quantity, name in zip(("position", "velocity", "effort"), names, strict=True):
+            expected = np.cumsum(series.makes, axis=0) if name is None else getattr(series, name)
+            assert (_column(messages[:2000], quantity) == expected).all(), quantity
+    poses = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in heads[:2000]])
+    assert (poses == series.q[:, :2]).all()
+    assert series.makes.sum() > 0 and series.force.max() > 1e5
+
+    newest = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
+    assert tuple(clearances[-1].name) == CLEARANCE_NAMES
+    index = stamps.index(stamp_ns(clearances[-1].header))
+    depth = series.wear_depth[index]
+    assert newest["pad_top_right_top"] == depth[2] > 0.0
+    assert newest["horizontal"] == 0.025 + depth[[1, 7]].mean() + depth[[3, 5]].mean()
+    assert newest["horizontal/p05"] < newest["horizontal"] < newest["horizontal/p95"]
+
+
+def test_a_fixed_rate_loses_no_impact(tmp_path: Path) -> None:
+    wrench = compile_loads(PAPER.loads).at(np.arange(1500) * 1e-3)
+    with bench(tmp_path, publish_mode="fixed_rate", publish_rate=20.0, excitation_timeout=60.0) as running:
+        peaks = running.probe.listen(JointState, "contact_peaks")
+        send = running.probe.excitation()
+        for index, row in enumerate(wrench.tolist()):
+            send(T0 + index * MS, row)
+            if index % 30 == 29:
+                running.probe.pause(0.03)
+        running.probe.until(lambda: peaks and stamp_ns(peaks[-1].header) == T0 + 1499 * MS, "the last frame")
+    series = _offline(PAPER, [T0 + index * MS for index in range(1500)], wrench)
+    assert len(peaks) < 300
+    assert (np.array(peaks[-1].position) == series.makes.sum(axis=0)).all()
+    assert (_column(peaks, "effort").max(axis=0) == series.peak.max(axis=0)).all()
+    np.testing.assert_allclose(_column(peaks, "velocity").sum(axis=0), series.impulse.sum(axis=0), rtol=1e-12)
+
+
+def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=60.0) as running:
+        probe = running.probe
+        forces = probe.listen(JointState, "contact_forces")
+        send = probe.excitation()
+        good = (30e3, 0.0, -40e3)
+        other = probe.node.create_publisher(JointState, "tool_forces", 10)
+        probe.until(lambda: other.get_subscription_count() > 0, "a reader of tool_forces")
+        probe.pause(0.3)
+        send(T0, good)
+        for bad in ((math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf)):
+            send(T0 + MS, bad)
+        send(0, good)
+        send(T0, good)
+        send(T0 + 3 * MS, good, force_z=1.0)
+        send(T0 + 2 * MS, good)
+        other.publish(JointState(name=["fx1"], effort=[1.0]))
+        send(T0 + 4 * MS, good)
+        probe.until(lambda: len(forces) == 3, "three good samples")
+        probe.until_figure("input", "samples_in", "10")
+        figures = probe.figures("input")
+        levels = {report["plow_twin: input"].level for report in probe.reports if "plow_twin: input" in report}
+    dropped = {key: int(count) for key, count in figures.items() if key.startswith("dropped_")}
+    assert {key: count for key, count in dropped.items() if count} == {
+        "dropped_non_finite": 3,
+        "dropped_unstamped": 1,
+        "dropped_duplicate": 1,
+        "dropped_out_of_order": 1,
+        "dropped_not_selected": 1,
+    }
+    assert figures["out_of_plane"] == "1"
+    assert b"\x02" in levels  # an unstamped sample is an error
+    assert [stamp_ns(message.header) - T0 for message in forces] == [0, 3 * MS, 4 * MS]
+    for quantity in ("position", "velocity", "effort"):
+        assert np.isfinite(_column(forces, quantity)).all()
+
+
+def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=60.0, failure_limit=2) as running:
+        probe = running.probe
+        forces = probe.listen(JointState, "contact_forces")
+        send = probe.excitation()
+        send(T0, (0.0, 0.0, 0.0))
+        for index in (1, 2):
+            send(T0 + index * MS, (1e200, 1e200, 1e200))
+        probe.until(lambda: any(status.level == b"\x02" for status in probe.status), "status ERROR")
+        probe.until_figure("state", "solver_failures", "2")
+        probe.until_figure("state", "resets", "1")
+        send(T0 + 5 * MS, (0.0, 0.0, 0.0))
+        probe.until(lambda: len(forces) == 2, "recovery")
+    assert [stamp_ns(message.header) - T0 for message in forces] == [0, 5 * MS]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, number: signal.Signals) -> None:
+    with bench(tmp_path, record_path=tmp_path / "run") as running:
+        forces = running.probe.listen(JointState, "contact_forces")
+        publisher = running.publisher("--seconds", "60")
+        running.probe.until(lambda: len(forces) > 500, "a flow of messages", 60.0)
+        assert running.twin.stop(number) == 0
+        assert "Traceback" not in running.twin.output()
+        assert publisher.running
+        assert publisher.stop(number) == 0
+        assert "Traceback" not in publisher.output()
+    reader = RunReader(tmp_path / "run")
+    used = sum(1 for record in reader if type(getattr(record, "entry", None)).__name__ == "Sample")
+    assert reader.status is FileStatus.COMPLETE
+    assert used > 500 and not reader.lost
+    report = replay(tmp_path / "run")
+    assert report.first_divergence is None
+
+
+@pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
+def test_best_effort_and_reliable_publishers_connect(tmp_path: Path, reliability: ReliabilityPolicy) -> None:
+    with bench(tmp_path) as running:
+        forces = running.probe.listen(JointState, "contact_forces")
+        running.probe.excitation(reliability)(T0, (1.0, 2.0, 3.0))
+        running.probe.until(lambda: forces, "an answer")
+        assert running.probe.figures("input")["refused_publishers"] == "0"
+
+
+def test_silence_is_held_and_said(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=0.2) as running:
+        probe = running.probe
+        forces = probe.listen(JointState, "contact_forces")
+        send = probe.excitation()
+        send(T0, (30e3, 0.0, 0.0))
+        probe.until(lambda: len(forces) > 20, "advances under the hold policy")
+        send(T0 + 9_000 * MS, (30e3, 0.0, 0.0))
+        probe.until(lambda: stamp_ns(forces[-1].header) >= T0 + 9_000 * MS, "the sample after it")
+        probe.until(lambda: sum(status.level == b"\x01" for status in probe.status) == 2, "silence again")
+        states = [value(status, "stream") for status in probe.status if value(status, "lifecycle") == "active"]
+        assert states == ["waiting", "running", "stale", "running", "stale"]
+        assert [status.level for status in probe.status[-3:]] == [b"\x01", b"\x00", b"\x01"]
+        assert value(probe.status[-1], "stale_inputs") == "excitation"
+        assert {key: value(probe.status[-1], key) for key in ("horizontal", "vertical", "pads")} == {
+            "horizontal": "prior",
+            "vertical": "prior",
+            "pads": "prior",
+        }
+        assert [item.key for item in probe.status[-1].values] == list(STATUS_KEYS)
+
+
+def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=0.05, use_sim_time="true") as running:
+        probe = running.probe
+        forces = probe.listen(JointState, "contact_forces")
+        probe.excitation()(T0, (30e3, 0.0, 0.0))
+        probe.until(lambda: forces, "the answer")
+        for _ in range(2):
+            assert probe.figures("input")["holds"] == "0"
+        assert len(forces) == 1
+        assert value(probe.status[-1], "stream") == "running"
+
+
+def test_diagnostics_go_on_without_a_clock_and_hold_every_documented_key(tmp_path: Path) -> None:
+    with bench(tmp_path, use_sim_time="true", hardware_id="head 7") as running:
+        probe = running.probe
+        count = len(probe.reports)
+        probe.until(lambda: len(probe.reports) >= count + 3, "three reports with /clock silent")
+        report = probe.reports[-1]
+        found = {name.partition(": ")[2]: [item.key for item in status.values] for name, status in report.items()}
+        assert {part: sorted(keys) for part, keys in found.items()} == {
+            part: sorted(keys) for part, keys in KEYS.items()
+        }
+        assert {status.hardware_id for status in report.values()} == {"head 7"}
+
+
+def test_reset_restores_the_initial_state(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=60.0) as running:
+        probe = running.probe
+        heads = probe.listen(Odometry, "head_state")
+        send = probe.excitation()
+        for index in range(300):
+            send(T0 + index * MS, (30e3, 0.0, -40e3))
+        probe.until(lambda: len(heads) == 300, "300 answers")
+        answer = probe.call(Trigger, f"{running.namespace}/plow_twin/reset", Trigger.Request())
+        assert answer.success, answer.message
+        send(T0 + 300 * MS, (0.0, 0.0, 0.0))
+        probe.until(lambda: len(heads) == 301, "the sample after the reset")
+        position = heads[-1].pose.pose.position
+        assert heads[-2].pose.pose.position.x != 0.0
+        assert (position.x, position.y, heads[-1].twist.twist.angular.z) == PAPER.initial.q
+
+
+def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
+    scale = np.sin(np.linspace(0.0, 1.5, 200))
+    amplitudes = {load.name: float(np.hypot(*load.force_n)) for load in PAPER.loads}
+    with bench(tmp_path, excitation_source="tool_forces", excitation_timeout=60.0) as running:
+        probe = running.probe
+        heads = probe.listen(Odometry, "head_state")
+        publisher = probe.node.create_publisher(JointState, "tool_forces", 1000)
+        probe.until(lambda: publisher.get_subscription_count() > 0, "a reader of tool_forces")
+        probe.pause(0.3)
+        for index, share in enumerate(scale):
+            # any order of the names will do
+            names = sorted(amplitudes, reverse=bool(index % 2))
+            message = JointState(name=names, effort=[amplitudes[name] * share for name in names])
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(T0 + index * MS, 1_000_000_000)
+            publisher.publish(message)
+        publisher.publish(JointState(name=["fx1", "unknown"], effort=[1.0, 2.0]))
+        probe.until(lambda: len(heads) == 200, "200 answers")
+        probe.until_figure("input", "dropped_malformed", "1")
+    per_unit = compile_loads(PAPER.loads).sine.sum(axis=0)
+    series = _offline(PAPER, [T0 + index * MS for index in range(200)], scale[:, None] * per_unit)
+    poses = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in heads])
+    np.testing.assert_allclose(poses, series.q[:, :2], rtol=1e-9, atol=1e-15)
+
+
+def test_the_scenes_own_loads_run_by_the_nodes_clock(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_source="scene", use_sim_time="true") as running:
+        probe = running.probe
+        heads = probe.listen(Odometry, "head_state")
+        clock = probe.node.create_publisher(Clock, "/clock", 10)
+        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
+        probe.pause(0.3)
+        for step in range(5):
+            message = Clock()
+            message.clock.sec, message.clock.nanosec = divmod(T0 + step * 300 * MS, 1_000_000_000)
+            clock.publish(message)
+            probe.until(lambda: heads and stamp_ns(heads[-1].header) == T0 + step * 300 * MS, "its answer")  # noqa: B023
+    twin = Twin(PAPER)
+    for index, head in enumerate(heads):
+        q = twin.advance((stamp_ns(head.header) - T0) * 1e-9).q
+        assert (head.pose.pose.position.x, head.pose.pose.position.y) == tuple(q[:2]), index
+
+
+def test_two_twins_in_two_namespaces_do_not_meet(tmp_path: Path) -> None:
+    (tmp_path / "one").mkdir()
+    (tmp_path / "two").mkdir()
+    with bench(tmp_path / "one") as one, bench(tmp_path / "two") as two:
+        first, second = (running.probe.listen(JointState, "contact_forces") for running in (one, two))
+        send = one.probe.excitation()
+        for index in range(50):
+            send(T0 + index * MS, (30e3, 0.0, 0.0))
+        one.probe.until(lambda: len(first) >= 50, "answers of the first")
+        assert second == []
+        topics = {name for name, _ in one.probe.node.get_topic_names_and_types()}
+        own = {"excitation", "tool_forces", "contact_forces", "head_state", "clearance", "status"}
+        assert {f"{one.namespace}/{name}" for name in own} <= topics
+        absolute = {name for name in topics if name.count("/") == 1}
+        assert absolute <= {"/diagnostics", "/clock", "/parameter_events", "/rosout"}
+
+
+def test_the_documentation_names_every_topic_parameter_and_key() -> None:
+    from plow_twin.ros.diagnostics import markdown_tables
+    from plow_twin.ros.parameters import markdown_table, yaml_text
+
+    text = (ROOT / "docs" / "node.md").read_text(encoding="utf-8")
+    assert markdown_table() in text
+    for table in markdown_tables().values():
+        assert table in text
+    assert (ROOT / "config" / "twin.yaml").read_text(encoding="utf-8") == yaml_text()
