@@ -33,9 +33,10 @@ _WHITE: Final = (235, 235, 235)
 
 @dataclass(frozen=True)
 class ViewSummary:
-    """What a .rrd holds: rows of the curves, moments of the cross-section, events, and how the recording ended."""
+    """What a .rrd holds: first stamp, rows of the curves, moments of the cross-section, events, the recording's end."""
 
     path: Path
+    first_ns: int
     curve_rows: int
     section_rows: int
     events: int
@@ -93,7 +94,7 @@ def to_rrd(
     run.finish(reader.status)
     stream.flush()
     stream.disconnect()
-    return ViewSummary(out, run.force.sent, run.section_rows, run.events.count, reader.status)
+    return ViewSummary(out, run.first_ns, run.force.sent, run.section_rows, run.events.count, reader.status)
 
 
 class _Run:
@@ -124,6 +125,7 @@ class _Run:
         self._first_ns: int | None = None
         self._sample_ns: int | None = None
         self._contact: JointState | None = None
+        self._early: list[tuple[int, DiagnosticStatus]] = []
         self._wrench = (0.0, 0.0, 0.0)
         self._handlers: dict[str, Callable[[OutputRecord, Any], None]] = {
             header.topic("contact_forces"): self._contact_forces,
@@ -137,6 +139,11 @@ class _Run:
     def elapsed_s(self) -> float:
         """Time since the first stamp [s]."""
         return 0.0 if self._first_ns is None else (self._stamp_ns - self._first_ns) * 1e-9
+
+    @property
+    def first_ns(self) -> int:
+        """The first stamp; 0 without any."""
+        return self._first_ns or 0
 
     def start(self, scene: Scene, source: Path) -> None:
         """Write what does not change in time."""
@@ -169,6 +176,8 @@ class _Run:
             fx, fy, moment = self._wrench = entry.wrench
             self.load.add(stamp_ns, self.step, (fx / 1e3, fy / 1e3, moment / 1e3))
             self._quality(stamp_ns, record.log_time_ns)
+        if self._early and self._first_ns is not None:
+            self._write_early(self._first_ns)
         self.events.entry(stamp_ns, max(self.step, 0), entry, self.header.excitation_source)
 
     def _quality(self, stamp_ns: int, log_time_ns: int) -> None:
@@ -234,10 +243,20 @@ class _Run:
             curves.add(message.stamp_ns, max(self.step, 0), 1e3 * message.position[chosen])
 
     def _status(self, record: OutputRecord, message: DiagnosticStatus) -> None:
-        self.events.status(self._stamp_ns or record.publish_time_ns, max(self.step, 0), message)
+        if self._first_ns is None:
+            self._early.append((record.publish_time_ns, message))
+        else:
+            self.events.status(self._stamp_ns, self.step, message)
+
+    def _write_early(self, stamp_ns: int | None) -> None:
+        """Write the states from before the first sample at its stamp: playing then starts where there is motion."""
+        for published_ns, message in self._early:
+            self.events.status(published_ns if stamp_ns is None else stamp_ns, max(self.step, 0), message)
+        self._early = []
 
     def finish(self, status: FileStatus) -> None:
         """Send what is still collected."""
+        self._write_early(None)
         if status in (FileStatus.TRUNCATED, FileStatus.DAMAGED):
             self.events.add(self._stamp_ns, max(self.step, 0), f"recording {status.value}", "ERROR")
         for buffer in buffers(self):

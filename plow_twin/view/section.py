@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 _MM: Final = 1000.0
 #: Length of an arrow [mm] per force [N].
-ARROW_MM_PER_N: Final = 1e-3
+ARROW_MM_PER_N: Final = 7e-4
 #: A force below that is not drawn [N].
 FAINT_N: Final = 500.0
 #: The head's body is drawn that much larger than its cavity [mm]; its true outline is not part of a scene.

@@ -1,0 +1,82 @@
+#!/usr/bin/env python3
+"""Draw a recording as rerun shows it, without a screen: tools/screenshot.py RUN [OUT.png] [--at SECONDS].
+
+Needs the package with its `view` extra and a Vulkan driver; Debian's mesa-vulkan-drivers will do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from rerun.experimental import ViewerClient
+
+from plow_twin.view import to_rrd
+
+SIZE = (1400, 900)
+MENU = 37
+
+
+def start_viewer(port: int) -> subprocess.Popen[bytes]:
+    """Start a viewer without a window that only this machine can reach."""
+    rerun = Path(sys.executable).with_name("rerun")
+    subprocess.run([rerun, "analytics", "disable"], check=True, capture_output=True)
+    window = f"{SIZE[0]}x{SIZE[1]}"
+    command = [rerun, "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", window]
+    return subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def connect(port: int, patience_s: float = 60.0) -> ViewerClient:
+    """Connect as soon as the viewer answers."""
+    deadline = time.monotonic() + patience_s
+    while True:
+        try:
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            client.get_state()
+            return client
+        except Exception:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.5)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Draw a recording as rerun shows it, without a screen.")
+    parser.add_argument("run", type=Path)
+    parser.add_argument("out", type=Path, nargs="?", default=Path("docs/images/view.png"))
+    parser.add_argument("--at", type=float, default=3.65, help="seconds after the first stamp (default: %(default)s)")
+    options = parser.parse_args()
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    with tempfile.TemporaryDirectory() as folder:
+        rrd, shot = Path(folder) / "run.rrd", Path(folder) / "shot.png"
+        summary = to_rrd(options.run, rrd)
+        viewer = start_viewer(port)
+        try:
+            client = connect(port)
+            client.open(str(rrd))
+            at_ns = summary.first_ns + round(1e9 * options.at)
+            client.set_time("ros_time", timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
+            time.sleep(8.0)  # lets the plots settle and the greeting go
+            client.save_screenshot(str(shot))
+        finally:
+            os.killpg(viewer.pid, signal.SIGTERM)  # the program is a child of the script that starts it
+            viewer.wait()
+        picture = Image.open(shot).convert("RGB").resize(SIZE, Image.Resampling.LANCZOS)
+        # without the menu; 256 colours are a third of the bytes
+        picture.crop((0, MENU, *SIZE)).quantize(256).save(options.out, optimize=True)
+    print(options.out)
+
+
+if __name__ == "__main__":
+    main()
