@@ -71,9 +71,14 @@ def test_a_managed_node_waits_refuses_nonsense_and_goes_through_all_states(tmp_p
         assert reader.status is FileStatus.COMPLETE
         probe.until(lambda: probe.node.count_publishers("contact_forces") == 0, "released publishers")
 
-        # around once more, on another scene, and out by shutdown
+        # a recording that cannot be made leaves nothing behind
+        assert _set(running, "record_path", str(tmp_path / "first" / "metadata.yaml" / "below")).successful
+        assert not _change(running, Transition.TRANSITION_CONFIGURE)
+        assert probe.node.count_publishers("contact_forces") == 0
+
+        # around once more, on another scene, beside the first recording, and out by shutdown
         assert _set(running, "scene", "bench_kv").successful
-        assert _set(running, "record_path", "").successful
+        assert _set(running, "record_path", str(tmp_path / "first")).successful
         assert _change(running, Transition.TRANSITION_CONFIGURE)
         assert _change(running, Transition.TRANSITION_ACTIVATE)
         probe.until_figure("state", "scene", "bench_kv")
@@ -81,6 +86,7 @@ def test_a_managed_node_waits_refuses_nonsense_and_goes_through_all_states(tmp_p
         assert _state(running) == "finalized"
         assert running.twin.stop() == 0
         assert "Traceback" not in running.twin.output()
+    assert RunReader(tmp_path / "first_2").header.parameters["scene"] == "bench_kv"
 
 
 def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import ReliabilityPolicy
 from ros_processes import ROOT, bench, value
@@ -182,6 +182,16 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
     assert report.first_divergence is None
 
 
+def test_a_stop_while_the_solver_is_compiled_is_clean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "empty cache"))
+    with bench(tmp_path, "unconfigured") as running:
+        running.probe.until(lambda: "preparing the solver" in running.twin.output(), "the start of compiling")
+        running.probe.pause(1.0)
+        assert "solver ready" not in running.twin.output()
+        assert running.twin.stop(signal.SIGTERM) == 0
+        assert "Traceback" not in running.twin.output()
+
+
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
 def test_best_effort_and_reliable_publishers_connect(tmp_path: Path, reliability: ReliabilityPolicy) -> None:
     with bench(tmp_path) as running:
@@ -253,6 +263,39 @@ def test_reset_restores_the_initial_state(tmp_path: Path) -> None:
         position = heads[-1].pose.pose.position
         assert heads[-2].pose.pose.position.x != 0.0
         assert (position.x, position.y, heads[-1].twist.twist.angular.z) == PAPER.initial.q
+
+
+def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -> None:
+    scene = _scene_file(tmp_path, replace(PAPER, wear=WEAR))
+    with bench(tmp_path, scene=scene, excitation_timeout=60.0) as running:
+        probe = running.probe
+        clearances, rates = probe.listen(JointState, "clearance"), probe.listen(JointState, "wear_rate")
+        send = probe.excitation()
+        travel = probe.node.create_publisher(TwistStamped, "travel", 10)
+        pose = probe.node.create_publisher(PoseStamped, "head_pose", 10)
+        probe.until(lambda: travel.get_subscription_count() and pose.get_subscription_count(), "their readers")
+        probe.pause(0.3)
+        for index in range(1000):
+            send(T0 + index * MS, (32e3, 0.0, -45e3))
+        probe.until(lambda: clearances and stamp_ns(clearances[-1].header) == T0 + 900 * MS, "a second of wear")
+        stopped, measured = TwistStamped(), PoseStamped()
+        for message in (stopped, measured):
+            message.header.stamp.sec = T0 // 1_000_000_000
+        measured.pose.position.x = 1.0
+        measured.pose.orientation.w = 1.0
+        travel.publish(stopped)
+        pose.publish(measured)
+        probe.until_figure("input", "travel_used", "1")
+        for index in range(1000, 1301):
+            send(T0 + index * MS, (32e3, 0.0, -45e3))
+        probe.until(lambda: stamp_ns(clearances[-1].header) == T0 + 1300 * MS, "the time after it")
+        figures = probe.figures("input")
+    assert max(rates[-4].velocity) > 0.0
+    assert max(rates[-1].velocity) == 0.0
+    assert clearances[-1].position == clearances[-2].position
+    assert figures["head_pose_used"] == "1"
+    x, y, theta = (float(number) for number in figures["head_pose_residual"].split())
+    assert -1.05 < x < -0.95 and abs(y) < 0.05 and abs(theta) < 0.3
 
 
 def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:

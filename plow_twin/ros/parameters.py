@@ -81,7 +81,11 @@ class Settings:
     )
     frame_id: str = _plain("slide_frame", Effect.CONFIGURE, "frame of all outputs: centre of the slide, x right, y up")
     child_frame_id: str = _plain("head_frame", Effect.CONFIGURE, "frame of the head in head_state")
-    record_path: str = _plain("", Effect.CONFIGURE, "folder to make for the recording of the run; empty: none")
+    record_path: str = _plain(
+        "",
+        Effect.CONFIGURE,
+        "folder to make for the recording of each configured run, with _2, _3, ... when it exists; empty: none",
+    )
     excitation_timeout: float = _number(
         0.5,
         "s",

@@ -30,8 +30,6 @@ class FramePublishers:
     def __init__(self, node: Node, frame_id: str, child_frame_id: str) -> None:
         self._node = node
         self._publishers = {topic: node.create_publisher(kind, topic, OUTPUT) for topic, kind in TOPICS.items()}
-        #: resolved names by base names
-        self.topics = {topic: str(publisher.topic_name) for topic, publisher in self._publishers.items()}
         self._forces = JointStateWriter(frame_id, PAIR_NAMES)
         self._peaks = JointStateWriter(frame_id, PAIR_NAMES)
         self._head = OdometryWriter(frame_id, child_frame_id)

@@ -63,7 +63,11 @@ class Recording:
             parameters=asdict(settings),
         )
         self._recorder = Recorder(
-            Path(settings.record_path), header, queue_size=_QUEUE_SIZE, now_ns=clock or time.time_ns, on_error=on_error
+            _free(Path(settings.record_path)),
+            header,
+            queue_size=_QUEUE_SIZE,
+            now_ns=clock or time.time_ns,
+            on_error=on_error,
         )
 
     @property
@@ -104,3 +108,12 @@ class Recording:
     def close(self) -> LossReport:
         """Write what is queued and close the file."""
         return self._recorder.close()
+
+
+def _free(folder: Path) -> Path:
+    """Return the folder, or the first of `<folder>_2`, `<folder>_3`, ... when it holds something already."""
+    path, number = folder, 1
+    while path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        number += 1
+        path = folder.with_name(f"{folder.name}_{number}")
+    return path

@@ -18,7 +18,7 @@ from plow_twin.presets import scene_path
 from plow_twin.ros.inputs import Inputs
 from plow_twin.ros.messages import Wrench
 from plow_twin.ros.parameters import Settings
-from plow_twin.ros.publishers import FramePublishers
+from plow_twin.ros.publishers import TOPICS, FramePublishers
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.driver import Driver, Policy
 from plow_twin.stream.health import DurationHistogram
@@ -60,6 +60,7 @@ class Runtime:
         self.sim_time: bool = node.get_parameter("use_sim_time").value
         self.scene: Scene = load_scene(scene_path(settings.scene))
         sampled = settings.excitation_source != "scene"
+        node.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
         twin = Twin(self.scene, tol=settings.tolerance, excitation="sampled" if sampled else "scene")
         #: seconds that compiling or loading the solver took
         self.compile_s = twin.warm_up()
@@ -69,8 +70,9 @@ class Runtime:
         self.withheld = 0
         self._received_ns = 0
         self._q: NDArray[np.float64] | None = None
-        self._publishers = FramePublishers(node, settings.frame_id, settings.child_frame_id)
+        # the last thing that can fail: after it the node's topics are made
         self.recording = self._record()
+        self._publishers = FramePublishers(node, settings.frame_id, settings.child_frame_id)
         session = Session(twin, on_entry=self.recording.journal if self.recording else _ignore)
         self.driver = Driver(session, self._intake(), policy(settings))
         self.inputs = Inputs(
@@ -161,7 +163,7 @@ class Runtime:
         from plow_twin.ros.recording import Recording
 
         clock = self._ros_time_ns if self.sim_time else None
-        topics = {**self._publishers.topics, "status": self._node.resolve_topic_name("status")}
+        topics = {topic: self._node.resolve_topic_name(topic) for topic in (*TOPICS, "status")}
         name = self._node.get_fully_qualified_name()
         return Recording(self._settings, self.scene, name, topics, clock, self._node.get_logger().error)
 
