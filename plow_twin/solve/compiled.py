@@ -49,7 +49,8 @@ class Compiled:
         """Return the scene's initial state."""
         state = new_record(STATE)
         state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
-        state.factor[:] = self.scene.contact.damping or 0.0
+        if self.parts.law.factor is not None:
+            state.factor[:] = self.scene.contact.damping or 0.0
         if self.scene.wear is not None:
             state.depth[:] = self.scene.wear.initial_depth_m
         state.clock[0] = time

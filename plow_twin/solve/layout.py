@@ -142,6 +142,7 @@ WORK: Final = np.dtype(
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
         ("lanes", "f8", (7, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
+        ("size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)

@@ -194,11 +194,13 @@ def expand(p, state, w, penetrating, hard, harmonics, second, segments, viscous,
             for lane in range(8):
                 gap[0, lane] += A[4, lane] - state.depth[lane]
         else:
+            size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
             if wear is not None and penetrating:
                 for lane in range(8):
                     gap[k, lane] -= worn[k, lane]
+                    size += p.weight / p.radius * abs(worn[k, lane])
+            w.size[k] = size
             reach *= hard
-            size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
             quiet = quiet + 1 if size * reach < small else 0
             if quiet == p.lacuna and k >= 4:
                 order = k

@@ -201,13 +201,6 @@ def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fracti
     return best, event, target
 
 
-@kernel(inline=True)
-def _term_size(p, series, k):  # type: ignore[no-untyped-def]
-    """Return the size of order k as a velocity."""
-    size = abs(series[k, VX]) + abs(series[k, VY]) + p.radius * abs(series[k, OMEGA])
-    return size + p.weight * (abs(series[k, COS]) + abs(series[k, SIN]))
-
-
 @kernel()
 def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
     """Return the sigma over which the series meets the step's share of the tolerance, at most `hard`; NaN if not finite.
@@ -217,7 +210,7 @@ def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
     """
     length = hard
     for k in range(order, order - max(p.lacuna, 2), -1):
-        size = _term_size(p, w.series, k)
+        size = w.size[k]
         if not (size <= 1e300):
             return math.nan
         if size > 0.0:

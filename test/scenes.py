@@ -1,0 +1,51 @@
+"""Scenes that several tests use, built from dataclasses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene
+from plow_twin.scene_file import load_scene
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = Path(__file__).resolve().parent / "data"
+
+
+def preset(name: str) -> Scene:
+    return load_scene(ROOT / "config" / f"{name}.yaml")
+
+
+def reference(name: str) -> dict[str, np.ndarray]:
+    with np.load(DATA / f"{name}.npz") as archive:
+        return {key: archive[key] for key in archive.files}
+
+
+def pose_error(scene: Scene, q: np.ndarray, reference_q: np.ndarray) -> float:
+    """Return the largest error relative to the clearance; angles by the half diagonal."""
+    gx, gy = scene.clearance.horizontal_m, scene.clearance.vertical_m
+    radius = 0.5 * np.hypot(scene.frame.width_m, scene.frame.height_m)
+    return float((np.abs(q - reference_q) / np.array([gx, gy, gx / radius])).max())
+
+
+def wall_and_point(
+    contact: Contact,
+    *,
+    speed: float,
+    mass: float = 2.0,
+    gravity: float = 0.0,
+    gap: float = 0.01,
+    pairs: tuple[str, ...] = ("top_left_top",),
+) -> Scene:
+    """A mass that can only move up and down, `gap / 2` above the corner it falls on."""
+    return Scene(
+        head=Head(mass, 1.0),
+        frame=Frame(0.2, 0.2),
+        clearance=Clearance(gap, gap),
+        contact=contact,
+        gravity=Gravity(gravity),
+        initial=Initial((0.0, 0.0, 0.0), (0.0, -speed, 0.0)),
+        locked=("x", "theta"),
+        pairs=pairs,
+    )

@@ -1,0 +1,70 @@
+"""Contact laws: the closed forms, the exact restitution, the series against the value."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from plow_twin import Clearance, Contact, Frame, Head, Scene, SceneError
+from plow_twin.model.contact import normal_force, power_term
+from plow_twin.model.contact_laws import DAMPING_FACTOR_CAP, LAWS, exact_damping_factor
+
+
+@pytest.mark.parametrize(("e", "d"), [(0.1, 9.998159), (0.3, 3.087082), (0.5, 1.432751), (0.7, 0.634828), (0.9, 0.166482)])
+def test_exact_damping_factor_is_the_published_one(e: float, d: float) -> None:
+    assert exact_damping_factor(e) == pytest.approx(d, abs=5e-7)
+
+
+@given(st.floats(0.02, 0.999))
+def test_exact_damping_factor_satisfies_its_identity(e: float) -> None:
+    d = exact_damping_factor(e)
+    assert 0.0 < d <= 1.0 / e
+    if 1.0 - d * e > 1e-9:
+        assert d * (1.0 + e) == pytest.approx(math.log((1.0 + d) / (1.0 - d * e)), rel=1e-6)
+
+
+def test_limits_of_restitution_stay_finite() -> None:
+    for name, law in LAWS.items():
+        if law.takes_restitution:
+            assert law.damping_factor(1.0) == 0.0, name
+            assert 0.0 < law.damping_factor(0.0) <= DAMPING_FACTOR_CAP, name
+
+
+@given(st.floats(-0.01, 0.02), st.floats(-5.0, 5.0), st.floats(0.0, 20.0), st.sampled_from([1.0, 1.5, 2.0, 2.2]))
+def test_contact_never_pulls_and_acts_only_inside(d: float, rate: float, factor: float, n: float) -> None:
+    force = normal_force(d, rate, 1e7, n, factor, 0.0)
+    assert force >= 0.0
+    assert d > 0.0 or force == 0.0
+    if d > 0.0 and 1.0 + factor * rate > 0.0:
+        assert force == pytest.approx(1e7 * d**n * (1.0 + factor * rate))
+
+
+@pytest.mark.parametrize(("shift", "n"), [(0, 1.5), (0, 2.2), (2, 1.5)])
+def test_power_series_equals_the_power(shift: int, n: float) -> None:
+    order, t = 24, 0.11
+    base, power = np.zeros((order + 1, 8)), np.zeros((order + 1, 8))
+    base[shift : shift + 4, 3] = [0.7, -0.4, 0.3, 0.2]
+    for k in range(order + 1):
+        power[k, 3] = power_term(base, power, 3, k, n, shift)
+    value = np.polynomial.polynomial.polyval(t, base[:, 3]) ** n
+    assert np.polynomial.polynomial.polyval(t, power[:, 3]) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("contact", "words"),
+    [
+        ({"law": "kelvin_voigt", "stiffness": 1e7, "restitution": 0.5}, "contact.restitution"),
+        ({"law": "hertz", "stiffness": 1e7, "damping": 1.0}, "no damping at all for hertz"),
+        ({"law": "hunt_crossley", "stiffness": 1e7}, "damping or restitution for hunt_crossley"),
+        ({"law": "hunt_crossley", "stiffness": 1e7, "damping": 1.0, "restitution": 0.5}, "not both"),
+        ({"law": "kelvin_voigt", "stiffness": 1e7, "exponent": 1.5, "damping": 1.0}, "contact.exponent: got 1.5"),
+        ({"law": "spring", "stiffness": math.nan}, "contact.stiffness: got nan"),
+    ],
+)
+def test_a_law_that_cannot_be_is_refused_by_name(contact: dict[str, object], words: str) -> None:
+    with pytest.raises(SceneError, match=words):
+        Scene(Head(1.0, 1.0), Frame(0.1, 0.1), Clearance(0.01, 0.01), Contact(**contact))  # type: ignore[arg-type]

@@ -1,0 +1,134 @@
+"""Answers known from outside: restitution, Hertz, the bouncing ball, statics, momentum. Sources at each test."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scenes import preset, wall_and_point
+
+from plow_twin import Clearance, Constant, Contact, Frame, Gravity, Head, Scene, SolverError, simulate
+from plow_twin.model.contact_laws import exact_damping_factor
+
+# delivered restitution at restitution asked for .1 .. .9, .95; published tables of the laws
+ASKED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+DELIVERED = {
+    "lankarani_nikravesh": (0.6653, 0.6723, 0.6842, 0.7016, 0.7252, 0.7561, 0.7960, 0.8471, 0.9132, 0.9535),
+    "flores": (0.0694, 0.1555, 0.2562, 0.3629, 0.4704, 0.5773, 0.6832, 0.7885, 0.8939, 0.9468),
+    "hunt_crossley": (0.5158, 0.5469, 0.5813, 0.6197, 0.6630, 0.7120, 0.7680, 0.8329, 0.9090, 0.9524),
+}
+
+
+def delivered(contact: Contact, speed: float = 1.0, mass: float = 2.0) -> float:
+    result = simulate(wall_and_point(contact, speed=speed, mass=mass), 0.1 / speed, tol=1e-11)
+    assert result.statistics["top_left_top"]["makes"] == 1
+    return float(result.v[-1, 1]) / speed
+
+
+@pytest.mark.parametrize("n", [1.0, 1.5, 2.2, 3.0])
+@pytest.mark.parametrize("e", [0.1, 0.5, 0.9])
+def test_exact_restitution_is_returned_whatever_the_law_s_numbers(n: float, e: float) -> None:
+    for stiffness, mass, speed in ((1e7, 2.0, 1.0), (1e9, 300.0, 0.2)):
+        contact = Contact("exact_restitution", stiffness * 1e3 ** (n - 1.0), n, restitution=e)
+        assert delivered(contact, speed, mass) == pytest.approx(e, abs=1e-8)
+
+
+@pytest.mark.parametrize("law", DELIVERED)
+def test_the_other_laws_deliver_what_is_known_of_them(law: str) -> None:
+    for asked, known in zip(ASKED, DELIVERED[law], strict=True):
+        assert delivered(Contact(law, 1e9, 1.5, restitution=asked)) == pytest.approx(known, abs=6e-5)
+
+
+@pytest.mark.parametrize(("z", "e"), [(0.01, 0.9693), (0.05, 0.8588), (0.1, 0.7441), (0.2, 0.5717), (0.3, 0.4510), (0.5, 0.2984)])
+def test_kelvin_voigt_without_pull(z: float, e: float) -> None:
+    stiffness, mass = 1e6, 2.0
+    assert delivered(Contact("kelvin_voigt", stiffness, damping=2.0 * z * math.sqrt(stiffness * mass))) == pytest.approx(e, abs=6e-5)
+
+
+def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
+    """Chung and Ooi, Granular Matter 13 (2011) 643, test 2: 49.7172 um, 11.36986 kN, 731.66 us."""
+    radius, modulus, poisson, density = 0.1, 7e10, 0.30, 2699.0
+    stiffness = 4.0 / 3.0 * modulus / (1.0 - poisson**2) * math.sqrt(radius)
+    mass = 4.0 / 3.0 * math.pi * radius**3 * density
+    result = simulate(wall_and_point(Contact("hertz", stiffness, 1.5), speed=0.2, mass=mass), 0.1, tol=1e-11)
+    force = result.statistics["top_left_top"]["max"]
+    assert force == pytest.approx(11369.86, abs=0.006)
+    assert (force / stiffness) ** (2.0 / 3.0) == pytest.approx(49.7172e-6, abs=6e-11)
+    assert np.diff(result.events["time"])[0] == pytest.approx(731.66e-6, abs=6e-9)
+
+
+@pytest.mark.parametrize(("n", "duration"), [(1.0, math.pi), (1.5, 2.94327518)])
+def test_depth_and_time_of_an_impact(n: float, duration: float) -> None:
+    """d_max^(n+1) = (n+1) m v0^2 / K (D - ln(1+D)) / D^2;  T = c_n d_max / v0 without damping."""
+    stiffness, mass, speed = 1e8, 2.0, 0.7
+    undamped = simulate(wall_and_point(Contact("hertz", stiffness, n), speed=speed, mass=mass), 0.1, tol=1e-11)
+    depth = ((n + 1.0) * mass * speed**2 / (2.0 * stiffness)) ** (1.0 / (n + 1.0))
+    assert np.diff(undamped.events["time"])[0] == pytest.approx(duration * depth / speed, rel=1e-8)
+    d = exact_damping_factor(0.4)
+    expected = ((n + 1.0) * mass * speed**2 / stiffness * (d - math.log1p(d)) / d**2) ** (1.0 / (n + 1.0))
+    scene = wall_and_point(Contact("exact_restitution", stiffness, n, restitution=0.4), speed=speed, mass=mass)
+    damped = simulate(scene, 0.009, output_dt=1e-7, tol=1e-11)
+    assert damped.penetration[:, 0].max() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("e", [0.3, 0.5, 0.8])
+def test_bouncing_ball_comes_to_rest(e: float) -> None:
+    """Rigid limit sqrt(2 h / g) (1 + e) / (1 - e); the error falls as the contact gets stiffer."""
+    h, g = 0.01, 9.81
+    errors = []
+    for stiffness in (1e9, 1e11):
+        contact = Contact("exact_restitution", stiffness, 1.5, restitution=e)
+        pairs = ("top_left_top", "top_right_top")
+        result = simulate(wall_and_point(contact, speed=0.0, mass=1.0, gravity=g, gap=2 * h, pairs=pairs), 3.0, tol=1e-8)
+        limit = math.sqrt(2.0 * h / g) * (1.0 + e) / (1.0 - e)
+        errors.append(abs(result.events["time"][-1] / limit - 1.0))
+        # at rest: each of the two corners carries half the weight
+        assert result.force[-1, [0, 2]] == pytest.approx([g / 2, g / 2], rel=1e-6)
+        assert abs(result.v[-1]).max() < 1e-6
+    assert errors[1] < errors[0] < 0.05 and errors[1] < 0.015
+
+
+@pytest.mark.parametrize(("n", "law"), [(1.0, "exact_restitution"), (1.5, "exact_restitution"), (1.0, "kelvin_voigt")])
+def test_a_constant_load_settles_on_statics(n: float, law: str) -> None:
+    stiffness, mass, g, fx, moment = 1e8, 2430.0, 9.81, 3e3, 800.0
+    damping = {"damping": 2e5} if law == "kelvin_voigt" else {"restitution": 0.2, "impact_speed_floor_m_s": 0.05}
+    scene = Scene(
+        Head(mass, 1265.0), Frame(0.33, 0.27), Clearance(0.01, 0.012), Contact(law, stiffness, n, **damping),
+        Gravity(g), (Constant("push", (fx, 0.0), moment),),
+    )  # fmt: skip
+    end = simulate(scene, 30.0, output_dt=30.0, tol=1e-10)
+    force, depth = end.force[-1], end.penetration[-1]
+    # the head leans with its roof on the two upper corners and, pushed right, with its left wall on one or two left ones
+    c, s = math.cos(end.q[-1, 2]), math.sin(end.q[-1, 2])
+    normal = np.array([[0, 1], [-1, 0], [0, 1], [1, 0], [0, -1], [1, 0], [0, -1], [-1, 0]]) @ np.array([[c, s], [-s, c]])
+    corner = 0.5 * np.array([[-0.33, 0.27]] * 2 + [[0.33, 0.27]] * 2 + [[0.33, -0.27]] * 2 + [[-0.33, -0.27]] * 2)
+    arm = corner - end.q[-1, :2]
+    assert force @ normal == pytest.approx([-fx, mass * g], abs=1e-2)
+    assert force @ (arm[:, 0] * normal[:, 1] - arm[:, 1] * normal[:, 0]) == pytest.approx(-moment, abs=1e-2)
+    touching = force > 0.0
+    assert depth[touching] == pytest.approx((force[touching] / stiffness) ** (1.0 / n), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["paper", "bench_kv", "bench_hc"])
+def test_impulses_add_up_to_the_change_of_momentum(name: str) -> None:
+    """Vertical: contact forces, turned to world axes, plus excitation and weight, integrated over time."""
+    scene = preset(name)
+    result = simulate(scene, 3.0, output_dt=1e-5, tol=1e-10)
+    theta = result.q[:, 2]
+    normal_y = np.array([1.0, 0, 1, 0, -1, 0, -1, 0])
+    normal_x = np.array([0.0, -1, 0, 1, 0, 1, 0, -1])
+    contact_y = (result.force * (np.outer(np.sin(theta), normal_x) + np.outer(np.cos(theta), normal_y))).sum(axis=1)
+    amplitude = sum(load.force_n[1] for load in scene.loads)  # type: ignore[union-attr]
+    excitation = amplitude * (1.0 - math.cos(2.0 * 3.0)) / 2.0
+    change = scene.head.mass_kg * (result.v[-1, 1] - result.v[0, 1])
+    total = np.trapezoid(contact_y, result.t) + excitation - scene.head.mass_kg * 9.81 * 3.0
+    assert total == pytest.approx(change, abs=2.0)
+
+
+def test_leaving_the_model_s_range_is_a_named_error() -> None:
+    scene = Scene(
+        Head(10.0, 1.0), Frame(0.3, 0.3), Clearance(0.02, 0.02), Contact("hertz", 1e3), Gravity(0.0), (Constant("f", (5e4, 0.0)),)
+    )
+    with pytest.raises(SolverError, match=r"at t = 0\.0\d+ s: the head left the model's range"):
+        simulate(scene, 1.0)

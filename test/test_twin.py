@@ -1,0 +1,131 @@
+"""The twin: same bits however it is asked, saved and restored; bad input changes nothing; what a scene lacks is not compiled."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import pose_error, preset, reference, wall_and_point
+
+from plow_twin import Status, Twin, Wear, simulate
+from plow_twin.model.loads import compile_loads
+from plow_twin.solve import step
+
+TIMES = np.arange(1, 3001) * 1e-3
+
+
+def samples() -> np.ndarray:
+    return compile_loads(preset("paper").loads).at(TIMES)
+
+
+def test_sampled_at_1_khz_follows_the_analytic_motion() -> None:
+    """Linear interpolation of the sine at 1 kHz is off by (omega dt)^2 / 8 = 5e-7 of the load."""
+    twin = Twin(preset("paper"), excitation="sampled")
+    series = twin.advance_samples(TIMES, samples())
+    assert (series.status == Status.OK).all()
+    assert pose_error(twin.scene, series.q[9::10], reference("paper_r1")["q"][1:301]) < 1e-5
+    exact = simulate(preset("paper"), 3.0)
+    for pair, row in enumerate(exact.statistics.values()):
+        assert series.peak[:, pair].max() == pytest.approx(row["max"], rel=1e-4)
+        assert series.impulse[:, pair].sum() == pytest.approx(row["impulse"], rel=1e-4, abs=1e-9)
+        assert series.makes[:, pair].sum() == row["makes"]
+
+
+@settings(max_examples=10)
+@given(st.lists(st.integers(1, 2999), max_size=6, unique=True))
+def test_samples_in_any_batches_give_the_same_bits(cuts: list[int]) -> None:
+    whole = Twin(preset("paper"), excitation="sampled")
+    expected = whole.advance_samples(TIMES, samples())
+    parts = Twin(preset("paper"), excitation="sampled")
+    edges = [0, *sorted(cuts), len(TIMES)]
+    rows = [parts.advance_samples(TIMES[a:b], samples()[a:b]) for a, b in zip(edges, edges[1:], strict=False)]
+    for name in ("q", "force", "peak", "impulse", "makes"):
+        assert np.array_equal(np.concatenate([getattr(row, name) for row in rows]), getattr(expected, name))
+    assert parts.digest() == whole.digest()
+    single = Twin(preset("paper"), excitation="sampled")
+    one_by_one = [single.advance(t, w) for t, w in zip(TIMES[:50], samples()[:50], strict=True)]
+    assert np.array_equal([row.peak for row in one_by_one], expected.peak[:50])
+
+
+@settings(max_examples=10)
+@given(st.lists(st.floats(0.0, 2.0), max_size=20))
+def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> None:
+    asked, direct = Twin(preset("paper")), Twin(preset("paper"))
+    rows = [asked.advance(t) for t in sorted(times)]
+    last, expected = asked.advance(2.0), direct.advance(2.0)
+    assert np.array_equal(last.q, expected.q) and np.array_equal(last.force, expected.force)
+    assert asked.digest() == direct.digest()
+    impulse = sum((row.impulse for row in rows), last.impulse)
+    assert impulse == pytest.approx(expected.impulse, rel=1e-10, abs=1e-9)
+    assert np.max([row.peak for row in [*rows, last]], axis=0) == pytest.approx(expected.peak, rel=1e-10)
+
+
+@pytest.mark.parametrize("excitation", ["scene", "sampled"])
+def test_a_restored_twin_goes_on_with_the_same_bits(excitation: str) -> None:
+    scene = dataclasses.replace(preset("bench_hc"), wear=Wear(1e-12, 0.015, 2.0))
+    first, second = (Twin(scene, excitation=excitation) for _ in range(2))  # type: ignore[arg-type]
+
+    def go(twin: Twin, t: float) -> np.ndarray:
+        return twin.advance(t, None if excitation == "scene" else np.array([4e4, 1.1e4, 3e4]) * np.sin(2 * t)).q
+
+    for t in (0.31, 0.77, 1.03):
+        go(first, t)
+    first.set_travel_speed(1.5)
+    go(first, 1.21)
+    second.restore(first.snapshot())
+    assert second.digest() == first.digest() and second.time == first.time
+    assert np.array_equal(go(first, 2.5), go(second, 2.5))
+    assert second.digest() == first.digest()
+    second.reset(3.0)
+    assert second.time == 3.0 and second.digest() != first.digest()
+
+
+@pytest.mark.parametrize(
+    ("t", "wrench", "words"),
+    [
+        (0.1, (0.0, 0.0, 0.0), "expected a time not before"),
+        (np.nan, (0.0, 0.0, 0.0), "expected finite times"),
+        (np.inf, (0.0, 0.0, 0.0), "expected finite times"),
+        (1.0, (0.0, np.nan, 0.0), "wrench: got"),
+        (1.0, (0.0, 0.0), "wrench: got"),
+    ],
+)
+def test_bad_input_is_named_and_changes_nothing(t: float, wrench: tuple[float, ...], words: str) -> None:
+    twin = Twin(preset("paper"), excitation="sampled")
+    twin.advance(0.5, (1e3, 2e3, 3e3))
+    before = twin.digest()
+    with pytest.raises(ValueError, match=words):
+        twin.advance(t, wrench)
+    assert twin.digest() == before
+
+
+def test_failures_keep_the_last_good_state_and_go_on() -> None:
+    twin = Twin(preset("paper"), excitation="sampled")
+    good = twin.advance(0.5, (0.0, 0.0, 0.0))
+    bad = twin.advance(0.6, (1e12, 0.0, 0.0))
+    assert bad.status in (Status.OUT_OF_RANGE, Status.NON_FINITE)
+    assert "." not in bad.status.text[:1] and len(bad.status.text) > 10
+    assert all(np.isfinite(value).all() for value in (bad.q, bad.v, bad.force, bad.peak, bad.impulse))
+    assert twin.time == 0.6
+    twin.reset(0.7)
+    assert twin.advance(0.8, (0.0, 0.0, 0.0)).status is Status.OK
+    assert good.status is Status.OK
+
+
+def test_a_scene_compiles_only_what_it_needs() -> None:
+    """Parts that a scene lacks are None in the compiled signature of the step."""
+    twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
+    twin.advance(0.01)
+    bare = ("none",) * 3 + ("float64",) + ("none",) * 5
+    compiled = [tuple(str(kind) for kind in signature[4:]) for signature in step.begin.signatures]  # type: ignore[attr-defined]
+    assert any(kinds[:9] == bare and kinds[9].startswith("array(float64, 1d") for kinds in compiled)
+
+
+def test_in_free_flight_nothing_of_the_contact_runs() -> None:
+    scene = wall_and_point(preset("bench_kv").contact, speed=0.0, gap=2.0)
+    twin = Twin(scene)
+    twin.advance(3600.0)
+    assert twin.steps <= 80 and twin._work.force.any() == False  # noqa: E712
