@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections import Counter
 from pathlib import Path
@@ -70,12 +71,15 @@ def joint_state(index: int) -> JointState:
 
 
 def kill_and_check(folder: Path, seconds: float) -> None:
+    lines: list[str] = []
     with start_writer(folder) as process:
         assert process.stdout is not None
-        line = process.stdout.readline()  # it writes
-        time.sleep(seconds)
-        process.send_signal(signal.SIGKILL)
-        last_index, last_ns = map(int, [line, *process.stdout.read().splitlines()][-1].split())
+        lines.append(process.stdout.readline())  # it writes
+        killer = threading.Timer(seconds, process.send_signal, [signal.SIGKILL])
+        killer.start()
+        lines += process.stdout  # all along, so that the pipe never fills up
+        killer.join()
+    last_index, last_ns = map(int, [line for line in lines if line.endswith("\n")][-1].split())
     reader = RunReader(folder)
     records = list(reader)
     assert reader.status is FileStatus.TRUNCATED
