@@ -12,7 +12,7 @@ _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
 
 
-@kernel()
+@kernel(inline=True)
 def _lay_out(p, parts, state, w, hard_time) -> bool:  # type: ignore[no-untyped-def]
     law = parts.law
     return begin(
@@ -21,7 +21,7 @@ def _lay_out(p, parts, state, w, hard_time) -> bool:  # type: ignore[no-untyped-
     )  # fmt: skip
 
 
-@kernel()
+@kernel(inline=True)
 def _next(p, parts, state, w, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
     """Lay out the next step unless one is under way."""
     if state.clock[LENGTH] >= 0.0:

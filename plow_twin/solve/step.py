@@ -245,13 +245,14 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step, mode = state.clock, state.step, state.mode
     t0 = clock[T0]
-    penetrating = False
+    inside = 0
     for pair in range(8):
-        penetrating = penetrating or mode[pair] != OFF
+        inside += 0 if mode[pair] == OFF else 1
         w.lanes[ACTS, pair] = p.stiffness if mode[pair] == ON else 0.0
         w.lanes[DAMPS, pair] = 0.0
         if mode[pair] == ON:
             w.lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
+    penetrating = inside > 0
     for j in range(3):
         w.wrench[0, j] = p.constant[j]
     if segments is not None:
