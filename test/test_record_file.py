@@ -7,6 +7,7 @@ import random
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from rosbags.highlevel import AnyReader
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode
+from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, to_message
 from plow_twin.record.messages import JointState, Odometry, WrenchStamped
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
@@ -189,6 +191,14 @@ def test_what_is_no_recording_is_named(content: bytes | None, expected: str, tmp
     with pytest.raises(RecordingError, match=expected) as error:
         RunReader(file)
     assert str(file) in str(error.value)
+
+
+def test_the_documentation_lists_every_key_of_header_and_journal() -> None:
+    text = (Path(__file__).resolve().parent.parent / "docs" / "recording.md").read_text()
+    keys = {"layout_version", *(spec.name for spec in fields(RunHeader))}
+    for kind in (Hold, Travel, Reset, Parameter, Snapshot, Digest, Loss, Dropped):
+        keys |= {kind.__name__.lower(), *(spec.name for spec in fields(kind))}
+    assert {key for key in keys if f"`{key}`" not in text} == set()
 
 
 def test_a_sample_that_is_not_finite_is_refused(tmp_path: Path) -> None:

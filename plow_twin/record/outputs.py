@@ -39,9 +39,7 @@ def contact_forces(frame: Frame, frame_id: str) -> JointState:
 
 def contact_peaks(frame: Frame, frame_id: str) -> JointState:
     """Return all touches so far as position, impulse [N s] as velocity and peak force [N] as effort since the last."""
-    return JointState(
-        frame.stamp_ns, frame_id, PAIR_NAMES, frame.touches.astype(np.float64), frame.impulse, frame.peak
-    )
+    return JointState(frame.stamp_ns, frame_id, PAIR_NAMES, frame.touches.astype(np.float64), frame.impulse, frame.peak)
 
 
 def head_state(frame: Frame, frame_id: str, child_frame_id: str) -> Odometry:
