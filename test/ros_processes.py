@@ -64,8 +64,13 @@ class Process:
         return self._process.wait(5.0)
 
     def close(self) -> None:
+        """End the process; a killed one would leave its shared memory behind."""
         if self.running:
-            self._process.kill()
+            self._process.terminate()
+            try:
+                self._process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
         self._process.wait()
 
 

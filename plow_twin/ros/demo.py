@@ -240,10 +240,10 @@ def _progress(console: Console, quiet: bool) -> Iterator[Progress]:
 def _view(folder: Path) -> Path | None:
     """Make the .rrd where rerun is installed."""
     try:
-        import rerun  # noqa: F401
-
         from plow_twin.view import to_rrd
-    except ModuleNotFoundError:
+    except ModuleNotFoundError as error:
+        if error.name != "rerun":
+            raise
         return None
     path = folder / "run.rrd"
     to_rrd(folder / "run", path)
