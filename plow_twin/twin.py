@@ -202,7 +202,6 @@ class Twin:
 
     def reset(self, t: float) -> None:
         """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
-        self._check_times(np.array([self.time if not np.isfinite(t) else max(t, self.time)]))
         if not np.isfinite(t):
             raise ValueError(f"t: got {t!r}, expected a finite time in s")
         self._state = self._compiled.initial_state(t)

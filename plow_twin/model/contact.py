@@ -48,3 +48,32 @@ def power_term(
     for j in range(1, k + 1):
         total += (exponent * j - (k - j)) * base[j + shift, lane] * power[k - j + offset, lane]
     return total / (k * base[shift, lane])
+
+
+@kernel(fast=True)
+def power_terms(
+    base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float, inverse: NDArray[np.float64]
+) -> None:
+    """Write coefficient k >= 1 of the eight columns of base^exponent side by side: `power_term` without a shift.
+
+    `inverse` (8,) is 1 / base[0], or zero for a column that is not wanted.
+    """
+    t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
+    for j in range(1, k + 1):
+        i = k - j
+        scale = exponent * j - i
+        t0 += scale * base[j, 0] * power[i, 0]
+        t1 += scale * base[j, 1] * power[i, 1]
+        t2 += scale * base[j, 2] * power[i, 2]
+        t3 += scale * base[j, 3] * power[i, 3]
+        t4 += scale * base[j, 4] * power[i, 4]
+        t5 += scale * base[j, 5] * power[i, 5]
+        t6 += scale * base[j, 6] * power[i, 6]
+        t7 += scale * base[j, 7] * power[i, 7]
+    scale = 1.0 / max(k, 1)
+    power[k, 0], power[k, 1], power[k, 2], power[k, 3] = (
+        t0 * scale * inverse[0], t1 * scale * inverse[1], t2 * scale * inverse[2], t3 * scale * inverse[3],
+    )  # fmt: skip
+    power[k, 4], power[k, 5], power[k, 6], power[k, 7] = (
+        t4 * scale * inverse[4], t5 * scale * inverse[5], t6 * scale * inverse[6], t7 * scale * inverse[7],
+    )  # fmt: skip

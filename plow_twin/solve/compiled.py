@@ -30,8 +30,8 @@ from plow_twin.solve.step import settle_modes
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
-#: Share of the tolerance that one step may spend.
-STEP_SHARE = 0.05
+#: Share of the tolerance that one step may spend: hundreds of steps and impacts that amplify must stay within it.
+STEP_SHARE = 1e-3
 #: Mode changes at one instant before the solver goes on past it.
 MAX_EVENTS_AT_ONCE = 64
 
@@ -126,8 +126,8 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
 
 
 def order_for(tol: float) -> int:
-    """Return the order of the series for a tolerance: about half the digits over log10(e), a few more for long steps."""
-    return int(min(MAX_ORDER, max(8, round(6.0 - 1.15 * math.log10(tol)))))
+    """Return the order of the series for a tolerance: what measured fastest on the bench scenes (docs/solver.md)."""
+    return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(STEP_SHARE * tol)))))
 
 
 def _lacuna(law: Law) -> int:

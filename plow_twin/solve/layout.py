@@ -25,7 +25,7 @@ MAX_ORDER: Final = 30
 MAX_HALVINGS: Final = 48
 
 # indices into Work.lanes
-ACTS, DAMPS, SIGN, RATIO, SUM, FIRST, SECOND = range(7)
+ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND = range(8)
 
 # contact modes; the first three are public
 OFF: Final = 0
@@ -140,7 +140,7 @@ WORK: Final = np.dtype(
         ("column", "f8", (2, _ROWS)),  # one polynomial
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
-        ("lanes", "f8", (7, PAIR_COUNT)),  # masks and sums of the eight pairs
+        ("lanes", "f8", (8, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
         ("size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),

@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import math
 
-from plow_twin.model.contact import power_term
+from plow_twin.model.contact import power_term, power_terms
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import (
     ACTS,
     ALPHA,
+    BASE,
     BETA,
     COS,
     DAMPS,
@@ -83,6 +84,27 @@ def _multiply(a, b, k, out) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
+def _multiply_older(a, b, k, out) -> None:  # type: ignore[no-untyped-def]
+    """Write order k of the eight products without the two terms of order k itself to row k of `out`.
+
+    These sums do not wait for the newest order, so that the processor can run them ahead.
+    """
+    t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
+    for j in range(1, k):
+        i = k - j
+        t0 += a[j, 0] * b[i, 0]
+        t1 += a[j, 1] * b[i, 1]
+        t2 += a[j, 2] * b[i, 2]
+        t3 += a[j, 3] * b[i, 3]
+        t4 += a[j, 4] * b[i, 4]
+        t5 += a[j, 5] * b[i, 5]
+        t6 += a[j, 6] * b[i, 6]
+        t7 += a[j, 7] * b[i, 7]
+    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
+    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
+
+
+@kernel(fast=True)
 def _combine(rows, c, s, x, y, k, out) -> None:  # type: ignore[no-untyped-def]
     """Write rows . (c, s, x, y) to row k of `out`."""
     t0 = rows[0, 0] * c + rows[1, 0] * s + rows[2, 0] * x + rows[3, 0] * y
@@ -114,13 +136,15 @@ def _weigh(a, weight_a, b, weight_b, k, out) -> None:  # type: ignore[no-untyped
 
 @kernel(fast=True)
 def _raise(w, k, touching, exponent) -> None:  # type: ignore[no-untyped-def]
-    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`, by `contact.power_term`."""
-    for lane in range(8):
-        if w.lanes[ACTS, lane] != 0.0:
-            shift = 2 if touching >> lane & 1 else 0
-            w.power[0, k, lane] = power_term(w.gap, w.power[0], lane, k, exponent, shift)
-        else:
-            w.power[0, k, lane] = 0.0
+    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`."""
+    power_terms(w.gap, w.power[0], k, exponent, w.lanes[BASE])
+    if k == 0:
+        for lane in range(8):
+            w.power[0, 0, lane] = w.gap[0, lane] ** exponent if w.lanes[BASE, lane] != 0.0 else 0.0
+    if touching != 0:
+        for lane in range(8):
+            if touching >> lane & 1:
+                w.power[0, k, lane] = power_term(w.gap, w.power[0], lane, k, exponent, 2)
 
 
 @kernel(fast=True)
@@ -182,6 +206,7 @@ def expand(p, state, w, penetrating, hard, harmonics, second, segments, viscous,
     im, ii = p.inverse_mass, p.inverse_inertia
     d0x, d0y, d1x, d1y = p.direction[0, 0], p.direction[0, 1], p.direction[1, 0], p.direction[1, 1]
     x, yy, vx, vy, om, c, s, theta = y[X], y[Y], y[VX], y[VY], y[OMEGA], y[COS], y[SIN], y[THETA]
+    x0, y0, vx0, vy0, om0, c0, s0 = x, yy, vx, vy, om, c, s
     # rates of the order before, for the sigma term of the time map
     px = py = pvx = pvy = pom = pc = ps = pth = 0.0
     c1 = s1 = c2 = s2 = 0.0
@@ -212,8 +237,13 @@ def expand(p, state, w, penetrating, hard, harmonics, second, segments, viscous,
         left[k, 0] = left[k, 1] = left[k, 2] = left[k, 3] = left[k, 4] = left[k, 5] = om
         if harmonics is not None:
             left[k, 6] = left[k, 7] = load[0, k]
-        _multiply(left, right, k, product)
-        dx, dy, dc, ds = vx + product[k, 0], vy - product[k, 1], -product[k, 4], product[k, 5]
+        _multiply_older(left, right, k, product)
+        # omega times the others: the terms of order k itself, and those between
+        om_k = 0.0 if k == 0 else om
+        dx = vx + (product[k, 0] + om0 * yy + om_k * y0)
+        dy = vy - (product[k, 1] + om0 * x + om_k * x0)
+        dc = -(product[k, 4] + om0 * s + om_k * s0)
+        ds = product[k, 5] + om0 * c + om_k * c0
         # loads, turned into head axes
         fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
         moment = start[2] if k == 0 else 0.0
@@ -226,8 +256,11 @@ def expand(p, state, w, penetrating, hard, harmonics, second, segments, viscous,
             elif k == 2:
                 moment += 0.5 * beta * slope[2]
         if harmonics is not None:
-            fx += d0x * product[k, 6] + d0y * product[k, 7]
-            fy += d0y * product[k, 6] - d0x * product[k, 7]
+            load_k = 0.0 if k == 0 else load[0, k]
+            along_c = product[k, 6] + load[0, 0] * c + load_k * c0
+            along_s = product[k, 7] + load[0, 0] * s + load_k * s0
+            fx += d0x * along_c + d0y * along_s
+            fy += d0y * along_c - d0x * along_s
             moment += load[2, k]
             if second is not None:
                 b6 = b7 = 0.0
@@ -261,7 +294,8 @@ def expand(p, state, w, penetrating, hard, harmonics, second, segments, viscous,
         if free is not None:
             moment *= free[2]
             fx, fy = _hold(w, k, free, fx, fy)
-        dvx, dvy = fx + product[k, 2], fy - product[k, 3]
+        dvx = fx + (product[k, 2] + om0 * vy + om_k * vy0)
+        dvy = fy - (product[k, 3] + om0 * vx + om_k * vx0)
         c2, s2, c1, s1 = c1, s1, c, s
         q = inverse[k + 1]
         x, px = (alpha * dx + beta * px) * q, dx

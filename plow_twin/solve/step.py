@@ -16,6 +16,7 @@ from plow_twin.solve.layout import (
     ACTS,
     ALPHA,
     AT_HARD_END,
+    BASE,
     BETA,
     CLIPPED,
     COEFFICIENTS,
@@ -250,7 +251,10 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
         inside += 0 if mode[pair] == OFF else 1
         w.lanes[ACTS, pair] = p.stiffness if mode[pair] == ON else 0.0
         w.lanes[DAMPS, pair] = 0.0
+        w.lanes[BASE, pair] = 0.0
         if mode[pair] == ON:
+            if fraction is not None and step[TOUCHING] >> pair & 1 == 0:
+                w.lanes[BASE, pair] = 1.0 / gap_and_rate(p, state, pair)[0]
             w.lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
     penetrating = inside > 0
     for j in range(3):
