@@ -1,0 +1,63 @@
+"""The documents hold: links and named files exist, the examples run, laws, verbs and exports are all there."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+import plow_twin
+from plow_twin.cli.app import commands
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.scene_file import loads_scene
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", page.read_text(), re.DOTALL)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_named_files_exist(page: Path) -> None:
+    text = page.read_text()
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert "://" in target or (page.parent / target).exists(), target
+    for name in re.findall(r"`((?:plow_twin|config|test|docs|tools|benchmark|launch)/[\w/.]+)`", text):
+        assert (ROOT / name).exists(), name
+
+
+def test_the_readme_s_example_runs() -> None:
+    (example,) = blocks(ROOT / "README.md", "python")
+    done = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "'method': 'events'" in done.stdout
+
+
+def test_the_interface_page_is_the_code_s() -> None:
+    page = (ROOT / "docs" / "interface.md").read_text()
+    (scene,) = blocks(ROOT / "docs" / "interface.md", "yaml")
+    assert yaml.safe_load(scene)["version"] == 1
+    assert loads_scene(scene, ROOT).wear is not None
+    for name in (*PAIR_NAMES, *LAWS):
+        assert f"`{name}`" in page, name
+    for verb in commands.commands:
+        assert f"`{verb} " in page or f"`{verb}`" in page, verb
+    for name in re.findall(r"`(Scene|Head|Frame|Clearance|\w+Error|Twin|Result)`", page):
+        assert hasattr(plow_twin, name), name
+
+
+def test_the_model_page_names_reconstruction_s_figures() -> None:
+    text = (ROOT / "docs" / "model.md").read_text()
+    result = plow_twin.simulate(loads_scene((ROOT / "config" / "paper.yaml").read_text(), ROOT), 60.0)
+    table = result.statistics
+    for pair, senses in (("bottom_right_bottom", "147.6 / 75.0 kN"), ("top_right_top", "183.3 / 90.2 kN")):
+        row = table[pair]
+        assert f"{row['max'] / 1e3:.1f} / {row['mean_in_contact'] / 1e3:.1f} kN" == senses
+        assert senses in text
