@@ -33,9 +33,7 @@ Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
 
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
-EVENT_DTYPE: Final = np.dtype(
-    [("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")]
-)
+EVENT_DTYPE: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
 _FIRST_LOG = 4096
 _ROWS_BY_DEFAULT = 1000
 _BUDGET = 2**62
@@ -56,11 +54,11 @@ class Result:
     events : ndarray of `EVENT_DTYPE`
         Every change of contact in order of time.
     statistics : mapping
-        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s], makes; over the whole
-        motion, not over the output rows.
+        By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s], makes; over the
+        whole motion, not over the output rows.
     contact_sets : mapping
-        `ccw` and `cw`: share of the contact time of that sense in which exactly these corners carry force. Corners by the
-        scene's labels, else by name.
+        `ccw` and `cw`: share of the contact time of that sense in which exactly these corners carry force. Corners by
+        the scene's labels, else by name.
     solver : mapping
         method, tol or dt, steps, evaluations (orders of series, or right-hand sides), events.
     wear_depth : ndarray, shape (8,)
@@ -99,8 +97,8 @@ def simulate(
     t_end : float
         End in s, not negative.
     output_dt : float, optional
-        Distance of the output rows in s; a thousandth of the motion by default. The rows do not change the motion, but for
-        the fixed-step methods `output_dt` is a whole multiple of `dt`.
+        Distance of the output rows in s; a thousandth of the motion by default. The rows do not change the motion, but
+        for the fixed-step methods `output_dt` is a whole multiple of `dt`.
     tol : float
         Tolerance of the pose relative to the clearance (`method="events"`).
     method : {"events", "rk4", "euler"}
@@ -200,8 +198,8 @@ def _run_fixed(compiled: Compiled, times: Array, t_end: float, method: str, dt: 
     done = np.zeros(1, np.int64)
     while True:
         code = fixed.march(
-            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, method == "euler",
-            stride, motion.q, motion.v, motion.penetration, motion.force,
+            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, method ==
+            "euler", stride, motion.q, motion.v, motion.penetration, motion.force,
         )  # fmt: skip
         if code != Status.LOG_FULL:
             break
@@ -247,8 +245,8 @@ def _result(
     }  # fmt: skip
     return Result(
         t=times, q=motion.q, v=motion.v, force=motion.force, penetration=motion.penetration, events=events,
-        statistics=statistics_of(motion.totals, t_end), contact_sets=contact_sets_of(scene, motion.totals), solver=solver,
-        wear_depth=motion.state.depth.copy(), wall_s=wall_s, compile_s=compile_s,
+        statistics=statistics_of(motion.totals, t_end), contact_sets=contact_sets_of(scene, motion.totals),
+        solver=solver, wear_depth=motion.state.depth.copy(), wall_s=wall_s, compile_s=compile_s,
     )  # fmt: skip
 
 

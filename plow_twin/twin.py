@@ -1,4 +1,4 @@
-"""The live twin: one head, advanced by any interval under sampled or analytic loads; can be saved, restored and hashed."""
+"""The live twin: one head, advanced by any interval under sampled or analytic loads; saved, restored and hashed."""
 
 from __future__ import annotations
 
@@ -105,8 +105,8 @@ class Twin:
 
     Notes
     -----
-    The motion does not depend on the times at which it is asked for, but a sample ends a step: the same samples give the
-    same bits.
+    The motion does not depend on the times at which it is asked for, but a sample ends a step: the same samples give
+    the same bits.
     """
 
     def __init__(
@@ -251,7 +251,14 @@ class Twin:
         self._check_times(times)
         out = _empty_series(times)
         drive.advance_times(
-            self._compiled.params, self._parts, self._state, self._work, self._totals, times, DEFAULT_BUDGET, *_columns(out)
+            self._compiled.params,
+            self._parts,
+            self._state,
+            self._work,
+            self._totals,
+            times,
+            DEFAULT_BUDGET,
+            *_columns(out),
         )
         return out
 
@@ -276,11 +283,24 @@ class Twin:
 
 def _empty_series(times: NDArray[np.float64]) -> AdvanceSeries:
     n = len(times)
-    eight = [np.zeros((n, 8)) for _ in range(6)]
+
+    def rows(width: int) -> NDArray[np.float64]:
+        return np.zeros((n, width))
+
     return AdvanceSeries(
-        times, np.zeros((n, 3)), np.zeros((n, 3)), *eight[:5], np.zeros((n, 8), np.int64), eight[5],
-        np.zeros(n, np.int64), np.zeros(n, np.int64),
-    )  # fmt: skip
+        t=times,
+        q=rows(3),
+        v=rows(3),
+        penetration=rows(8),
+        rate=rows(8),
+        force=rows(8),
+        peak=rows(8),
+        impulse=rows(8),
+        makes=np.zeros((n, 8), np.int64),
+        wear_depth=rows(8),
+        steps=np.zeros(n, np.int64),
+        status=np.zeros(n, np.int64),
+    )
 
 
 def _columns(out: AdvanceSeries) -> tuple[NDArray[np.float64] | NDArray[np.int64], ...]:

@@ -14,7 +14,9 @@ from plow_twin.model.contact import normal_force, power_term
 from plow_twin.model.contact_laws import DAMPING_FACTOR_CAP, LAWS, exact_damping_factor
 
 
-@pytest.mark.parametrize(("e", "d"), [(0.1, 9.998159), (0.3, 3.087082), (0.5, 1.432751), (0.7, 0.634828), (0.9, 0.166482)])
+@pytest.mark.parametrize(
+    ("e", "d"), [(0.1, 9.998159), (0.3, 3.087082), (0.5, 1.432751), (0.7, 0.634828), (0.9, 0.166482)]
+)
 def test_exact_damping_factor_is_the_published_one(e: float, d: float) -> None:
     assert exact_damping_factor(e) == pytest.approx(d, abs=5e-7)
 

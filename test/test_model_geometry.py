@@ -84,12 +84,18 @@ def test_pose_and_body_coordinates_agree(
 def test_senses_are_those_of_the_paper() -> None:
     labels = preset("paper").frame.labels
     stops_ccw = {PAIR_NAMES[i] for i in np.flatnonzero(STOPS_COUNTER_CLOCKWISE)}
-    expected = {f"{labels[letter]}_{wall}" for letter, wall in (("a", "bottom"), ("b", "right"), ("c", "top"), ("d", "left"))}
+    expected = {
+        f"{labels[letter]}_{wall}" for letter, wall in (("a", "bottom"), ("b", "right"), ("c", "top"), ("d", "left"))
+    }
     assert stops_ccw == expected
 
 
 def test_length_scale_skips_clearances_that_are_not_there() -> None:
     scene = preset("paper")
-    for horizontal, vertical, expected in ((0.025, 0.03, 0.025), (0.0, 0.03, 0.03), (-1e-3, 1e-9, 1e-4 * np.hypot(0.33, 0.27))):
+    for horizontal, vertical, expected in (
+        (0.025, 0.03, 0.025),
+        (0.0, 0.03, 0.03),
+        (-1e-3, 1e-9, 1e-4 * np.hypot(0.33, 0.27)),
+    ):
         clearance = dataclasses.replace(scene.clearance, horizontal_m=horizontal, vertical_m=vertical)
         assert geometry.length_scale(dataclasses.replace(scene, clearance=clearance)) == pytest.approx(expected)

@@ -257,6 +257,8 @@ def scenes(draw: st.DrawFn) -> Scene:
         else:
             loads.append(draw(tables(name)))
     wear = Wear(draw(POSITIVE), draw(POSITIVE), draw(POSITIVE), (draw(POSITIVE),) * 8)
+    locked = tuple(draw(st.lists(st.sampled_from(DOF_NAMES), unique=True)))
+    x, y, theta = (0.0 if name in locked else draw(FINITE) for name in DOF_NAMES)
     scene = Scene(
         head=Head(draw(POSITIVE), draw(POSITIVE)),
         frame=Frame(draw(POSITIVE), draw(POSITIVE), draw(st.dictionaries(NAME, st.sampled_from(CORNER_NAMES)))),
@@ -264,8 +266,8 @@ def scenes(draw: st.DrawFn) -> Scene:
         contact=draw(contacts()),
         gravity=Gravity(draw(FINITE), draw(FINITE)),
         loads=tuple(loads),
-        initial=Initial(draw(TRIPLE), draw(TRIPLE)),
-        locked=tuple(draw(st.lists(st.sampled_from(DOF_NAMES), unique=True))),
+        initial=Initial(draw(TRIPLE), (x, y, theta)),
+        locked=locked,
         pairs=tuple(draw(st.lists(st.sampled_from(PAIR_NAMES), unique=True))),
         wear=draw(st.none() | st.just(wear)),
     )

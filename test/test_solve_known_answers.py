@@ -40,10 +40,14 @@ def test_the_other_laws_deliver_what_is_known_of_them(law: str) -> None:
         assert delivered(Contact(law, 1e9, 1.5, restitution=asked)) == pytest.approx(known, abs=6e-5)
 
 
-@pytest.mark.parametrize(("z", "e"), [(0.01, 0.9693), (0.05, 0.8588), (0.1, 0.7441), (0.2, 0.5717), (0.3, 0.4510), (0.5, 0.2984)])
+@pytest.mark.parametrize(
+    ("z", "e"), [(0.01, 0.9693), (0.05, 0.8588), (0.1, 0.7441), (0.2, 0.5717), (0.3, 0.4510), (0.5, 0.2984)]
+)
 def test_kelvin_voigt_without_pull(z: float, e: float) -> None:
     stiffness, mass = 1e6, 2.0
-    assert delivered(Contact("kelvin_voigt", stiffness, damping=2.0 * z * math.sqrt(stiffness * mass))) == pytest.approx(e, abs=6e-5)
+    assert delivered(
+        Contact("kelvin_voigt", stiffness, damping=2.0 * z * math.sqrt(stiffness * mass))
+    ) == pytest.approx(e, abs=6e-5)
 
 
 def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
@@ -80,7 +84,9 @@ def test_bouncing_ball_comes_to_rest(e: float) -> None:
     for stiffness in (1e9, 1e11):
         contact = Contact("exact_restitution", stiffness, 1.5, restitution=e)
         pairs = ("top_left_top", "top_right_top")
-        result = simulate(wall_and_point(contact, speed=0.0, mass=1.0, gravity=g, gap=2 * h, pairs=pairs), 3.0, tol=1e-8)
+        result = simulate(
+            wall_and_point(contact, speed=0.0, mass=1.0, gravity=g, gap=2 * h, pairs=pairs), 3.0, tol=1e-8
+        )
         limit = math.sqrt(2.0 * h / g) * (1.0 + e) / (1.0 - e)
         errors.append(abs(result.events["time"][-1] / limit - 1.0))
         # at rest: each of the two corners carries half the weight
@@ -99,9 +105,12 @@ def test_a_constant_load_settles_on_statics(n: float, law: str) -> None:
     )  # fmt: skip
     end = simulate(scene, 30.0, output_dt=30.0, tol=1e-10)
     force, depth = end.force[-1], end.penetration[-1]
-    # the head leans with its roof on the two upper corners and, pushed right, with its left wall on one or two left ones
+    # the head leans with its roof on the two upper corners and, pushed right, with its left wall on one or two left
+    # ones
     c, s = math.cos(end.q[-1, 2]), math.sin(end.q[-1, 2])
-    normal = np.array([[0, 1], [-1, 0], [0, 1], [1, 0], [0, -1], [1, 0], [0, -1], [-1, 0]]) @ np.array([[c, s], [-s, c]])
+    normal = np.array([[0, 1], [-1, 0], [0, 1], [1, 0], [0, -1], [1, 0], [0, -1], [-1, 0]]) @ np.array(
+        [[c, s], [-s, c]]
+    )
     corner = 0.5 * np.array([[-0.33, 0.27]] * 2 + [[0.33, 0.27]] * 2 + [[0.33, -0.27]] * 2 + [[-0.33, -0.27]] * 2)
     arm = corner - end.q[-1, :2]
     assert force @ normal == pytest.approx([-fx, mass * g], abs=1e-2)
@@ -128,7 +137,12 @@ def test_impulses_add_up_to_the_change_of_momentum(name: str) -> None:
 
 def test_leaving_the_model_s_range_is_a_named_error() -> None:
     scene = Scene(
-        Head(10.0, 1.0), Frame(0.3, 0.3), Clearance(0.02, 0.02), Contact("hertz", 1e3), Gravity(0.0), (Constant("f", (5e4, 0.0)),)
+        Head(10.0, 1.0),
+        Frame(0.3, 0.3),
+        Clearance(0.02, 0.02),
+        Contact("hertz", 1e3),
+        Gravity(0.0),
+        (Constant("f", (5e4, 0.0)),),
     )
     with pytest.raises(SolverError, match=r"at t = 0\.0\d+ s: the head left the model's range"):
         simulate(scene, 1.0)

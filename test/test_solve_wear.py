@@ -36,7 +36,7 @@ def test_constant_force_and_speed() -> None:
 
 
 def test_linear_feedback_of_wear_on_force() -> None:
-    """h = (exp(b r t) - 1) / b for F = F0 (1 + b h): a head clamped by interference relaxes as its pads wear, b = -1/d0."""
+    """h = (exp(b r t) - 1) / b for F = F0 (1 + b h): a head clamped by interference relaxes as it wears, b = -1/d0."""
     depth, stiffness, k_s, area, speed, t = 1e-4, 1e7, 2e-9, 0.015, 2.0, 20.0
     scene = pressed(Wear(k_s, area, speed), clearance=-2.0 * depth, gravity=0.0, stiffness=stiffness)
     result = simulate(scene, t, tol=1e-10)

@@ -3,8 +3,8 @@
     Kelvin-Voigt      F = K d + C d'
     all other laws    F = K d^n (1 + lambda d')
 
-(model of the paper's lost eq. 6; the laws' lambda comes from `contact_laws`). A solver decides when a pair is in contact
-and when its force would pull: there the force is zero.
+(model of the paper's lost eq. 6; the laws' lambda comes from `contact_laws`). A solver decides when a pair is in
+contact and when its force would pull: there the force is zero.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ def power_term(
 ) -> float:
     """Return coefficient k of base(t)^exponent for one column, series of shape (n, 8) with orders in rows.
 
-    Recurrence  b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j}  (Knuth, TAOCP 2, sec. 4.7). A base that starts with
-    t^shift is divided by it first; its power then starts with t^(shift exponent).
+    Recurrence  b_0 k P_k = sum_j (exponent j - (k - j)) b_j P_{k-j}  (Knuth, TAOCP 2, sec. 4.7). A base that starts
+    with t^shift is divided by it first; its power then starts with t^(shift exponent).
     """
     offset = int(shift * exponent)
     if k < offset:

@@ -1,8 +1,8 @@
 """Contact laws: each is one definition with its equation and its source.
 
-All laws but Kelvin-Voigt have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive inward.
-They differ in the damping factor  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch.
-A law is added by one entry in `LAWS`: every solver reads nothing but these numbers.
+All laws but Kelvin-Voigt have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive
+inward. They differ in the damping factor  D = lambda v0  that they derive from the restitution e; v0 is the speed of
+the touch. A law is added by one entry in `LAWS`: every solver reads nothing but these numbers.
 """
 
 from __future__ import annotations

@@ -5,13 +5,13 @@ The head's state is kept in *body coordinates* of its centre of mass G:
     X, Y     position of G, VX, VY its velocity, both resolved in head axes,
     omega    angular velocity,  c, s = cos(theta), sin(theta),  theta.
 
-With them every penetration is linear, and so is every arm. A frame corner C = (Cx, Cy) is seen from the cavity's centre at
-p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
+With them every penetration is linear, and so is every arm. A frame corner C = (Cx, Cy) is seen from the cavity's
+centre at p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
 
     p_x =  c Cx + s Cy - X + rx        p_y = -s Cx + c Cy - Y + ry
 
-with (rx, ry) the offset of G from the cavity's centre in head axes. The penetration past a wall with outward normal n at
-distance H is n . p - H; its rate is n . dp/dt, positive inward.
+with (rx, ry) the offset of G from the cavity's centre in head axes. The penetration past a wall with outward normal n
+at distance H is n . p - H; its rate is n . dp/dt, positive inward.
 """
 
 from __future__ import annotations
@@ -88,15 +88,24 @@ def body_state(
     c, s = math.cos(theta), math.sin(theta)
     rx, ry = com_offset
     return np.array(
-        [c * x + s * y + rx, -s * x + c * y + ry, c * vx + s * vy - omega * ry, -s * vx + c * vy + omega * rx, omega, c, s, theta]
+        [
+            c * x + s * y + rx,
+            -s * x + c * y + ry,
+            c * vx + s * vy - omega * ry,
+            -s * vx + c * vy + omega * rx,
+            omega,
+            c,
+            s,
+            theta,
+        ]
     )
 
 
 def length_scale(scene: Scene) -> float:
     """Return the length in m that a tolerance refers to: the smallest clearance that is not negligible.
 
-    A clearance that is zero, negative or below 1e-4 of the frame's diagonal does not count; without any the scale is that
-    fraction of the diagonal.
+    A clearance that is zero, negative or below 1e-4 of the frame's diagonal does not count; without any the scale is
+    that fraction of the diagonal.
     """
     floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)
     return min((c for c in (scene.clearance.horizontal_m, scene.clearance.vertical_m) if c > floor), default=floor)

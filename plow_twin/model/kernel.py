@@ -1,7 +1,7 @@
 """The decorator of every compiled function: numba with a cache on disk that notices a change in any kernel.
 
-Numba's own cache looks at the file of the function that is called, not at those of the functions it calls: a change there
-would go unseen. Here the stamp of each cached function stands for the text of all kernels.
+Numba's own cache looks at the file of the function that is called, not at those of the functions it calls: a change
+there would go unseen. Here the stamp of each cached function stands for the text of all kernels.
 """
 
 from __future__ import annotations

@@ -99,7 +99,10 @@ class Contact:
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
-        "N s/m or s/m", "kelvin_voigt: C in N s/m; others: constant factor lambda of (1 + lambda d') in s/m", None, ge=0.0
+        "N s/m or s/m",
+        "kelvin_voigt: C in N s/m; others: constant factor lambda of (1 + lambda d') in s/m",
+        None,
+        ge=0.0,
     )
     restitution: float | None = _quantity("1", "restitution asked of the law", None, ge=0.0, le=1.0)
     impact_speed_floor_m_s: float = _quantity(
@@ -171,7 +174,9 @@ class Wear:
     pad_area_m2: float = _quantity("m^2", "area A of one pad", gt=0.0)
     travel_speed_m_s: float = _quantity("m/s", "speed v along the face", ge=0.0)
     initial_depth_m: tuple[float, ...] = _quantity("m", "wear depth of the eight pads at t = 0", (0.0,) * 8, ge=0.0)
-    prior_m2_n: tuple[float, float] = _quantity("m^2/N", "5 % and 95 % points of what k_s may be", (1e-15, 1e-13), gt=0.0)
+    prior_m2_n: tuple[float, float] = _quantity(
+        "m^2/N", "5 % and 95 % points of what k_s may be", (1e-15, 1e-13), gt=0.0
+    )
 
 
 @dataclass(frozen=True)
@@ -206,6 +211,11 @@ def check(scene: Scene) -> Iterator[Problem]:
         yield from _check_contact(scene.contact)
         yield from _check_rotation(scene)
         yield from _check_loads(scene.loads)
+        for name, rate in zip(DOF_NAMES, scene.initial.v, strict=True):
+            if name in scene.locked and rate != 0.0:
+                yield Problem("initial.v", scene.initial.v, f"0 for the locked {name}")
+        if scene.wear is not None and scene.wear.prior_m2_n[0] > scene.wear.prior_m2_n[1]:
+            yield Problem("wear.prior_m2_n", scene.wear.prior_m2_n, "the 5 % point first, then the 95 % point")
         for key in ("locked", "pairs"):
             names = getattr(scene, key)
             if len(set(names)) != len(names):
@@ -247,9 +257,13 @@ def _check_number(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
 
 
 def _admissible(value: Any, metadata: Mapping[str, Any]) -> bool:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)) or not math.isfinite(value):
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, (int, float, np.integer, np.floating))
+        or not math.isfinite(value)
+    ):
         return False
-    return (
+    return bool(
         value > metadata.get("gt", -math.inf)
         and value >= metadata.get("ge", -math.inf)
         and value < metadata.get("lt", math.inf)
@@ -276,12 +290,16 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     law = LAWS[contact.law]
     given = {"damping": contact.damping, "restitution": contact.restitution}
     names = [name for name, value in given.items() if value is not None]
-    allowed = [name for name, possible in (("damping", law.takes_damping), ("restitution", law.takes_restitution)) if possible]
+    allowed = [
+        name for name, possible in (("damping", law.takes_damping), ("restitution", law.takes_restitution)) if possible
+    ]
     if len(names) > 1:
         yield Problem("contact", given, "either damping or restitution, not both")
     for name in names:
         if name not in allowed:
-            yield Problem(f"contact.{name}", given[name], f"{' or '.join(allowed) or 'no damping at all'} for {contact.law}")
+            yield Problem(
+                f"contact.{name}", given[name], f"{' or '.join(allowed) or 'no damping at all'} for {contact.law}"
+            )
     if allowed and not names:
         yield Problem("contact", given, f"{' or '.join(allowed)} for {contact.law}")
     if law.exponent is not None and contact.exponent != law.exponent:
@@ -294,7 +312,9 @@ def _check_rotation(scene: Scene) -> Iterator[Problem]:
         yield Problem("head.com_offset_m", scene.head.com_offset_m, "(0, 0) for rotation: paper")
     if scene.head.rotation == "consistent":
         if scene.gravity.arm_m != 0.0:
-            yield Problem("gravity.arm_m", scene.gravity.arm_m, "0 for rotation: consistent (gravity acts at com_offset_m)")
+            yield Problem(
+                "gravity.arm_m", scene.gravity.arm_m, "0 for rotation: consistent (gravity acts at com_offset_m)"
+            )
         if offset and {"x", "y"} & set(scene.locked) and "theta" not in scene.locked:
             yield Problem("locked", scene.locked, "no x or y while theta is free and the centre of mass is offset")
 

@@ -1,0 +1,1 @@
+"""How the motion is advanced: series, events, the loop; fixed-step methods."""

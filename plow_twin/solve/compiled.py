@@ -139,13 +139,16 @@ def _lacuna(law: Law) -> int:
 
 def per_mass(scene: Scene, wrench: Array) -> Array:
     """Divide wrenches, shape (..., 3), by mass and inertia."""
-    return np.asarray(wrench) / np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
+    share: Array = np.asarray(wrench) / np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
+    return share
 
 
 def segments_of(scene: Scene, pieces: Pieces) -> Segments:
     """Return linear pieces per mass and inertia."""
     return Segments(
-        np.ascontiguousarray(pieces.knots, dtype=np.float64), per_mass(scene, pieces.start), per_mass(scene, pieces.slope)
+        np.ascontiguousarray(pieces.knots, dtype=np.float64),
+        per_mass(scene, pieces.start),
+        per_mass(scene, pieces.slope),
     )
 
 
@@ -192,7 +195,11 @@ def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
         force = force + np.abs(loads.pieces.start).max(axis=0)
     acceleration = per_mass(scene, force)
     radius = geometry.half_diagonal(scene)
-    total = abs(scene.gravity.acceleration_m_s2) + float(np.hypot(acceleration[0], acceleration[1])) + radius * acceleration[2]
+    total = (
+        abs(scene.gravity.acceleration_m_s2)
+        + float(np.hypot(acceleration[0], acceleration[1]))
+        + radius * acceleration[2]
+    )
     initial = float(np.hypot(*scene.initial.v[:2])) + radius * abs(scene.initial.v[2])
     return max(math.sqrt(length * total), initial, 1e-3 * length)
 

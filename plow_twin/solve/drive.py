@@ -13,7 +13,7 @@ _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
 
 
 @kernel(inline=True)
-def _lay_out(p, parts, state, w, hard_time) -> bool:  # type: ignore[no-untyped-def]
+def _lay_out(p, parts, state, w, hard_time) -> bool:
     law = parts.law
     return begin(
         p, state, w, hard_time, parts.harmonics, parts.second, parts.segments,
@@ -22,7 +22,7 @@ def _lay_out(p, parts, state, w, hard_time) -> bool:  # type: ignore[no-untyped-
 
 
 @kernel(inline=True)
-def _next(p, parts, state, w, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
+def _next(p, parts, state, w, hard_time, budget) -> int:
     """Lay out the next step unless one is under way."""
     if state.clock[LENGTH] >= 0.0:
         return _OK
@@ -34,7 +34,7 @@ def _next(p, parts, state, w, hard_time, budget) -> int:  # type: ignore[no-unty
 
 
 @kernel()
-def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:  # type: ignore[no-untyped-def]
+def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:
     """Bring the motion to `target`; steps may reach beyond it, up to `hard_time`. Returns a `Status`."""
     while True:
         t0 = state.clock[T0]
@@ -55,7 +55,7 @@ def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:  # t
 
 
 @kernel()
-def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth) -> None:  # type: ignore[no-untyped-def]
+def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth) -> None:
     """Write row i: the state at the present time and the totals, which are cleared."""
     y = w.moved
     if state.clock[LENGTH] >= 0.0:
@@ -74,7 +74,26 @@ def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, pea
 
 
 @kernel()
-def advance_times(p, parts, state, w, totals, times, budget, q, v, penetration, rate, force, peak, impulse, makes, depth, steps, status) -> None:  # type: ignore[no-untyped-def]  # noqa: E501
+def advance_times(
+    p,
+    parts,
+    state,
+    w,
+    totals,
+    times,
+    budget,
+    q,
+    v,
+    penetration,
+    rate,
+    force,
+    peak,
+    impulse,
+    makes,
+    depth,
+    steps,
+    status,
+) -> None:
     """Advance to each time under the scene's own loads and write a row for each."""
     for i in range(times.size):
         before = state.count[STEPS]
@@ -84,7 +103,27 @@ def advance_times(p, parts, state, w, totals, times, budget, q, v, penetration, 
 
 
 @kernel()
-def advance_samples(p, parts, state, w, totals, times, wrench, budget, q, v, penetration, rate, force, peak, impulse, makes, depth, steps, status) -> None:  # type: ignore[no-untyped-def]  # noqa: E501
+def advance_samples(
+    p,
+    parts,
+    state,
+    w,
+    totals,
+    times,
+    wrench,
+    budget,
+    q,
+    v,
+    penetration,
+    rate,
+    force,
+    peak,
+    impulse,
+    makes,
+    depth,
+    steps,
+    status,
+) -> None:
     """Advance to each time under a wrench that runs straight from wrench[i] to wrench[i + 1]; a sample ends a step."""
     piece = parts.segments
     state.step[PIECE] = 0
@@ -101,7 +140,7 @@ def advance_samples(p, parts, state, w, totals, times, wrench, budget, q, v, pen
 
 
 @kernel()
-def end_step(p, parts, state, w, totals) -> None:  # type: ignore[no-untyped-def]
+def end_step(p, parts, state, w, totals) -> None:
     """End the step under way at the present time: something changes from outside."""
     clock = state.clock
     if clock[LENGTH] < 0.0:
@@ -114,7 +153,7 @@ def end_step(p, parts, state, w, totals) -> None:  # type: ignore[no-untyped-def
 
 
 @kernel()
-def lay_out_again(p, parts, state, w) -> None:  # type: ignore[no-untyped-def]
+def lay_out_again(p, parts, state, w) -> None:
     """Compute the step under way once more after a restore: its series are not part of the state."""
     used, count = state.clock[USED], state.count.copy()
     _lay_out(p, parts, state, w, np.inf)
@@ -123,7 +162,7 @@ def lay_out_again(p, parts, state, w) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force) -> int:  # type: ignore[no-untyped-def]
+def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force) -> int:
     """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
 
     `penetration` and `force` may be None. The rows' times do not change the steps.

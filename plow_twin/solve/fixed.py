@@ -1,7 +1,7 @@
 """Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
 
-They evaluate the equations of motion (paper, eq. 5) as they stand, in world axes about the centre of mass, independently
-of the series: a check on them as much as a method.
+They evaluate the equations of motion (paper, eq. 5) as they stand, in world axes about the centre of mass,
+independently of the series: a check on them as much as a method.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _LOG_FULL = int(Status.LOG_FULL)
 
 
 @kernel()
-def _load(p, harmonics, second, segments, t, out) -> None:  # type: ignore[no-untyped-def]
+def _load(p, harmonics, second, segments, t, out) -> None:
     """Write force per mass and moment per inertia at t, world axes."""
     out[:] = p.constant
     if harmonics is not None:
@@ -33,7 +33,7 @@ def _load(p, harmonics, second, segments, t, out) -> None:  # type: ignore[no-un
 
 
 @kernel()
-def _add_harmonics(p, harmonics, second, t, out) -> None:  # type: ignore[no-untyped-def]
+def _add_harmonics(p, harmonics, second, t, out) -> None:
     for i in range(harmonics.omega.size):
         sine, cosine = math.sin(harmonics.omega[i] * t), math.cos(harmonics.omega[i] * t)
         s1 = harmonics.first[i, 0] * sine + harmonics.first[i, 1] * cosine
@@ -47,7 +47,7 @@ def _add_harmonics(p, harmonics, second, t, out) -> None:  # type: ignore[no-unt
 
 
 @kernel()
-def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:  # type: ignore[no-untyped-def]
+def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:
     """Write the rate of z = (x, y, theta, vx, vy, omega) of the centre of mass, world axes."""
     _load(p, parts.harmonics, parts.second, parts.segments, t, load)
     A, B = p.gap, p.arm
@@ -79,7 +79,7 @@ def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:  # t
 
 
 @kernel()
-def _to_body(z, y) -> None:  # type: ignore[no-untyped-def]
+def _to_body(z, y) -> None:
     """Write body coordinates from z."""
     c, s = math.cos(z[2]), math.sin(z[2])
     y[0], y[1] = c * z[0] + s * z[1], c * z[1] - s * z[0]
@@ -88,7 +88,7 @@ def _to_body(z, y) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _switch(p, state, penetration, rate, time, totals, log) -> None:  # type: ignore[no-untyped-def]
+def _switch(p, state, penetration, rate, time, totals, log) -> None:
     """Note which pairs touch or part, at the step's resolution."""
     for pair in range(8):
         inside = p.enabled[pair] == 1 and penetration[pair] > 0.0
@@ -107,7 +107,7 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:  # type: ig
 
 
 @kernel()
-def _account(state, force_before, force, dt, totals) -> None:  # type: ignore[no-untyped-def]
+def _account(state, force_before, force, dt, totals) -> None:
     """Add one step to the totals by the trapezoidal rule."""
     sets = np.zeros(2, np.int64)
     for pair in range(8):
@@ -123,7 +123,7 @@ def _account(state, force_before, force, dt, totals) -> None:  # type: ignore[no
 
 
 @kernel()
-def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force) -> int:  # type: ignore[no-untyped-def]  # noqa: E501
+def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force) -> int:
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
     z, trial = np.empty(6), np.empty(6)
     k = np.empty((4, 6))
@@ -177,7 +177,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
 
 
 @kernel()
-def _wear(rate, state, force, dt) -> None:  # type: ignore[no-untyped-def]
+def _wear(rate, state, force, dt) -> None:
     if rate is not None:
         for pair in range(8):
             state.depth[pair] += rate[pair] * force[pair] * dt

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,14 +64,15 @@ class Status(IntEnum):
 _STATUS_TEXT: Final = {
     Status.OK: "done",
     Status.STALLED: "time did not advance: contact modes kept changing at one instant",
-    Status.OUT_OF_RANGE: "the head left the model's range: |theta| > 45 degrees or a penetration beyond half the cavity",
+    Status.OUT_OF_RANGE: "the head left the model's range: |theta| above 45 degrees or half the cavity penetrated",
     Status.NON_FINITE: "the motion became non-finite; load, stiffness or damping is too large for double precision",
     Status.BUDGET: "the budget of steps was used up before the time asked for",
     Status.LOG_FULL: "the event log is full",
 }
 
 
-# Records rather than tuples of arrays: a kernel gets one pointer, shapes are constants, and nothing is reference counted.
+# Records rather than tuples of arrays: a kernel gets one pointer, shapes are constants, and nothing is reference
+# counted.
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
@@ -160,7 +161,10 @@ TOTALS: Final = np.dtype(
     ]
 )
 
-Params = State = Work = Totals = np.record
+Params: TypeAlias = np.record
+State: TypeAlias = np.record
+Work: TypeAlias = np.record
+Totals: TypeAlias = np.record
 
 
 class Harmonics(NamedTuple):

@@ -1,7 +1,7 @@
 """Polynomials on an interval: sure statements on sign, first root and maximum, from the Bernstein form.
 
-A polynomial lies within the hull of its Bernstein coefficients, and has no more roots than they have sign changes; halving
-the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
+A polynomial lies within the hull of its Bernstein coefficients, and has no more roots than they have sign changes;
+halving the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
 
 
 @kernel()
-def first_root(g: Array, n: int, h: float, w) -> float:  # type: ignore[no-untyped-def]
+def first_root(g: Array, n: int, h: float, w) -> float:
     """Return where g first turns negative in [0, h), or infinity; g[0] >= 0.
 
     Intervals whose Bernstein coefficients show no negative value are left out, one sign change is one root, the rest is
@@ -104,7 +104,7 @@ def first_root(g: Array, n: int, h: float, w) -> float:  # type: ignore[no-untyp
 
 
 @kernel()
-def maximum(g: Array, n: int, h: float, floor: float, w) -> float:  # type: ignore[no-untyped-def]
+def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
     """Return the larger of `floor` and the maximum of g on [0, h], to 1e-12 of it."""
     b = w.halves
     to_bernstein(g, n, h, w.binomial[n], b[0])

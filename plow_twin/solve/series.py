@@ -36,7 +36,7 @@ from plow_twin.solve.layout import (
 
 
 @kernel(fast=True)
-def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:  # type: ignore[no-untyped-def]
+def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
     """Write the series of S1, S2 and M to `w.load`.
 
     sin and cos along t(sigma) follow from one another:  (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}).
@@ -66,7 +66,7 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:  # ty
 
 
 @kernel(fast=True)
-def _multiply(a, b, k, out) -> None:  # type: ignore[no-untyped-def]
+def _multiply(a, b, k, out) -> None:
     """Write order k of the eight products of the columns of a and b to row k of `out`."""
     t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
     for j in range(k + 1):
@@ -84,7 +84,7 @@ def _multiply(a, b, k, out) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def _multiply_older(a, b, k, out) -> None:  # type: ignore[no-untyped-def]
+def _multiply_older(a, b, k, out) -> None:
     """Write order k of the eight products without the two terms of order k itself to row k of `out`.
 
     These sums do not wait for the newest order, so that the processor can run them ahead.
@@ -105,7 +105,7 @@ def _multiply_older(a, b, k, out) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def _combine(rows, c, s, x, y, k, out) -> None:  # type: ignore[no-untyped-def]
+def _combine(rows, c, s, x, y, k, out) -> None:
     """Write rows . (c, s, x, y) to row k of `out`."""
     t0 = rows[0, 0] * c + rows[1, 0] * s + rows[2, 0] * x + rows[3, 0] * y
     t1 = rows[0, 1] * c + rows[1, 1] * s + rows[2, 1] * x + rows[3, 1] * y
@@ -120,7 +120,7 @@ def _combine(rows, c, s, x, y, k, out) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def _weigh(a, weight_a, b, weight_b, k, out) -> None:  # type: ignore[no-untyped-def]
+def _weigh(a, weight_a, b, weight_b, k, out) -> None:
     """Write weight_a a + weight_b b, lane by lane, to row k of `out`."""
     t0 = weight_a[0] * a[k, 0] + weight_b[0] * b[k, 0]
     t1 = weight_a[1] * a[k, 1] + weight_b[1] * b[k, 1]
@@ -135,7 +135,7 @@ def _weigh(a, weight_a, b, weight_b, k, out) -> None:  # type: ignore[no-untyped
 
 
 @kernel(fast=True)
-def _raise(w, k, touching, exponent) -> None:  # type: ignore[no-untyped-def]
+def _raise(w, k, touching, exponent) -> None:
     """Write order k of penetration^exponent of the pairs that act to `w.power[0]`."""
     power_terms(w.gap, w.power[0], k, exponent, w.lanes[BASE])
     if k == 0:
@@ -148,7 +148,7 @@ def _raise(w, k, touching, exponent) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def _damp(elastic, w, k, factor) -> None:  # type: ignore[no-untyped-def]
+def _damp(elastic, w, k, factor) -> None:
     """Write order k of K elastic (1 + lambda d') to `w.force`."""
     if factor is not None:
         _multiply(elastic, w.rate, k, w.damped)
@@ -156,7 +156,7 @@ def _damp(elastic, w, k, factor) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def _push(state, w, k, viscous, factor, integer, fraction) -> None:  # type: ignore[no-untyped-def]
+def _push(state, w, k, viscous, factor, integer, fraction) -> None:
     """Write order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
     Row ACTS of `w.lanes` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
@@ -176,7 +176,7 @@ def _push(state, w, k, viscous, factor, integer, fraction) -> None:  # type: ign
 
 
 @kernel(fast=True)
-def _hold(w, k, free, fx, fy):  # type: ignore[no-untyped-def]
+def _hold(w, k, free, fx, fy):
     """Return order k of the force per mass in head axes without what acts along a locked world axis."""
     w.world[0, k], w.world[1, k] = fx, fy
     right, world = w.right, w.world
@@ -193,11 +193,13 @@ def _hold(w, k, free, fx, fy):  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def expand(p, state, w, penetrating, hard, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free):  # type: ignore[no-untyped-def]  # noqa: E501
+def expand(
+    p, state, w, penetrating, hard, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+):
     """Write the series of state, penetration, rate and force to `w`; return the order used.
 
-    Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. `hard` is the longest sigma of
-    interest: orders whose terms vanish there are not computed.
+    Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. `hard` is the longest
+    sigma of interest: orders whose terms vanish there are not computed.
     """
     y, alpha, beta = state.y, state.clock[ALPHA], state.clock[BETA]
     series, left, right, product, gap, force = w.series, w.left, w.right, w.product, w.gap, w.force

@@ -1,7 +1,8 @@
 """One step: series, length, first event, what happened in it, and the switch at its end.
 
-A step never depends on where output is wanted. It ends at an event, at a knot of the load, or where its series stops being
-accurate. Guards are polynomials that stay >= 0 while a mode lasts; `polynomial.first_root` finds the first that does not.
+A step never depends on where output is wanted. It ends at an event, at a knot of the load, or where its series stops
+being accurate. Guards are polynomials that stay >= 0 while a mode lasts; `polynomial.first_root` finds the first that
+does not.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ LONGEST_STEP = 100.0
 
 
 @kernel(inline=True)
-def gap_and_rate(p, state, pair):  # type: ignore[no-untyped-def]
+def gap_and_rate(p, state, pair):
     """Return penetration and its rate of one pair at the step's start."""
     y, A = state.y, p.gap
     c, s, om = y[COS], y[SIN], y[OMEGA]
@@ -69,7 +70,7 @@ def gap_and_rate(p, state, pair):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def touch(p, state, pair) -> None:  # type: ignore[no-untyped-def]
+def touch(p, state, pair) -> None:
     """Start a contact: read its impact speed, lambda = D / v0."""
     if p.damping_factor >= 0.0:
         _, speed = gap_and_rate(p, state, pair)
@@ -77,7 +78,7 @@ def touch(p, state, pair) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def settle_modes(p, state) -> None:  # type: ignore[no-untyped-def]
+def settle_modes(p, state) -> None:
     """Choose each pair's mode from its penetration, where a motion starts or is changed from outside."""
     for pair in range(8):
         state.mode[pair] = OFF
@@ -91,10 +92,11 @@ def settle_modes(p, state) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def _guards(p, state, w, order, penetrating, viscous) -> None:  # type: ignore[no-untyped-def]
+def _guards(p, state, w, order, penetrating, viscous) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 where the law is viscous, else d >= 0 (or a small depth); others: d >= 0.
+    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 where the law is viscous, else d >= 0 (or a small depth); others: d
+    >= 0.
     """
     gap, rate, guard, lanes = w.gap, w.rate, w.guard, w.lanes
     for lane in range(8):
@@ -119,7 +121,7 @@ def _guards(p, state, w, order, penetrating, viscous) -> None:  # type: ignore[n
 
 
 @kernel()
-def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:  # type: ignore[no-untyped-def]
+def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:
     """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
 
     on: 1 + lambda d' >= 0; clipped: the force would pull; released: d <= p.release.
@@ -147,7 +149,7 @@ def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:  # type: i
 
 
 @kernel(fast=True)
-def _unsafe_lanes(w, order, h):  # type: ignore[no-untyped-def]
+def _unsafe_lanes(w, order, h):
     """Return a bit for each guard that g_0 > sum |g_k| h^k does not prove to stay positive on [0, h]."""
     guard, total = w.guard, w.lanes[SUM]
     for lane in range(8):
@@ -163,7 +165,7 @@ def _unsafe_lanes(w, order, h):  # type: ignore[no-untyped-def]
 
 
 @kernel(inline=True)
-def _next_mode(mode, viscous, fraction):  # type: ignore[no-untyped-def]
+def _next_mode(mode, viscous, fraction):
     """Return the mode that follows when a pair's first guard ends it."""
     if mode == OFF:
         return ON if fraction is None or fraction == 1.5 else RELEASED
@@ -173,7 +175,7 @@ def _next_mode(mode, viscous, fraction):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fraction):  # type: ignore[no-untyped-def]
+def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fraction):
     """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
     _guards(p, state, w, order, penetrating, viscous)
     best, event, target = sigma, -1, 0
@@ -203,8 +205,9 @@ def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fracti
 
 
 @kernel()
-def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
-    """Return the sigma over which the series meets the step's share of the tolerance, at most `hard`; NaN if not finite.
+def _accurate_length(p, w, order, hard):
+    """Return the sigma over which the series meets the step's share of the tolerance, at most `hard`; NaN if not
+    finite.
 
     Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
     test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are looked at, since single ones can vanish.
@@ -224,7 +227,7 @@ def _accurate_length(p, w, order, hard):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def _linear_load(segments, step, t0, w):  # type: ignore[no-untyped-def]
+def _linear_load(segments, step, t0, w):
     """Add the linear load at t0 to `w.wrench` and return the time up to which it is linear."""
     piece = step[PIECE]
     while piece + 1 < segments.knots.size and segments.knots[piece + 1] <= t0:
@@ -242,7 +245,9 @@ def _linear_load(segments, step, t0, w):  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free) -> bool:  # type: ignore[no-untyped-def]  # noqa: E501
+def begin(
+    p, state, w, hard_time, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+) -> bool:
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step, mode = state.clock, state.step, state.mode
     t0 = clock[T0]
@@ -273,14 +278,25 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
     if harmonics is not None:
         expand_harmonics(harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
     order = expand(
-        p, state, w, penetrating, hard, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+        p,
+        state,
+        w,
+        penetrating,
+        hard,
+        harmonics,
+        second,
+        segments,
+        viscous,
+        factor,
+        integer,
+        fraction,
+        wear,
+        offset,
+        free,
     )
     state.count[STEPS] += 1
     state.count[COEFFICIENTS] += order
-    if order < p.order:
-        sigma = hard
-    else:
-        sigma = _accurate_length(p, w, order, hard)
+    sigma = hard if order < p.order else _accurate_length(p, w, order, hard)
     if not math.isfinite(sigma):
         return False
     limited = limited and sigma == hard
@@ -301,7 +317,7 @@ def begin(p, state, w, hard_time, harmonics, second, segments, viscous, factor, 
 
 
 @kernel(inline=True)
-def sigma_at(state, used):  # type: ignore[no-untyped-def]
+def sigma_at(state, used):
     """Return sigma at `used` seconds into the step."""
     clock = state.clock
     if used >= clock[LENGTH]:
@@ -310,7 +326,7 @@ def sigma_at(state, used):  # type: ignore[no-untyped-def]
 
 
 @kernel(fast=True)
-def evaluate(state, w, sigma, out) -> None:  # type: ignore[no-untyped-def]
+def evaluate(state, w, sigma, out) -> None:
     """Write the body-coordinate state at sigma to `out`, shape (8,)."""
     order, series = state.step[ORDER], w.series
     for i in range(8):
@@ -321,7 +337,7 @@ def evaluate(state, w, sigma, out) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def pose_of(y, offset, q, v) -> None:  # type: ignore[no-untyped-def]
+def pose_of(y, offset, q, v) -> None:
     """Write pose and rate of the cavity's centre in world axes from body coordinates; inverse of `body_state`."""
     c, s, x, yy, vx, vy, om = y[COS], y[SIN], y[0], y[1], y[VX], y[VY], y[OMEGA]
     if offset is not None:
@@ -332,7 +348,7 @@ def pose_of(y, offset, q, v) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def pair_outputs(p, state, y, penetration, rate, force) -> None:  # type: ignore[no-untyped-def]
+def pair_outputs(p, state, y, penetration, rate, force) -> None:
     """Write penetration, rate and force of the eight pairs in body coordinates y, shape (8,) each."""
     A = p.gap
     c, s, om = y[COS], y[SIN], y[OMEGA]
@@ -345,7 +361,7 @@ def pair_outputs(p, state, y, penetration, rate, force) -> None:  # type: ignore
 
 
 @kernel(fast=True)
-def _sums(w, order, h) -> None:  # type: ignore[no-untyped-def]
+def _sums(w, order, h) -> None:
     """Write bound and integrals of each force over [0, h]: sum |f_k| h^k, sum f_k h^k / (k+1), sum f_k h^k / (k+2)."""
     force, bound, first, second, inverse = w.force, w.lanes[SUM], w.lanes[FIRST], w.lanes[SECOND], w.inverse
     for lane in range(8):
@@ -358,7 +374,7 @@ def _sums(w, order, h) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel()
-def account(state, w, low, high, totals) -> None:  # type: ignore[no-untyped-def]
+def account(state, w, low, high, totals) -> None:
     """Add what happened between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
     mode = state.mode
     acting = 0
@@ -398,14 +414,14 @@ def account(state, w, low, high, totals) -> None:  # type: ignore[no-untyped-def
 
 
 @kernel()
-def _swap_rows(a, b, order) -> None:  # type: ignore[no-untyped-def]
+def _swap_rows(a, b, order) -> None:
     for k in range(order + 1):
         for lane in range(8):
             a[k, lane], b[k, lane] = b[k, lane], a[k, lane]
 
 
 @kernel()
-def finish(p, state, w, totals, log, wear, fraction) -> None:  # type: ignore[no-untyped-def]
+def finish(p, state, w, totals, log, wear, fraction) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
     clock, step, y = state.clock, state.step, state.y
     sigma, order = clock[SIGMA], step[ORDER]
@@ -457,11 +473,12 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:  # type: ignore[no
 
 
 @kernel()
-def within_range(p, state) -> bool:  # type: ignore[no-untyped-def]
+def within_range(p, state) -> bool:
     """Tell whether the model still holds: |theta| <= 45 degrees and no penetration beyond half the cavity."""
     if abs(state.y[THETA]) > 0.7853981633974483:
         return False
+    deepest = 0.0
     for pair in range(8):
-        if p.enabled[pair] == 1 and gap_and_rate(p, state, pair)[0] > p.half_cavity:
-            return False
-    return True
+        if p.enabled[pair] == 1:
+            deepest = max(deepest, gap_and_rate(p, state, pair)[0])
+    return deepest <= p.half_cavity
