@@ -1,5 +1,7 @@
 """Digital twin of a mechanism with clearance: the coal plough's head in its guide."""
 
+from plow_twin.ensemble import Ensemble as Ensemble
+from plow_twin.ensemble import simulate_many as simulate_many
 from plow_twin.errors import PlowTwinError as PlowTwinError
 from plow_twin.errors import Problem as Problem
 from plow_twin.errors import RecordingError as RecordingError

@@ -19,11 +19,13 @@ from plow_twin.solve.layout import (
     COEFFICIENTS,
     EVENTS,
     STEPS,
+    T0,
     TOTALS,
     Log,
     State,
     Status,
     Totals,
+    Work,
     new_log,
     new_record,
     new_work,
@@ -36,7 +38,8 @@ Array = NDArray[np.float64]
 EVENT_DTYPE: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
 _FIRST_LOG = 4096
 _ROWS_BY_DEFAULT = 1000
-_BUDGET = 2**62
+#: Steps after which a run gives up with a named error: minutes of work.
+BUDGET: Final = 10**8
 
 
 @dataclass(frozen=True)
@@ -115,30 +118,36 @@ def simulate(
     """
     _check(t_end, output_dt, method, dt)
     compiled = compile_scene(scene, tol)
-    if output_dt is None:
-        output_dt = t_end / _ROWS_BY_DEFAULT if dt is None else dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
-    times = _grid(t_end, output_dt) if t_end > 0.0 else np.zeros(1)
+    if output_dt is None and dt is not None:
+        output_dt = dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
+    times = output_times(t_end, output_dt)
     begin = _time.perf_counter()
-    run = _run_events if method == "events" else _run_fixed
-    run(compiled, np.zeros(1), 0.0, method, dt)
+    _run(compiled, np.zeros(1), 0.0, method, dt)
     compile_s = _time.perf_counter() - begin
     begin = _time.perf_counter()
-    motion = run(compiled, times, t_end, method, dt)
+    motion = _run(compiled, times, t_end, method, dt)
     wall_s = _time.perf_counter() - begin
     return _result(scene, times, t_end, tol, method, dt, motion, wall_s, compile_s)
 
 
 @dataclass
-class _Motion:
-    """Arrays that a run fills."""
+class Motion:
+    """A run under way, and the arrays that it fills."""
 
     state: State
     totals: Totals
     log: Log
     q: Array
     v: Array
-    penetration: Array
-    force: Array
+    penetration: Array | None = None
+    force: Array | None = None
+
+    @staticmethod
+    def start(compiled: Compiled, q: Array, v: Array, outputs: bool = False) -> Motion:
+        """Start at the scene's initial state; rows go to q and v, shape (n, 3) each, pair outputs to new arrays."""
+        eight = (len(q), PAIR_COUNT)
+        pairs = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
+        return Motion(compiled.initial_state(), new_record(TOTALS), new_log(_FIRST_LOG), q, v, *pairs)
 
 
 def _check(t_end: float, output_dt: float | None, method: str, dt: float | None) -> None:
@@ -158,54 +167,58 @@ def _check(t_end: float, output_dt: float | None, method: str, dt: float | None)
         raise ValueError(f"output_dt: got {output_dt!r}, expected a whole multiple of dt = {dt!r} [s]")
 
 
-def _grid(t_end: float, output_dt: float) -> Array:
-    """Return 0, output_dt, .. and t_end."""
+def output_times(t_end: float, output_dt: float | None) -> Array:
+    """Return 0, output_dt, .. and t_end; a thousand rows without `output_dt`."""
+    if t_end == 0.0:
+        return np.zeros(1)
+    if output_dt is None:
+        output_dt = t_end / _ROWS_BY_DEFAULT
     count = int(np.floor(t_end / output_dt * (1.0 + 1e-12)))
-    times = np.arange(count + 1) * output_dt
-    times = np.minimum(times, t_end)
+    times: Array = np.minimum(np.arange(count + 1) * output_dt, t_end)
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-def _new_motion(compiled: Compiled, rows: int) -> _Motion:
-    three, eight = (rows, 3), (rows, PAIR_COUNT)
-    return _Motion(
-        compiled.initial_state(), new_record(TOTALS), new_log(_FIRST_LOG),
-        np.zeros(three), np.zeros(three), np.zeros(eight), np.zeros(eight),
-    )  # fmt: skip
+def _run(compiled: Compiled, times: Array, t_end: float, method: Method, dt: float | None) -> Motion:
+    motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)), outputs=True)
+    if dt is None:
+        code, _ = run_events(compiled, motion, times, t_end, new_work(), BUDGET)
+        time = float(motion.state.clock[T0])
+    else:
+        stride = round(float(times[1]) / dt) if len(times) > 1 else 1
+        code, time = _run_fixed(compiled, motion, (len(times) - 1) * stride, stride, dt, method == "euler")
+    if code != Status.OK:
+        raise SolverError(f"at t = {time:.9g} s: {Status(code).text}")
+    return motion
 
 
-def _run_events(compiled: Compiled, times: Array, t_end: float, method: str, dt: float | None) -> _Motion:
-    del method, dt
-    motion = _new_motion(compiled, len(times))
-    work, first = new_work(), np.zeros(1, np.int64)
+def run_events(
+    compiled: Compiled, motion: Motion, times: Array, t_end: float, work: Work, budget: int
+) -> tuple[int, int]:
+    """Bring a motion to `t_end` by the event-located series; return its `Status` and the number of rows written."""
+    first = np.zeros(1, np.int64)
     while True:
         code = drive.record(
-            compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, _BUDGET, first,
+            compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, budget, first,
             times, motion.q, motion.v, motion.penetration, motion.force,
         )  # fmt: skip
         if code != Status.LOG_FULL:
-            break
+            return code, int(first[0])
         motion.log = _grown(motion.log)
-    _raise_for(code, motion.state)
-    return motion
 
 
-def _run_fixed(compiled: Compiled, times: Array, t_end: float, method: str, dt: float | None) -> _Motion:
-    assert dt is not None
-    stride = round(float(times[1]) / dt) if len(times) > 1 else 1
-    steps = (len(times) - 1) * stride
-    motion = _new_motion(compiled, len(times))
+def _run_fixed(
+    compiled: Compiled, motion: Motion, steps: int, stride: int, dt: float, euler: bool
+) -> tuple[int, float]:
+    """Bring a motion through `steps` fixed steps; return its `Status` and the time reached."""
     done = np.zeros(1, np.int64)
     while True:
         code = fixed.march(
-            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, method ==
-            "euler", stride, motion.q, motion.v, motion.penetration, motion.force,
+            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, euler, stride,
+            motion.q, motion.v, motion.penetration, motion.force,
         )  # fmt: skip
         if code != Status.LOG_FULL:
-            break
+            return code, float(done[0]) * dt
         motion.log = _grown(motion.log)
-    _raise_for(code, motion.state, float(done[0]) * dt)
-    return motion
 
 
 def _grown(log: Log) -> Log:
@@ -216,12 +229,6 @@ def _grown(log: Log) -> Log:
     return larger
 
 
-def _raise_for(code: int, state: State, time: float | None = None) -> None:
-    status = Status(code)
-    if status is not Status.OK:
-        raise SolverError(f"at t = {state.clock[0] if time is None else time:.9g} s: {status.text}")
-
-
 def _result(
     scene: Scene,
     times: Array,
@@ -229,11 +236,12 @@ def _result(
     tol: float,
     method: str,
     dt: float | None,
-    motion: _Motion,
+    motion: Motion,
     wall_s: float,
     compile_s: float,
 ) -> Result:
     log, count = motion.log, motion.state.count
+    assert motion.force is not None and motion.penetration is not None
     size = int(log.length[0])
     events = np.zeros(size, EVENT_DTYPE)
     for name in EVENT_DTYPE.names or ():

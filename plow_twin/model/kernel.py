@@ -36,7 +36,7 @@ def kernel(*, fast: bool = False, inline: bool = False) -> Callable[[Callable[..
         options["inline"] = "always"
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        dispatcher = numba.njit(cache=True, error_model="numpy", **options)(function)
+        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
         cache_file = getattr(dispatcher._cache, "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST

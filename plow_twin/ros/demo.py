@@ -110,6 +110,8 @@ def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool
     node = [
         *("plow_twin.ros.main", "--ros-args"),
         *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
+        # the demo's own publisher is reliable: no sample is lost when the machine is busy
+        *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
         # the last sample is followed by the stop, not by the hold policy
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]

@@ -19,6 +19,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from numpy.typing import NDArray
+from rclpy.duration import Duration
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -126,6 +127,10 @@ class ExcitationPublisher(Node):
             self._send(stamp_ns, wrench)
         self._wait_for_answer(FIRST_STAMP_NS + (self.sent - 1) * self._plan.period_ns)
 
+    def flush(self) -> None:
+        """Wait until every reliable reader has what was sent."""
+        self._samples.wait_for_all_acked(Duration(nanoseconds=round(_STALL_S * NS_PER_S)))
+
     def _wait_for_answer(self, stamp_ns: int) -> None:
         give_up = time.monotonic() + _STALL_S
         while self._answered_ns < stamp_ns and not self._stop.stopped:
@@ -211,6 +216,7 @@ def _publish(node: ExcitationPublisher, options: argparse.Namespace) -> int:
         node.run_real()
     else:
         node.run_fast()
+    node.flush()
     report = {
         "sent": node.sent,
         "seconds": round(time.monotonic() - begin, 3),
