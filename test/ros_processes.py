@@ -19,10 +19,9 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import WrenchStamped
 from rclpy.context import Context
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from plow_twin.ros.messages import set_stamp
-from plow_twin.ros.qos import LATCHED
 
 with warnings.catch_warnings():
     # the wheels' parser of message definitions uses a deprecated module of the standard library
@@ -85,7 +84,9 @@ class Probe:
         self._executor.add_node(self.node)
         self.status: list[DiagnosticStatus] = []
         self.reports: list[dict[str, DiagnosticStatus]] = []
-        self.node.create_subscription(DiagnosticStatus, "status", self.status.append, LATCHED)
+        # deeper than the twin's own: what changes quickly is still seen
+        latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(DiagnosticStatus, "status", self.status.append, latched)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)
 
     def _report(self, message: DiagnosticArray) -> None:
@@ -140,6 +141,11 @@ class Probe:
             publisher.publish(message)
 
         return send
+
+    def pace(self, index: int) -> None:
+        """Rest after each 50 samples: best-effort readers drop what comes faster than they look."""
+        if index % 50 == 49:
+            self.pause(0.04)
 
     def pause(self, seconds: float) -> None:
         """Give discovery on the other side its time."""

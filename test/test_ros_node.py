@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import ReliabilityPolicy
 from ros_processes import ROOT, bench, value
@@ -35,6 +35,9 @@ MS = 1_000_000
 PAPER = load_scene(scene_path("paper"))
 WEAR = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
 
+#: On a busy machine a best-effort input may lose samples; where the test needs all of them it asks for them.
+RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
+
 
 def _scene_file(folder: Path, scene: Scene) -> Path:
     path = folder / "scene.yaml"
@@ -53,25 +56,25 @@ def _offline(scene: Scene, stamps: list[int], wrench: np.ndarray) -> AdvanceSeri
 
 def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path: Path) -> None:
     scene = replace(PAPER, wear=WEAR)
-    with bench(tmp_path, scene=_scene_file(tmp_path, scene), expected_rate=1000.0, excitation_timeout=60.0) as running:
+    settings = {"expected_rate": 1000.0, "excitation_timeout": 60.0, **RELIABLE_INPUT}
+    with bench(tmp_path, scene=_scene_file(tmp_path, scene), **settings) as running:
         probe = running.probe
         forces, peaks = probe.listen(JointState, "contact_forces"), probe.listen(JointState, "contact_peaks")
         heads, clearances = probe.listen(Odometry, "head_state"), probe.listen(JointState, "clearance")
         publisher = running.publisher("--seconds", "2")
-        samples = probe.listen(WrenchStamped, "excitation")
         probe.until(lambda: not publisher.running, "the end of the publisher", 100.0)
         assert publisher.wait() == 0, publisher.output()
         assert json.loads(publisher.output().splitlines()[-1])["sent"] == 2000
-        probe.until(lambda: len(samples) == 2000 and len(heads) >= 2000, "all messages")
+        for name, heard in (("forces", forces), ("peaks", peaks), ("heads", heads)):
+            probe.until(lambda heard=heard: len(heard) == 2000, f"2000 {name}")
         figures = probe.figures("input")
         assert (figures["samples_used"], figures["samples_missing"]) == ("2000", "0")
 
-    stamps = [stamp_ns(message.header) for message in samples]
+    stamps = [stamp_ns(message.header) for message in forces]
     assert (np.diff(stamps) == MS).all()
-    wrench = np.array([(m.wrench.force.x, m.wrench.force.y, m.wrench.torque.z) for m in samples])
-    assert (wrench == compile_loads(scene.loads).at(np.arange(2000) * 1e-3)).all()
+    # what the publisher samples: the scene's loads on the grid
+    wrench = compile_loads(scene.loads).at(np.arange(2000) * 1e-3)
     series = _offline(scene, stamps, wrench)
-    assert [stamp_ns(message.header) for message in forces[:2000]] == stamps
     assert tuple(forces[0].name) == PAIR_NAMES == tuple(peaks[0].name)
     for messages, names in (
         (forces, ("penetration", "rate", "force")),
@@ -79,8 +82,8 @@ def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path:
     ):
         for quantity, name in zip(("position", "velocity", "effort"), names, strict=True):
             expected = np.cumsum(series.makes, axis=0) if name is None else getattr(series, name)
-            assert (_column(messages[:2000], quantity) == expected).all(), quantity
-    poses = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in heads[:2000]])
+            assert (_column(messages, quantity) == expected).all(), quantity
+    poses = np.array([(m.pose.pose.position.x, m.pose.pose.position.y) for m in heads])
     assert (poses == series.q[:, :2]).all()
     assert series.makes.sum() > 0 and series.force.max() > 1e5
 
@@ -95,13 +98,14 @@ def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path:
 
 def test_a_fixed_rate_loses_no_impact(tmp_path: Path) -> None:
     wrench = compile_loads(PAPER.loads).at(np.arange(1500) * 1e-3)
-    with bench(tmp_path, publish_mode="fixed_rate", publish_rate=20.0, excitation_timeout=60.0) as running:
+    with bench(
+        tmp_path, publish_mode="fixed_rate", publish_rate=20.0, excitation_timeout=60.0, **RELIABLE_INPUT
+    ) as running:
         peaks = running.probe.listen(JointState, "contact_peaks")
         send = running.probe.excitation()
         for index, row in enumerate(wrench.tolist()):
             send(T0 + index * MS, row)
-            if index % 30 == 29:
-                running.probe.pause(0.03)
+            running.probe.pace(index)
         running.probe.until(lambda: peaks and stamp_ns(peaks[-1].header) == T0 + 1499 * MS, "the last frame")
     series = _offline(PAPER, [T0 + index * MS for index in range(1500)], wrench)
     assert len(peaks) < 300
@@ -148,18 +152,21 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
 
 
 def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> None:
-    with bench(tmp_path, excitation_timeout=60.0, failure_limit=2) as running:
+    with bench(tmp_path, excitation_timeout=60.0, failure_limit=3) as running:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
         send = probe.excitation()
         send(T0, (0.0, 0.0, 0.0))
         for index in (1, 2):
             send(T0 + index * MS, (1e200, 1e200, 1e200))
-        probe.until(lambda: any(status.level == b"\x02" for status in probe.status), "status ERROR")
+        probe.until(lambda: probe.status[-1].level == b"\x02", "status ERROR")
+        assert value(probe.status[-1], "stream") == "failed"
         probe.until_figure("state", "solver_failures", "2")
+        send(T0 + 3 * MS, (1e200, 1e200, 1e200))
         probe.until_figure("state", "resets", "1")
         send(T0 + 5 * MS, (0.0, 0.0, 0.0))
         probe.until(lambda: len(forces) == 2, "recovery")
+        probe.until(lambda: probe.status[-1].level == b"\x00", "status OK")
     assert [stamp_ns(message.header) - T0 for message in forces] == [0, 5 * MS]
 
 
@@ -249,12 +256,13 @@ def test_diagnostics_go_on_without_a_clock_and_hold_every_documented_key(tmp_pat
 
 
 def test_reset_restores_the_initial_state(tmp_path: Path) -> None:
-    with bench(tmp_path, excitation_timeout=60.0) as running:
+    with bench(tmp_path, excitation_timeout=60.0, **RELIABLE_INPUT) as running:
         probe = running.probe
         heads = probe.listen(Odometry, "head_state")
         send = probe.excitation()
         for index in range(300):
             send(T0 + index * MS, (30e3, 0.0, -40e3))
+            probe.pace(index)
         probe.until(lambda: len(heads) == 300, "300 answers")
         answer = probe.call(Trigger, f"{running.namespace}/plow_twin/reset", Trigger.Request())
         assert answer.success, answer.message
@@ -267,7 +275,7 @@ def test_reset_restores_the_initial_state(tmp_path: Path) -> None:
 
 def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -> None:
     scene = _scene_file(tmp_path, replace(PAPER, wear=WEAR))
-    with bench(tmp_path, scene=scene, excitation_timeout=60.0) as running:
+    with bench(tmp_path, scene=scene, excitation_timeout=60.0, **RELIABLE_INPUT) as running:
         probe = running.probe
         clearances, rates = probe.listen(JointState, "clearance"), probe.listen(JointState, "wear_rate")
         send = probe.excitation()
@@ -277,6 +285,7 @@ def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -
         probe.pause(0.3)
         for index in range(1000):
             send(T0 + index * MS, (32e3, 0.0, -45e3))
+            probe.pace(index)
         probe.until(lambda: clearances and stamp_ns(clearances[-1].header) == T0 + 900 * MS, "a second of wear")
         stopped, measured = TwistStamped(), PoseStamped()
         for message in (stopped, measured):
@@ -288,6 +297,7 @@ def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -
         probe.until_figure("input", "travel_used", "1")
         for index in range(1000, 1301):
             send(T0 + index * MS, (32e3, 0.0, -45e3))
+            probe.pace(index)
         probe.until(lambda: stamp_ns(clearances[-1].header) == T0 + 1300 * MS, "the time after it")
         figures = probe.figures("input")
     assert max(rates[-4].velocity) > 0.0
@@ -301,7 +311,8 @@ def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -
 def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
     scale = np.sin(np.linspace(0.0, 1.5, 200))
     amplitudes = {load.name: float(np.hypot(*load.force_n)) for load in PAPER.loads}
-    with bench(tmp_path, excitation_source="tool_forces", excitation_timeout=60.0) as running:
+    reliable = {"qos_overrides.{ns}/tool_forces.subscription.reliability": "reliable"}
+    with bench(tmp_path, excitation_source="tool_forces", excitation_timeout=60.0, **reliable) as running:
         probe = running.probe
         heads = probe.listen(Odometry, "head_state")
         publisher = probe.node.create_publisher(JointState, "tool_forces", 1000)
@@ -313,6 +324,7 @@ def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
             message = JointState(name=names, effort=[amplitudes[name] * share for name in names])
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(T0 + index * MS, 1_000_000_000)
             publisher.publish(message)
+            probe.pace(index)
         publisher.publish(JointState(name=["fx1", "unknown"], effort=[1.0, 2.0]))
         probe.until(lambda: len(heads) == 200, "200 answers")
         probe.until_figure("input", "dropped_malformed", "1")
