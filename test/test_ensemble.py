@@ -6,9 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scenes import preset
 
 from plow_twin import Clearance, Scene, Status, simulate, simulate_many
-from scenes import preset
 
 
 def members() -> list[Scene]:
