@@ -95,8 +95,8 @@ def settle_modes(p, state) -> None:
 def _guards(p, state, w, order, penetrating, viscous) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 where the law is viscous, else d >= 0 (or a small depth); others: d
-    >= 0.
+    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 where the law is viscous, else d >= 0 or a small depth;
+    others: d >= 0.
     """
     gap, rate, guard, lanes = w.gap, w.rate, w.guard, w.lanes
     for lane in range(8):
@@ -206,8 +206,7 @@ def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fracti
 
 @kernel()
 def _accurate_length(p, w, order, hard):
-    """Return the sigma over which the series meets the step's share of the tolerance, at most `hard`; NaN if not
-    finite.
+    """Return the sigma over which the series meets its share of the tolerance, at most `hard`; NaN if not finite.
 
     Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
     test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are looked at, since single ones can vanish.
@@ -245,23 +244,36 @@ def _linear_load(segments, step, t0, w):
 
 
 @kernel()
+def _weigh_pairs(p, state, w, viscous, fraction) -> bool:
+    """Write what each pair that acts contributes per order to `w.lanes`; return whether any pair penetrates."""
+    mode, lanes = state.mode, w.lanes
+    inside = 0
+    for pair in range(8):
+        lanes[BASE, pair] = 0.0
+        if fraction is not None and mode[pair] == ON and state.step[TOUCHING] >> pair & 1 == 0:
+            depth = gap_and_rate(p, state, pair)[0]
+            if depth > 1e-3 * p.release:
+                lanes[BASE, pair] = 1.0 / depth
+            else:
+                # interrupted right after its touch: too shallow for a series of its power
+                mode[pair] = RELEASED
+        acts = mode[pair] == ON
+        lanes[ACTS, pair] = p.stiffness if acts else 0.0
+        lanes[DAMPS, pair] = 0.0
+        if acts:
+            lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
+        inside += 0 if mode[pair] == OFF else 1
+    return inside > 0
+
+
+@kernel()
 def begin(
     p, state, w, hard_time, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
 ) -> bool:
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
-    clock, step, mode = state.clock, state.step, state.mode
+    clock, step = state.clock, state.step
     t0 = clock[T0]
-    inside = 0
-    for pair in range(8):
-        inside += 0 if mode[pair] == OFF else 1
-        w.lanes[ACTS, pair] = p.stiffness if mode[pair] == ON else 0.0
-        w.lanes[DAMPS, pair] = 0.0
-        w.lanes[BASE, pair] = 0.0
-        if mode[pair] == ON:
-            if fraction is not None and step[TOUCHING] >> pair & 1 == 0:
-                w.lanes[BASE, pair] = 1.0 / gap_and_rate(p, state, pair)[0]
-            w.lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
-    penetrating = inside > 0
+    penetrating = _weigh_pairs(p, state, w, viscous, fraction)
     for j in range(3):
         w.wrench[0, j] = p.constant[j]
     if segments is not None:
