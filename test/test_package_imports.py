@@ -12,7 +12,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
-CORE = {"errors", "model", "solve", "twin", "simulate"}
+CORE = {"errors", "model", "solve", "twin", "simulate", "ensemble"}
 #: For each room of the package, the rooms it may import.
 ROOMS = {
     "errors": set(),
@@ -21,13 +21,13 @@ ROOMS = {
     "solve": {"errors", "model"},
     "twin": {"errors", "model", "solve"},
     "simulate": {"errors", "model", "solve"},
+    "ensemble": {"errors", "model", "solve", "simulate"},
     "scene_file": {"errors", "model"},
     "stream": CORE,
     "record": CORE | {"scene_file", "stream"},
     "view": CORE | {"scene_file", "stream", "record"},
-    "study": CORE | {"scene_file", "presets"},
     "ros": CORE | {"scene_file", "presets", "stream", "record", "view"},
-    "cli": CORE | {"scene_file", "presets", "stream", "record", "view", "study", "ros"},
+    "cli": CORE | {"scene_file", "presets", "stream", "record", "view", "ros"},
     "__init__": CORE,
     "__main__": {"cli"},
 }
@@ -38,10 +38,10 @@ LIBRARIES = {
     "solve": {"scipy", "numba"},
     "twin": {"scipy", "numba"},
     "simulate": {"scipy", "numba"},
+    "ensemble": set(),
     "scene_file": {"yaml", "jsonschema"},
     "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite"},
     "view": {"rerun"},
-    "study": {"scipy", "numba"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", "rich", *MESSAGES},
     "cli": {"click", "rich"},
 }

@@ -10,7 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import IO, Any, Final
@@ -21,7 +21,10 @@ from rich.table import Table
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, corner_of
+from plow_twin.model.scene import Mark, Provenance, Wear
+from plow_twin.presets import scene_path
 from plow_twin.ros.run_summary import SENSES, RunSummary, corner_letters, summarise
+from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
 #: Compiling the solver for the first time takes some 20 s on a small machine [s].
@@ -105,10 +108,21 @@ def _set_environment(folder: Path) -> None:
     os.environ.setdefault("ROS_LOG_DIR", str((folder / "log").resolve()))
 
 
+def _worn_scene(folder: Path) -> Path:
+    """Write the paper's scene with wear switched on, so that the demo shows clearance growing."""
+    wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
+    assumed = Provenance(Mark.ASSUMED, "hard steel guide in coal dust, 1e-15 .. 1e-13 m^2/N; not in the paper")
+    paper = load_scene(scene_path("paper"))
+    path = (folder / "scene.yaml").resolve()
+    scene = replace(paper, wear=wear, marks={**paper.marks, "wear.coefficient_m2_n": assumed})
+    path.write_text(dump_scene(scene), encoding="utf-8")
+    return path
+
+
 def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool) -> tuple[Watch, int]:
     """Run both processes to their end; return the node's last figures and the number of samples sent."""
     node = [
-        *("plow_twin.ros.main", "--ros-args"),
+        *("plow_twin.ros.main", "--ros-args", "-p", f"scene:={_worn_scene(folder)}"),
         *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
         # the demo's own publisher is reliable: no sample is lost when the machine is busy
         *("-p", "qos_overrides./excitation.subscription.reliability:=reliable"),
@@ -270,10 +284,10 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
         sets = "  ".join(f"{corners} {share:.1%}" for corners, share in shares.items() if share >= 0.001)
         console.print(f"contact sets {sense}: {sets or 'none'}", highlight=False, soft_wrap=True)
     for name, (value, low, high) in summary.clearance.items():
-        interval = f"prior {low * 1e3:.4f} .. {high * 1e3:.4f} mm"
-        console.print(f"{name} clearance {value * 1e3:.4f} mm ({interval})", highlight=False)
+        interval = f"prior {low * 1e3:.6f} .. {high * 1e3:.6f} mm"
+        console.print(f"{name} clearance {value * 1e3:.6f} mm ({interval})", highlight=False)
     wear = (
-        "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e6:.4f} um, deepest pad"
+        "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e9:.3f} nm, deepest pad"
     )
     console.print(f"wear {wear}", highlight=False)
     used, out = watch.text("input", "samples_used"), watch.text("output", "published")
@@ -292,7 +306,7 @@ def _force_table(summary: RunSummary) -> Table:
     table.add_column("corner", no_wrap=True)
     for sense in SENSES:
         for column in ("max", "mean", "touches"):
-            table.add_column(f"{sense} {column}", justify="right", no_wrap=True)
+            table.add_column(f"{sense}\n{column}", justify="right", no_wrap=True)
     for corner in CORNER_NAMES:
         pairs = [pair for pair in range(PAIR_COUNT) if corner_of(pair) == corner]
         cells = []
