@@ -13,7 +13,6 @@ import pytest
 from ros_processes import ROOT
 
 from plow_twin.model.loads import compile_loads
-from plow_twin.presets import scene_path
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.ros.run_summary import summarise
 from plow_twin.scene_file import load_scene
@@ -32,7 +31,8 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     for line in (
         "samples sent 3000, used 3000, frames out 3000, lost 0",
         "contact sets ccw: ",
-        "horizontal clearance 25.0000 mm",
+        "horizontal clearance 25.000",
+        " nm, deepest pad",
         "real-time factor ",
         "plow-twin replay ",
         "rerun ",
@@ -47,7 +47,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     assert "Traceback" not in (folder / "node.log").read_text()
 
     # the summary against the twin itself
-    scene = load_scene(scene_path("paper"))
+    scene = load_scene(folder / "scene.yaml")
     times = np.arange(3000) * 1e-3
     series = Twin(scene, excitation="sampled").advance_samples(times, compile_loads(scene.loads).at(times))
     summary = summarise(folder / "run")
@@ -56,6 +56,9 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     in_contact = (series.impulse > 0.0).sum(axis=0) * 1e-3
     mean = np.divide(series.impulse.sum(axis=0), in_contact, out=np.zeros(8), where=in_contact > 0.0)
     np.testing.assert_allclose(summary.mean_in_contact, mean, rtol=1e-3)
+    np.testing.assert_allclose(summary.wear_depth, series.wear_depth[-1], rtol=0.05)
+    horizontal, low, high = summary.clearance["horizontal"]
+    assert 0.025 < low < horizontal < high
     for shares in summary.contact_sets.values():
         assert sum(shares.values()) == pytest.approx(1.0)
 
