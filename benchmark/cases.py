@@ -1,0 +1,151 @@
+"""What is measured: cases, interleaved timing, rows of the table."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from native import NotInstalled
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One run: seconds taken, poses (rows, 3) or None, and what was counted."""
+
+    wall_s: float
+    q: Array | None = None
+    steps: int | None = None
+    evaluations: int | None = None
+    events: int | None = None
+
+
+@dataclass
+class Row:
+    """One line of the table; times in ms, median and smallest of `runs` runs. Empty cells do not apply."""
+
+    section: str
+    scene: str
+    solver: str
+    setting: str
+    output_s: float | None = None
+    simulated_s: float | None = None
+    wall_ms: float | None = None
+    wall_min_ms: float | None = None
+    runs: int = 0
+    error: float | None = None
+    steps: int | None = None
+    evaluations: int | None = None
+    events: int | None = None
+    value: float | None = None
+    status: str = "ok"
+
+
+@dataclass
+class Case:
+    """A row to be measured: `prepare` builds (and compiles) and returns the function to be timed by itself."""
+
+    row: Row
+    prepare: Callable[[], Callable[[], Sample]]
+    error: Callable[[Array], float] | None = None
+    samples: list[Sample] = field(default_factory=list)
+
+
+#: A case stops being repeated once its runs have taken this long together.
+TIME_PER_CASE_S = 3.0
+
+
+def measure(cases: Sequence[Case], repeats: int, advance: Callable[[str], None]) -> list[Row]:
+    """Run all cases in turn, `repeats` rounds, so that a change of the machine's speed meets all of them alike."""
+    ready: list[tuple[Case, Callable[[], Sample]]] = []
+    for case in cases:
+        advance(f"{case.row.solver} {case.row.setting}")
+        try:
+            run = case.prepare()
+            first = run()
+        except Exception as problem:
+            case.row.status = f"not run: {problem}" if isinstance(problem, NotInstalled | ImportError) else f"failed: {problem}"
+            continue
+        if case.error is not None and first.q is not None:
+            case.row.error = case.error(first.q)
+        case.samples = [first] if first.wall_s > TIME_PER_CASE_S else []
+        ready.append((case, run))
+    for _ in range(repeats):
+        for case, run in ready:
+            if sum(sample.wall_s for sample in case.samples) < TIME_PER_CASE_S:
+                case.samples.append(run())
+    for case, _ in ready:
+        _summarise(case)
+    return [case.row for case in cases]
+
+
+def _summarise(case: Case) -> None:
+    walls, row, last = [1e3 * sample.wall_s for sample in case.samples], case.row, case.samples[-1]
+    row.wall_ms, row.wall_min_ms, row.runs = median(walls), min(walls), len(walls)
+    row.steps, row.evaluations, row.events = last.steps, last.evaluations, last.events
+
+
+def timed(function: Callable[[], Any]) -> tuple[float, Any]:
+    """Return the seconds a call took, and its result."""
+    begin = time.perf_counter()
+    result = function()
+    return time.perf_counter() - begin, result
+
+
+def pose_error(reference: Array, scale: Sequence[float]) -> Callable[[Array], float]:
+    """Return the measure of error: largest |q - reference| over `scale` (3,), infinite when not comparable."""
+
+    def error(q: Array) -> float:
+        if q.shape != reference.shape or not np.isfinite(q).all():
+            return float("inf")
+        return float((np.abs(q - reference) / np.asarray(scale)).max())
+
+    return error
+
+
+def write_csv(path: Path, rows: Iterable[Row]) -> None:
+    """Write the table, numbers with six digits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        names = [spec.name for spec in fields(Row)]
+        writer.writerow(names)
+        for row in rows:
+            writer.writerow([_text(getattr(row, name)) for name in names])
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """Read a table as dictionaries of texts."""
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def machine_name() -> str:
+    """Return a name made of the CPU's model and the number of cores, nothing else of the machine."""
+    facts: dict[str, str] = {}
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines():
+            key, _, value = line.partition(":")
+            facts[key.strip()] = value.strip()
+    except OSError:
+        pass
+    name = facts.get("model name", "unknown cpu")
+    # virtual machines often hide the model's number
+    known = name if re.search(r"\d", name) else f"{name} f{facts.get('cpu family', 0)}m{facts.get('model', 0)}"
+    return re.sub(r"[^a-z0-9]+", "_", f"{known} {os.cpu_count()}core".lower()).strip("_")

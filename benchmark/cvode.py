@@ -1,0 +1,50 @@
+"""CVODE called from C: `cvode_bench.c` as a process that times itself."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from bench_scenes import T_END
+from cases import Array, Sample
+from native import NotInstalled, compile_c
+
+_LIBRARIES = [
+    *(f"-lsundials_{part}" for part in ("cvode", "nvecserial", "sunmatrixdense", "sunlinsoldense", "sunnonlinsolfixedpoint")),
+    "-lm",
+]
+
+
+def program() -> str:
+    """Return the compiled program, or raise `NotInstalled`."""
+    try:
+        return compile_c("cvode_bench.c", _LIBRARIES)
+    except NotInstalled as problem:
+        raise NotInstalled(f"SUNDIALS' CVODE library (Debian libsundials-dev): {problem}") from None
+
+
+def version() -> str:
+    """Return the version of SUNDIALS that the program was compiled with."""
+    return subprocess.run([program(), "--version"], capture_output=True, text=True, check=True).stdout.strip()
+
+
+def prepare(p: Array, law: str, method: str, roots: bool, rtol: float, output_dt: float) -> Callable[[], Sample]:
+    """Prepare one setting; each call starts the process for one warm-up run and one that counts."""
+    executable = program()
+    numbers = " ".join(repr(float(number)) for number in p)
+
+    def run() -> Sample:
+        with TemporaryDirectory() as folder:
+            poses = Path(folder) / "poses"
+            setting = [law, method, str(int(roots)), repr(rtol), repr(T_END), repr(output_dt), "2", str(poses)]
+            done = subprocess.run([executable, *setting], input=numbers, capture_output=True, text=True)
+            if done.returncode != 0:
+                raise RuntimeError(done.stderr.strip() or f"exit code {done.returncode}")
+            lines = done.stdout.split("\n")
+            steps, evaluations, events = (int(word) for word in lines[2].split())
+            return Sample(min(map(float, lines[:2])), np.fromfile(poses).reshape(-1, 3), steps, evaluations, events)
+
+    return run

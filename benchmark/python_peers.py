@@ -1,0 +1,86 @@
+"""Peers called from Python: SciPy's solvers and scikit-sundae's CVODE, all with the jitted right-hand side of `lean`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+from bench_scenes import T_END
+from cases import Array, Sample, timed
+from lean import rhs_into
+
+#: Poses are about 1e-2, velocities about 1: absolute tolerances relative to rtol.
+_ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
+
+
+def _grid(output_dt: float) -> Array:
+    return np.arange(round(T_END / output_dt) + 1) * output_dt
+
+
+def prepare_solve_ivp(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
+    """Prepare `scipy.integrate.solve_ivp`; the step is held below the free flights, lest one steps over a contact."""
+    from scipy.integrate import solve_ivp
+
+    grid = _grid(output_dt)
+
+    def rhs(t: float, y: Array) -> Array:
+        out = np.empty(6)
+        rhs_into(t, y, out, p)
+        return out
+
+    rhs(0.0, np.zeros(6))
+
+    def run() -> Sample:
+        solve = partial(solve_ivp, rhs, (0.0, T_END), np.zeros(6), method, grid, rtol=rtol, atol=rtol * _ATOL)
+        wall, result = timed(solve)
+        if not result.success:
+            raise RuntimeError(result.message)
+        return Sample(wall, result.y[:3].T, None, result.nfev)
+
+    return run
+
+
+def prepare_odeint(p: Array, rtol: float, output_dt: float) -> Callable[[], Sample]:
+    """Prepare LSODA through `scipy.integrate.odeint`, whose loop is compiled."""
+    from scipy.integrate import odeint
+
+    grid = _grid(output_dt)
+
+    def rhs(t: float, y: Array) -> Array:
+        out = np.empty(6)
+        rhs_into(t, y, out, p)
+        return out
+
+    rhs(0.0, np.zeros(6))
+
+    def run() -> Sample:
+        wall, (y, info) = timed(
+            partial(odeint, rhs, np.zeros(6), grid, rtol=rtol, atol=rtol * _ATOL, mxstep=10**7, tfirst=True, full_output=True)
+        )
+        if info["message"] != "Integration successful.":
+            raise RuntimeError(info["message"])
+        return Sample(wall, y[:, :3], int(info["nst"][-1]), int(info["nfe"][-1]))
+
+    return run
+
+
+def prepare_sundae(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
+    """Prepare CVODE through scikit-sundae."""
+    from sksundae.cvode import CVODE
+
+    grid = _grid(output_dt)
+
+    def rhs(t: float, y: Array, out: Array) -> None:
+        rhs_into(t, y, out, p)
+
+    rhs(0.0, np.zeros(6), np.zeros(6))
+    solver = CVODE(rhs, method=method, rtol=rtol, atol=rtol * _ATOL, max_num_steps=10**8)
+
+    def run() -> Sample:
+        wall, result = timed(lambda: solver.solve(grid, np.zeros(6)))
+        if len(result.y) != len(grid):
+            raise RuntimeError(str(result.message))
+        return Sample(wall, result.y[:, :3], None, int(result.nfev))
+
+    return run
