@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import struct
+import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +138,13 @@ def test_after_a_damaged_chunk_nothing_is_claimed(run: Run, tmp_path: Path) -> N
 
 
 def test_replay_goes_on_from_the_snapshot_after_a_loss(tmp_path: Path) -> None:
-    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), queue_size=150, pause_every=400)
+    def rush_then_walk() -> Iterator[Sample]:
+        for index in range(COUNT):
+            if index > COUNT // 2 and index % 10 == 0:
+                time.sleep(0.03)  # the queue empties: from here on the recording is whole
+            yield paper_sample(index)
+
+    run = record_run(tmp_path / "run", rush_then_walk(), queue_size=150, pause_every=0)
     assert run.loss.closed and run.loss.lost["journal"] > 0
     report = replay(run.folder)
     assert (report.exit_code, report.divergences) == (3, 0)
