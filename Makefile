@@ -1,6 +1,6 @@
 # Needs Python 3.11 or 3.12, make and nothing else; everything goes into $(VENV).
 .DELETE_ON_ERROR:
-.PHONY: demo test stress lint clean
+.PHONY: demo test stress lint bench clean
 
 SUPPORTED := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
@@ -13,6 +13,7 @@ INSTALLED := $(VENV)/.installed
 SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
+BENCH_ARGS ?=
 
 demo: $(INSTALLED)
 	"$(VENV)/bin/plow-twin" demo --speed $(SPEED) --out "$(OUT)"
@@ -26,6 +27,11 @@ stress: $(INSTALLED)
 lint: $(INSTALLED)
 	"$(VENV)/bin/ruff" check .
 	"$(VENV)/bin/mypy"
+
+# the peers come on top; one that cannot be installed here is named as not run
+bench: $(INSTALLED)
+	"$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt -e ".[bench]"
+	"$(VENV)/bin/python" benchmark/run.py $(BENCH_ARGS)
 
 $(INSTALLED): setup.py setup.cfg package.xml pyproject.toml requirements/constraints.txt
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or 3.12 with venv on PATH; name one: make PYTHON=/path/to/python" >&2; exit 1; }

@@ -16,6 +16,7 @@ EXTRAS = {
     ],
     "record": ["mcap>=1.3", "rosbags>=0.11"],
     "view": ["rerun-sdk>=0.41"],
+    "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9"],
     "test": ["pytest>=8", "pytest-timeout", "hypothesis"],
 }
 EXTRAS["dev"] = [

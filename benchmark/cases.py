@@ -47,7 +47,10 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
+    #: what the section is about: members beyond the listed error, times real time, error in tolerances
     value: float | None = None
+    #: growth of a small displacement at t = 0 (random scenes)
+    amplification: float | None = None
     status: str = "ok"
 
 
@@ -62,7 +65,7 @@ class Case:
 
 
 #: A case stops being repeated once its runs have taken this long together.
-TIME_PER_CASE_S = 3.0
+TIME_PER_CASE_S = 2.0
 
 
 def measure(cases: Sequence[Case], repeats: int, advance: Callable[[str], None]) -> list[Row]:
@@ -74,7 +77,9 @@ def measure(cases: Sequence[Case], repeats: int, advance: Callable[[str], None])
             run = case.prepare()
             first = run()
         except Exception as problem:
-            case.row.status = f"not run: {problem}" if isinstance(problem, NotInstalled | ImportError) else f"failed: {problem}"
+            case.row.status = (
+                f"not run: {problem}" if isinstance(problem, NotInstalled | ImportError) else f"failed: {problem}"
+            )
             continue
         if case.error is not None and first.q is not None:
             case.row.error = case.error(first.q)

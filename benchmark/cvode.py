@@ -13,7 +13,10 @@ from cases import Array, Sample
 from native import NotInstalled, compile_c
 
 _LIBRARIES = [
-    *(f"-lsundials_{part}" for part in ("cvode", "nvecserial", "sunmatrixdense", "sunlinsoldense", "sunnonlinsolfixedpoint")),
+    *(
+        f"-lsundials_{part}"
+        for part in ("cvode", "nvecserial", "sunmatrixdense", "sunlinsoldense", "sunnonlinsolfixedpoint")
+    ),
     "-lm",
 ]
 

@@ -17,7 +17,6 @@ class NotInstalled(Exception):
     """Something that a peer needs is missing; the message says what."""
 
 
-
 def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAGS) -> str:
     """Compile `source` of this folder and return the path of the program.
 

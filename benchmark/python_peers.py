@@ -1,4 +1,4 @@
-"""Peers called from Python: SciPy's solvers and scikit-sundae's CVODE, all with the jitted right-hand side of `lean`."""
+"""Peers called from Python: SciPy's solvers and scikit-sundae's CVODE, with the jitted right-hand side of `lean`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def _grid(output_dt: float) -> Array:
 
 
 def prepare_solve_ivp(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare `scipy.integrate.solve_ivp`; the step is held below the free flights, lest one steps over a contact."""
+    """Prepare `scipy.integrate.solve_ivp`."""
     from scipy.integrate import solve_ivp
 
     grid = _grid(output_dt)
@@ -56,7 +56,17 @@ def prepare_odeint(p: Array, rtol: float, output_dt: float) -> Callable[[], Samp
 
     def run() -> Sample:
         wall, (y, info) = timed(
-            partial(odeint, rhs, np.zeros(6), grid, rtol=rtol, atol=rtol * _ATOL, mxstep=10**7, tfirst=True, full_output=True)
+            partial(
+                odeint,
+                rhs,
+                np.zeros(6),
+                grid,
+                rtol=rtol,
+                atol=rtol * _ATOL,
+                mxstep=10**7,
+                tfirst=True,
+                full_output=True,
+            )
         )
         if info["message"] != "Integration successful.":
             raise RuntimeError(info["message"])

@@ -24,8 +24,8 @@ DATA = HERE / "data" / "random_scenes.npz"
 COUNT, SEED = 200, 20150419
 T_END, OUTPUT_DT = 1.0, 0.02
 #: Settings (tolerance of a step, longest step in contact): two of each arithmetic, which must agree.
-LONG_DOUBLE = (1e-16, 0.7), (1e-15, 1.0)
-QUAD = (1e-21, 1.0), (1e-19, 0.8)
+LONG_DOUBLE = (1e-16, 0.3), (1e-15, 0.45)
+QUAD = (1e-21, 0.3), (1e-19, 0.45)
 #: Disagreement in clearances above which the pair is run again in 113-bit arithmetic.
 AGREED = 1e-11
 PERTURBATION = 1e-12
@@ -150,9 +150,15 @@ def reference_run(
     quad: bool = False,
 ) -> ReferenceRun:
     """Run the reference program on one scene, in 64-bit mantissa or (`quad`) 113-bit arithmetic."""
-    program = compile_c("reference.c", ["-lquadmath", "-lm"], (*FLAGS, "-DQUAD")) if quad else compile_c("reference.c", ["-lm"])
+    program = (
+        compile_c("reference.c", ["-lquadmath", "-lm"], (*FLAGS, "-DQUAD"))
+        if quad
+        else compile_c("reference.c", ["-lm"])
+    )
     line = reference_line(scene, t_end, output_dt).encode()
-    output = subprocess.run([program, *map(repr, setting), repr(perturbation)], input=line, capture_output=True, check=True)
+    output = subprocess.run(
+        [program, *map(repr, setting), repr(perturbation)], input=line, capture_output=True, check=True
+    )
     numbers = np.frombuffer(output.stdout)
     status, steps, evaluations, events, rows = (int(number) for number in numbers[:5])
     return ReferenceRun(numbers[5:].reshape(rows, 3), status == 0, steps, evaluations, events)
@@ -167,7 +173,9 @@ def make(progress: Callable[[], None] = lambda: None) -> None:
     def one(scene: Scene) -> tuple[NDArray[np.float64], float, float, int]:
         fine, coarse = (reference_run(scene, T_END, OUTPUT_DT, setting) for setting in LONG_DOUBLE)
         moved = reference_run(scene, T_END, OUTPUT_DT, LONG_DOUBLE[1], PERTURBATION)
-        amplification = distance(scene, moved.q, coarse.q) / PERTURBATION if moved.finished and coarse.finished else np.nan
+        amplification = (
+            distance(scene, moved.q, coarse.q) / PERTURBATION if moved.finished and coarse.finished else np.nan
+        )
         if not (fine.finished and coarse.finished) or distance(scene, coarse.q, fine.q) > AGREED:
             fine, coarse = (reference_run(scene, T_END, OUTPUT_DT, setting, quad=True) for setting in QUAD)
         progress()
