@@ -66,26 +66,8 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
 
 
 @kernel(fast=True)
-def _multiply(a, b, k, out) -> None:
-    """Write order k of the eight products of the columns of a and b to row k of `out`."""
-    t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
-    for j in range(k + 1):
-        i = k - j
-        t0 += a[j, 0] * b[i, 0]
-        t1 += a[j, 1] * b[i, 1]
-        t2 += a[j, 2] * b[i, 2]
-        t3 += a[j, 3] * b[i, 3]
-        t4 += a[j, 4] * b[i, 4]
-        t5 += a[j, 5] * b[i, 5]
-        t6 += a[j, 6] * b[i, 6]
-        t7 += a[j, 7] * b[i, 7]
-    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
-    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
-
-
-@kernel(fast=True)
 def _multiply_older(a, b, k, out) -> None:
-    """Write order k of the eight products without the two terms of order k itself to row k of `out`.
+    """Write order k of the eight products of the columns of a and b, without the two terms of order k itself, to `out`.
 
     These sums do not wait for the newest order, so that the processor can run them ahead.
     """
@@ -100,6 +82,23 @@ def _multiply_older(a, b, k, out) -> None:
         t5 += a[j, 5] * b[i, 5]
         t6 += a[j, 6] * b[i, 6]
         t7 += a[j, 7] * b[i, 7]
+    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
+    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
+
+
+@kernel(fast=True)
+def _multiply(a, b, k, out) -> None:
+    """Write order k of the eight products of the columns of a and b to row k of `out`."""
+    _multiply_older(a, b, k, out)
+    both = 0.0 if k == 0 else 1.0
+    t0 = out[k, 0] + a[0, 0] * b[k, 0] + both * a[k, 0] * b[0, 0]
+    t1 = out[k, 1] + a[0, 1] * b[k, 1] + both * a[k, 1] * b[0, 1]
+    t2 = out[k, 2] + a[0, 2] * b[k, 2] + both * a[k, 2] * b[0, 2]
+    t3 = out[k, 3] + a[0, 3] * b[k, 3] + both * a[k, 3] * b[0, 3]
+    t4 = out[k, 4] + a[0, 4] * b[k, 4] + both * a[k, 4] * b[0, 4]
+    t5 = out[k, 5] + a[0, 5] * b[k, 5] + both * a[k, 5] * b[0, 5]
+    t6 = out[k, 6] + a[0, 6] * b[k, 6] + both * a[k, 6] * b[0, 6]
+    t7 = out[k, 7] + a[0, 7] * b[k, 7] + both * a[k, 7] * b[0, 7]
     out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
     out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
 
@@ -193,6 +192,65 @@ def _hold(w, k, free, fx, fy):
 
 
 @kernel(fast=True)
+def _loads(p, w, k, c, s, c1, s1, c2, s2, alpha, beta, harmonics, second, segments):
+    """Return order k of the load per mass, turned into head axes, and of its moment per inertia.
+
+    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before.
+    """
+    load, product, right, start, slope = w.load, w.product, w.right, w.wrench[0], w.wrench[1]
+    fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
+    moment = start[2] if k == 0 else 0.0
+    if segments is not None:
+        # wrench start + slope t(sigma): its own series has the terms alpha slope and beta slope / 2
+        fx += alpha * (slope[0] * c1 + slope[1] * s1) + 0.5 * beta * (slope[0] * c2 + slope[1] * s2)
+        fy += alpha * (slope[1] * c1 - slope[0] * s1) + 0.5 * beta * (slope[1] * c2 - slope[0] * s2)
+        if k == 1:
+            moment += alpha * slope[2]
+        elif k == 2:
+            moment += 0.5 * beta * slope[2]
+    if harmonics is not None:
+        along_c = product[k, 6] + load[0, 0] * c
+        along_s = product[k, 7] + load[0, 0] * s
+        if k > 0:
+            along_c += load[0, k] * right[0, 6]
+            along_s += load[0, k] * right[0, 7]
+        fx += p.direction[0, 0] * along_c + p.direction[0, 1] * along_s
+        fy += p.direction[0, 1] * along_c - p.direction[0, 0] * along_s
+        moment += load[2, k]
+        if second is not None:
+            along_c = along_s = 0.0
+            for j in range(k + 1):
+                along_c += load[1, j] * right[k - j, 6]
+                along_s += load[1, j] * right[k - j, 7]
+            fx += p.direction[1, 0] * along_c + p.direction[1, 1] * along_s
+            fy += p.direction[1, 1] * along_c - p.direction[1, 0] * along_s
+    return fx, fy, moment
+
+
+@kernel(fast=True)
+def _resultant(p, w, k):
+    """Return order k of the sum of the contact forces in head axes, and of their moment about the centre of mass."""
+    rows, force, torque = p.gap, w.force, w.torque
+    _multiply(w.arm, force, k, torque)
+    push_x = push_y = moment = 0.0
+    for lane in range(8):
+        # the rows for X and Y are the walls' inward normals
+        push_x -= rows[2, lane] * force[k, lane]
+        push_y -= rows[3, lane] * force[k, lane]
+        moment += torque[k, lane]
+    return push_x, push_y, moment
+
+
+@kernel(fast=True)
+def _wear(w, k, wear, alpha, beta) -> None:
+    """Write order k + 1 of the growth of each pad's depth:  dh/dt = k_s F v / A (Archard)."""
+    for lane in range(8):
+        before = w.force[k - 1, lane] if k > 0 else 0.0
+        growth = wear[lane] * (alpha * w.force[k, lane] + beta * before)
+        w.worn[k + 1, lane] = growth * w.inverse[k + 1]
+
+
+@kernel(fast=True)
 def expand(
     p, state, w, penetrating, hard, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
 ):
@@ -202,11 +260,9 @@ def expand(
     sigma of interest: orders whose terms vanish there are not computed.
     """
     y, alpha, beta = state.y, state.clock[ALPHA], state.clock[BETA]
-    series, left, right, product, gap, force = w.series, w.left, w.right, w.product, w.gap, w.force
-    load, inverse, worn = w.load, w.inverse, w.worn
-    A, B, start, slope = p.gap, p.arm, w.wrench[0], w.wrench[1]
+    series, left, right, product, gap, worn = w.series, w.left, w.right, w.product, w.gap, w.worn
+    load, inverse, A = w.load, w.inverse, p.gap
     im, ii = p.inverse_mass, p.inverse_inertia
-    d0x, d0y, d1x, d1y = p.direction[0, 0], p.direction[0, 1], p.direction[1, 0], p.direction[1, 1]
     x, yy, vx, vy, om, c, s, theta = y[X], y[Y], y[VX], y[VY], y[OMEGA], y[COS], y[SIN], y[THETA]
     x0, y0, vx0, vy0, om0, c0, s0 = x, yy, vx, vy, om, c, s
     # rates of the order before, for the sigma term of the time map
@@ -246,53 +302,20 @@ def expand(
         dy = vy - (product[k, 1] + om0 * x + om_k * x0)
         dc = -(product[k, 4] + om0 * s + om_k * s0)
         ds = product[k, 5] + om0 * c + om_k * c0
-        # loads, turned into head axes
-        fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
-        moment = start[2] if k == 0 else 0.0
-        if segments is not None:
-            # wrench start + slope t(sigma): its own series has the terms alpha slope and beta slope / 2
-            fx += alpha * (slope[0] * c1 + slope[1] * s1) + 0.5 * beta * (slope[0] * c2 + slope[1] * s2)
-            fy += alpha * (slope[1] * c1 - slope[0] * s1) + 0.5 * beta * (slope[1] * c2 - slope[0] * s2)
-            if k == 1:
-                moment += alpha * slope[2]
-            elif k == 2:
-                moment += 0.5 * beta * slope[2]
-        if harmonics is not None:
-            load_k = 0.0 if k == 0 else load[0, k]
-            along_c = product[k, 6] + load[0, 0] * c + load_k * c0
-            along_s = product[k, 7] + load[0, 0] * s + load_k * s0
-            fx += d0x * along_c + d0y * along_s
-            fy += d0y * along_c - d0x * along_s
-            moment += load[2, k]
-            if second is not None:
-                b6 = b7 = 0.0
-                for j in range(k + 1):
-                    b6 += load[1, j] * right[k - j, 6]
-                    b7 += load[1, j] * right[k - j, 7]
-                fx += d1x * b6 + d1y * b7
-                fy += d1y * b6 - d1x * b7
+        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, alpha, beta, harmonics, second, segments)
         if offset is not None:
             # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
             moment -= (offset[0] * (fy + p.gravity * c) - offset[1] * (fx + p.gravity * s)) * ii / im
         if penetrating:
             _combine(A, dc, ds, dx, dy, k, w.rate)
-            _combine(B, c, s, x, yy, k, w.arm)
+            _combine(p.arm, c, s, x, yy, k, w.arm)
             _push(state, w, k, viscous, factor, integer, fraction)
-            push_x = push_y = 0.0
-            for lane in range(8):
-                push_x += A[2, lane] * force[k, lane]
-                push_y += A[3, lane] * force[k, lane]
-            fx -= push_x * im
-            fy -= push_y * im
-            _multiply(w.arm, force, k, w.torque)
-            torque = 0.0
-            for lane in range(8):
-                torque += w.torque[k, lane]
-            moment += ii * torque
+            push_x, push_y, torque = _resultant(p, w, k)
+            fx += push_x * im
+            fy += push_y * im
+            moment += torque * ii
             if wear is not None:
-                for lane in range(8):
-                    before = force[k - 1, lane] if k > 0 else 0.0
-                    worn[k + 1, lane] = wear[lane] * (alpha * force[k, lane] + beta * before) * inverse[k + 1]
+                _wear(w, k, wear, alpha, beta)
         if free is not None:
             moment *= free[2]
             fx, fy = _hold(w, k, free, fx, fy)
