@@ -66,6 +66,16 @@ def test_a_cut_recording_ends_with_3_in_every_verb(run: Run, tmp_path: Path) -> 
     assert (tmp_path / "cut.rrd").stat().st_size > 10_000
 
 
+def test_a_recording_stopped_early_ends_with_3_in_every_verb(tmp_path: Path) -> None:
+    stopped = record_run(tmp_path / "run", map(paper_sample, range(100)), min_free_bytes=2**62)
+    assert stopped.loss.closed and not stopped.loss.complete
+    for verb in ("replay", "view", "info"):
+        done = plow_twin(verb, stopped.folder)
+        assert done.returncode == 3, f"{verb}: {done.stderr}"
+        assert "stopped early" in done.stdout + done.stderr
+        assert verb == "view" or f"expected at least {2**62} B" in done.stdout
+
+
 def test_info_counts_what_a_recording_holds(run: Run) -> None:
     done = plow_twin("info", run.file, "--json")
     assert done.returncode == 0, done.stderr

@@ -12,6 +12,7 @@ import textwrap
 import threading
 import time
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import JointState
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
 from plow_twin.record.recorder import JOURNAL, Recorder
+from plow_twin.record.writer import RunWriter
 from plow_twin.stream.journal import Loss, Sample, Snapshot
 
 HEADER = RunHeader("version: 1")
@@ -173,7 +175,30 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
     assert loss.closed and loss.lost[JOURNAL] >= 1
     reader = RunReader(tmp_path / "run")
     list(reader)
-    assert reader.status is FileStatus.COMPLETE
+    assert reader.status is FileStatus.STOPPED_EARLY
+    assert reader.stop_reason is not None and reader.stop_reason in errors[0]
+    bag = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert bag["custom_data"]["plow_twin_stopped_early"] == reader.stop_reason
+
+
+def test_what_callers_lose_while_the_file_is_closed_does_not_disturb_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    close = RunWriter.close
+
+    def close_among_callers(writer: RunWriter, loss: Mapping[str, int], *reason: str | None) -> None:
+        before = dict(loss)
+        assert not recorder.output("/late", BASE_NS, joint_state(0))  # the lock is free
+        assert dict(loss) == before
+        close(writer, loss, *reason)
+
+    monkeypatch.setattr(RunWriter, "close", close_among_callers)
+    recorder = Recorder(tmp_path / "run", HEADER, min_free_bytes=2**62)
+    loss = recorder.close()
+    assert loss.closed and loss.lost == {"/late": 1}
+    reader = RunReader(tmp_path / "run")
+    list(reader)
+    assert reader.lost == {} and reader.status is FileStatus.STOPPED_EARLY
 
 
 def test_a_removed_file_is_noticed(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     facts: dict[str, Any] = {
         "file": str(reader.path),
         "status": reader.status.value,
+        "stop_reason": reader.stop_reason,
         "duration_s": 0.0 if first is None or last is None else (last - first) * 1e-9,
         "messages": dict(sorted(reader.counts.items())),
         "lost": lost,

@@ -44,6 +44,7 @@ def _facts(report: ReplayReport) -> dict[str, Any]:
         "file": str(report.path),
         "result": "diverged" if diverged else "the same as far as the file goes" if report.loss else "the same",
         "file_status": report.status.value,
+        "stop_reason": report.stop_reason,
         "entries": report.entries,
         "samples": report.samples,
         "steps": report.steps,

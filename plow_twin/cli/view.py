@@ -9,7 +9,7 @@ import click
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, progress, quiet_option
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but the recording is cut off or damaged.")
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but parts of the recording are missing.")
 @click.argument("recording", type=click.Path(path_type=Path, exists=True))
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; by default beside the .mcap."

@@ -19,6 +19,8 @@ from plow_twin.stream.journal import ParameterValue
 HEADER_RECORD: Final = "plow_twin"
 #: Name of the MCAP metadata record, written at close, that holds the loss counters.
 LOSS_RECORD: Final = "plow_twin_loss"
+#: Key in it of the reason why recording ended before the run; all other keys are topics.
+STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 1
 

@@ -15,7 +15,7 @@ from typing import IO, Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode
-from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, RunHeader
+from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message
 from plow_twin.record.messages import MESSAGE_TYPES, Message
 from plow_twin.stream.journal import Entry
@@ -30,6 +30,7 @@ class FileStatus(Enum):
 
     UNREAD = "not read to its end"
     COMPLETE = "complete"
+    STOPPED_EARLY = "stopped early: the recorder closed it before the run ended"
     TRUNCATED = "truncated: the recorder did not close it"
     DAMAGED = "damaged: chunks could not be read"
 
@@ -66,8 +67,9 @@ Record = EntryRecord | OutputRecord
 class RunReader:
     """Iterate over the records of a recording, a folder or its `.mcap` file.
 
-    `status`, `damaged_chunks`, `lost` (by topic, as the recorder counted) and `counts` (records by topic) hold once the
-    iteration has ended; `position` is the share of the file that has been read, 0..1.
+    `status`, `damaged_chunks`, `lost` (by topic, as the recorder counted), `stop_reason` (why it stopped early, if it
+    did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the file that has
+    been read, 0..1.
 
     Raises
     ------
@@ -80,6 +82,7 @@ class RunReader:
     status: FileStatus = field(default=FileStatus.UNREAD, init=False)
     damaged_chunks: int = field(default=0, init=False)
     lost: Mapping[str, int] = field(default_factory=dict, init=False)
+    stop_reason: str | None = field(default=None, init=False)
     counts: Counter[str] = field(default_factory=Counter, init=False)
     position: float = field(default=0.0, init=False)
 
@@ -96,6 +99,7 @@ class RunReader:
 
     def __iter__(self) -> Iterator[Record]:
         self.status, self.damaged_chunks, self.lost, self.position = FileStatus.UNREAD, 0, {}, 0.0
+        self.stop_reason = None
         size = self.path.stat().st_size
         self.counts.clear()
         channels: dict[int, Any] = {}
@@ -108,13 +112,17 @@ class RunReader:
                     for inner in self._open_chunk(record, schemas, channels):
                         yield from self._convert(inner, schemas, channels)
                 elif kind == "Metadata" and record.name == LOSS_RECORD:
-                    self.lost = {topic: int(count) for topic, count in record.metadata.items()}
+                    counted = dict(record.metadata)
+                    self.stop_reason = counted.pop(STOPPED_EARLY_KEY, None)
+                    self.lost = {topic: int(count) for topic, count in counted.items()}
                 elif kind == "Footer":
                     self.status = FileStatus.COMPLETE
         if self.status is FileStatus.UNREAD:
             self.status = FileStatus.TRUNCATED
         elif self.damaged_chunks:
             self.status = FileStatus.DAMAGED
+        elif self.stop_reason is not None:
+            self.status = FileStatus.STOPPED_EARLY
 
     def _records(self, stream: IO[bytes]) -> Iterator[Any]:
         """Yield the records outside the chunks up to the footer or to where the file breaks off."""

@@ -13,7 +13,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
 from plow_twin.record.header import RunHeader
@@ -107,7 +107,7 @@ class Recorder:
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
         self._on_error = on_error
-        self._lock = threading.Lock()  # held by callers only, for microseconds; the thread never takes it to write
+        self._lock = threading.Lock()  # held for microseconds; the thread never writes while it holds it
         self._sequence = -1
         self._journal_gap = 0
         self._snapshot_due = False
@@ -222,11 +222,12 @@ class Recorder:
                     next_flush = time.monotonic() + self._flush_period_s
             if reason is not None:
                 self._give_up(reason)
-            self._writer.close(self._lost)
+            with self._lock:  # callers go on counting what they lose
+                lost = dict(self._lost)
+            self._writer.close(lost, reason)
             self._closed = True
         except Exception as error:  # whatever it is: the twin goes on without its recorder
-            self._lost.update(self._unflushed)
-            self._give_up(str(error))
+            self._give_up(str(error), self._unflushed)
             self._writer.abandon()
 
     def _drain(self) -> None:
@@ -245,14 +246,15 @@ class Recorder:
         self._unflushed.clear()
         return self._writer.reason_to_stop()
 
-    def _give_up(self, reason: str) -> None:
-        """Stop taking in, count what is queued as lost and say so once."""
+    def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
+        """Stop taking in, count as lost what is queued and what is `unsafe`, by topic, and say so once."""
         first = self._error is None
         with self._lock:
             self._accepting = False
             self._error = self._error or f"{self.path}: recording stopped: {reason}"
             unwritten, self._queue = self._queue, deque()
-        self._lost.update(Counter(item.key for item in unwritten))
+            self._lost.update(unsafe)
+            self._lost.update(item.key for item in unwritten)
         if first and self._on_error is not None:
             self._on_error(self._error)
 

@@ -71,6 +71,7 @@ class ReplayReport:
     divergences: int = 0
     first_divergence: Divergence | None = None
     status: FileStatus = FileStatus.UNREAD
+    stop_reason: str | None = None
     damaged_chunks: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     build_differences: dict[str, tuple[str, str]] = field(default_factory=dict)
@@ -245,6 +246,7 @@ class _Replay:
         """Complete the report once the file has been read."""
         report = self.report
         report.status, report.damaged_chunks, report.wall_s = reader.status, reader.damaged_chunks, wall_s
+        report.stop_reason = reader.stop_reason
         report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
         if self.gaps > self.noted["journal"]:
             report.lost["journal, unaccounted"] = self.gaps - self.noted["journal"]

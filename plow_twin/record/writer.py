@@ -12,7 +12,7 @@ from mcap.writer import Writer
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
-from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, RunHeader
+from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.messages import Message
 from plow_twin.record.metadata_yaml import TopicCount, bag_metadata, qos_text, write_metadata
@@ -102,16 +102,18 @@ class RunWriter:
             return f"{free} B free on the disk, expected at least {self._min_free_bytes} B"
         return None
 
-    def close(self, loss: Mapping[str, int]) -> None:
-        """Write the loss counters, the index and `metadata.yaml`."""
+    def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
+        """Write the loss counters, why recording ended before the run (if it did), the index and `metadata.yaml`."""
         record = {topic: str(count) for topic, count in loss.items()}
+        custom = {f"plow_twin_lost {topic}": count for topic, count in record.items()}
+        if stop_reason is not None:
+            record[STOPPED_EARLY_KEY] = custom[f"plow_twin_{STOPPED_EARLY_KEY}"] = stop_reason
         self._mcap.flush()  # type: ignore[no-untyped-call]
         self._mcap.add_metadata(LOSS_RECORD, record)
         self._mcap.finish()  # type: ignore[no-untyped-call]
         self._file.close()
         topics = [counter for _, counter in self._topics.values()]
         start, end = max(0, self._start_ns), max(0, self._end_ns)
-        custom = {f"plow_twin_lost {topic}": count for topic, count in record.items()}
         write_metadata(self.folder, bag_metadata(self.path.name, topics, start, end, custom))
 
     def abandon(self) -> None:

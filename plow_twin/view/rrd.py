@@ -257,7 +257,7 @@ class _Run:
     def finish(self, status: FileStatus) -> None:
         """Send what is still collected."""
         self._write_early(None)
-        if status in (FileStatus.TRUNCATED, FileStatus.DAMAGED):
+        if status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
             self.events.add(self._stamp_ns, max(self.step, 0), f"recording {status.value}", "ERROR")
         for buffer in buffers(self):
             buffer.flush()
