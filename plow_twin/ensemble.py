@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
-from plow_twin.simulate import BUDGET, Motion, output_times, run_events
+from plow_twin.simulate import BUDGET, Motion, check_times, output_times, run_events
 from plow_twin.solve.compiled import compile_scene
 from plow_twin.solve.layout import STEPS, Status, Work, new_work
 
@@ -70,16 +70,17 @@ def simulate_many(
     workers : int, optional
         Threads; all cores by default. The kernels run without the interpreter's lock.
     on_progress : callable, optional
-        Called with the number of members done, from any thread.
+        Called with the number of members done, from one thread at a time.
 
     Raises
     ------
     ValueError
         For an argument that cannot be used.
     """
+    check_times(t_end, output_dt)
     times = output_times(t_end, output_dt)
     ensemble = _empty(times, len(scenes))
-    local = threading.local()
+    local, lock = threading.local(), threading.Lock()
     done = 0
 
     def run(index: int) -> None:
@@ -87,9 +88,10 @@ def simulate_many(
         if not hasattr(local, "work"):
             local.work = new_work()
         _run_member(scenes[index], index, t_end, tol, local.work, ensemble)
-        done += 1
-        if on_progress is not None:
-            on_progress(done)
+        with lock:
+            done += 1
+            if on_progress is not None:
+                on_progress(done)
 
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
         # the first member alone: it compiles what all need

@@ -116,7 +116,7 @@ def simulate(
     SolverError
         When the motion could not be continued; says when and why.
     """
-    _check(t_end, output_dt, method, dt)
+    check_times(t_end, output_dt, method, dt)
     compiled = compile_scene(scene, tol)
     if output_dt is None and dt is not None:
         output_dt = dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
@@ -150,7 +150,8 @@ class Motion:
         return Motion(compiled.initial_state(), new_record(TOTALS), new_log(_FIRST_LOG), q, v, *pairs)
 
 
-def _check(t_end: float, output_dt: float | None, method: str, dt: float | None) -> None:
+def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
+    """Raise `ValueError` for times that no run can have."""
     if not (np.isfinite(t_end) and t_end >= 0.0):
         raise ValueError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
     if output_dt is not None and not (np.isfinite(output_dt) and output_dt > 0.0):
@@ -163,8 +164,9 @@ def _check(t_end: float, output_dt: float | None, method: str, dt: float | None)
         return
     if dt is None or not (np.isfinite(dt) and dt > 0.0):
         raise ValueError(f"dt: got {dt!r}, expected a finite time > 0 [s] with method={method!r}")
-    if output_dt is not None and abs(output_dt / dt - round(output_dt / dt)) > 1e-6 * output_dt / dt:
-        raise ValueError(f"output_dt: got {output_dt!r}, expected a whole multiple of dt = {dt!r} [s]")
+    for name, value in (("t_end", t_end), ("output_dt", output_dt)):
+        if value is not None and abs(value / dt - round(value / dt)) > 1e-6 * max(1.0, value / dt):
+            raise ValueError(f"{name}: got {value!r}, expected a whole multiple of dt = {dt!r} [s]")
 
 
 def output_times(t_end: float, output_dt: float | None) -> Array:
@@ -185,7 +187,7 @@ def _run(compiled: Compiled, times: Array, t_end: float, method: Method, dt: flo
         time = float(motion.state.clock[T0])
     else:
         stride = round(float(times[1]) / dt) if len(times) > 1 else 1
-        code, time = _run_fixed(compiled, motion, (len(times) - 1) * stride, stride, dt, method == "euler")
+        code, time = _run_fixed(compiled, motion, round(t_end / dt), stride, dt, method == "euler")
     if code != Status.OK:
         raise SolverError(f"at t = {time:.9g} s: {Status(code).text}")
     return motion

@@ -140,10 +140,9 @@ class Twin:
         """Compile every kernel that this scene uses, or load it from the cache on disk; return the seconds it took."""
         begin = _time.perf_counter()
         saved = self.snapshot()
-        if self.excitation == "sampled":
-            self.advance_samples(np.array([self.time + 1e-6]), np.zeros((1, 3)))
-        else:
-            self.advance(self.time + 1e-6)
+        self.advance(self.time + 1e-6)
+        self.restore(self.snapshot())
+        self._end_step()
         self.restore(saved)
         return _time.perf_counter() - begin
 

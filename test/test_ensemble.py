@@ -41,3 +41,9 @@ def test_a_member_that_fails_does_not_stop_the_others() -> None:
     assert ensemble.status.tolist() == [Status.OK, Status.OUT_OF_RANGE, Status.OK]
     assert np.isfinite(ensemble.q[[0, 2]]).all() and np.array_equal(ensemble.q[0], ensemble.q[2])
     assert np.isfinite(ensemble.q[1, 0]).all() and np.isnan(ensemble.q[1, -1]).all()
+
+
+@pytest.mark.parametrize("t_end", [-1.0, float("nan"), float("inf")])
+def test_times_are_checked_as_in_simulate(t_end: float) -> None:
+    with pytest.raises(ValueError, match="t_end: got"):
+        simulate_many([preset("paper")], t_end)

@@ -70,3 +70,13 @@ def test_power_series_equals_the_power(shift: int, n: float) -> None:
 def test_a_law_that_cannot_be_is_refused_by_name(contact: dict[str, object], words: str) -> None:
     with pytest.raises(SceneError, match=words):
         Scene(Head(1.0, 1.0), Frame(0.1, 0.1), Clearance(0.01, 0.01), Contact(**contact))  # type: ignore[arg-type]
+
+
+def test_parts_of_the_wrong_kind_are_all_named_at_once() -> None:
+    with pytest.raises(SceneError) as caught:
+        Scene(None, Frame(0.1, 0.1), 3, Contact("hertz", 1e7), loads=None, pairs="all", wear=2.0)  # type: ignore[arg-type]
+    keys = {problem.key for problem in caught.value.problems}
+    assert keys == {"head", "clearance", "loads", "pairs", "wear"}
+    labels = {"a": "top_left", "b": "top_left"}
+    with pytest.raises(SceneError, match=r"frame\.labels.*each corner once"):
+        Scene(Head(1.0, 1.0), Frame(0.1, 0.1, labels), Clearance(0.01, 0.01), Contact("hertz", 1e7))

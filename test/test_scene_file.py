@@ -257,11 +257,13 @@ def scenes(draw: st.DrawFn) -> Scene:
         else:
             loads.append(draw(tables(name)))
     wear = Wear(draw(POSITIVE), draw(POSITIVE), draw(POSITIVE), (draw(POSITIVE),) * 8)
+    letters = draw(st.lists(NAME, max_size=len(CORNER_NAMES), unique=True))
+    labels = dict(zip(letters, draw(st.permutations(CORNER_NAMES)), strict=False))
     locked = tuple(draw(st.lists(st.sampled_from(DOF_NAMES), unique=True)))
     x, y, theta = (0.0 if name in locked else draw(FINITE) for name in DOF_NAMES)
     scene = Scene(
         head=Head(draw(POSITIVE), draw(POSITIVE)),
-        frame=Frame(draw(POSITIVE), draw(POSITIVE), draw(st.dictionaries(NAME, st.sampled_from(CORNER_NAMES)))),
+        frame=Frame(draw(POSITIVE), draw(POSITIVE), labels),
         clearance=Clearance(draw(FINITE), draw(FINITE)),
         contact=draw(contacts()),
         gravity=Gravity(draw(FINITE), draw(FINITE)),

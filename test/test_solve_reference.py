@@ -149,3 +149,12 @@ def test_fixed_step_rk4_follows_the_reference_as_far_as_it_can(name: str, dt: fl
     assert pose_error(scene, result.q, expected["q"][:501]) < bound
     located = simulate(scene, 5.0, output_dt=0.01, tol=1e-10)
     assert result.force == pytest.approx(located.force, abs=2e3 * bound / 1e-5)
+
+
+def test_the_last_row_of_a_fixed_step_run_is_where_it_says() -> None:
+    scene = preset("paper")
+    uneven, even = (simulate(scene, 1.0, output_dt=dt, method="rk4", dt=1e-3) for dt in (0.3, 0.1))
+    assert uneven.t[-1] == 1.0 and uneven.solver["steps"] == 1000
+    assert np.array_equal(uneven.q[-1], even.q[-1]) and np.array_equal(uneven.q[1], even.q[3])
+    with pytest.raises(ValueError, match=r"t_end: got 1\.0005, expected a whole multiple of dt"):
+        simulate(scene, 1.0005, method="rk4", dt=1e-3)

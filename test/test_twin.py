@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import pose_error, preset, reference, wall_and_point
 
-from plow_twin import Status, Twin, Wear, simulate
+from plow_twin import Constant, SolverError, Status, Twin, Wear, simulate
 from plow_twin.model.loads import compile_loads
 from plow_twin.solve import drive
 
@@ -103,17 +103,32 @@ def test_bad_input_is_named_and_changes_nothing(t: float, wrench: tuple[float, .
     assert twin.digest() == before
 
 
-def test_failures_keep_the_last_good_state_and_go_on() -> None:
+@pytest.mark.parametrize("wrench", [(0.0, 0.0, 1e7), (1e12, 0.0, 0.0), (1e300, 0.0, 0.0)])
+def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wrench: tuple[float, ...]) -> None:
     twin = Twin(preset("paper"), excitation="sampled")
     good = twin.advance(0.5, (0.0, 0.0, 0.0))
-    bad = twin.advance(0.6, (1e12, 0.0, 0.0))
-    assert bad.status in (Status.OUT_OF_RANGE, Status.NON_FINITE)
-    assert "." not in bad.status.text[:1] and len(bad.status.text) > 10
-    assert all(np.isfinite(value).all() for value in (bad.q, bad.v, bad.force, bad.peak, bad.impulse))
-    assert twin.time == 0.6
-    twin.reset(0.7)
-    assert twin.advance(0.8, (0.0, 0.0, 0.0)).status is Status.OK
-    assert good.status is Status.OK
+    bad = twin.advance(0.6, wrench)
+    assert bad.status in (Status.OUT_OF_RANGE, Status.NON_FINITE) and len(bad.status.text) > 10
+    for name in ("q", "v", "penetration", "force", "wear_depth"):
+        assert np.array_equal(getattr(bad, name), getattr(good, name)), name
+    assert not bad.impulse.any() and not bad.makes.any() and twin.time == 0.6
+    assert twin.advance(0.6, (0.0, 0.0, 0.0)).status is Status.OK
+    after = twin.advance(0.7, (0.0, 0.0, 0.0))
+    assert after.status is Status.OK and abs(after.q - good.q).max() < 0.05
+
+
+def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
+    """A step that ends at the time asked for is checked too."""
+    for dt in (1e-3, 7e-4):
+        twin = Twin(preset("paper"), excitation="sampled")
+        rows = [twin.advance(k * dt, (0.0, 0.0, 1e6)) for k in range(1, 100)]
+        assert any(row.status is Status.OUT_OF_RANGE for row in rows)
+        assert all(abs(row.q[2]) <= np.pi / 4 for row in rows)
+    analytic = Twin(dataclasses.replace(preset("paper"), loads=(Constant("turn", (0.0, 0.0), 1e6),)))
+    for t in np.linspace(0.0, 0.1, 57):
+        assert abs(analytic.advance(t).q[2]) <= np.pi / 4
+    with pytest.raises(SolverError, match="left the model's range"):
+        simulate(analytic.scene, 0.0465)
 
 
 def test_a_scene_compiles_only_what_it_needs() -> None:
@@ -131,3 +146,15 @@ def test_in_free_flight_nothing_of_the_contact_runs() -> None:
     twin = Twin(scene)
     twin.advance(3600.0)
     assert twin.steps <= 80 and twin._work.force.any() == False  # noqa: E712
+
+
+def test_warm_up_leaves_nothing_to_compile() -> None:
+    twin = Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
+    twin.warm_up()
+    before = [len(kernel.signatures) for kernel in (drive.advance_times, drive.end_step, drive.lay_out_again)]
+    assert min(before) > 0 and twin.time == 0.0
+    twin.advance(0.01)
+    twin.set_travel_speed(1.0)
+    twin.advance(0.02)
+    twin.restore(twin.snapshot())
+    assert [len(kernel.signatures) for kernel in (drive.advance_times, drive.end_step, drive.lay_out_again)] == before

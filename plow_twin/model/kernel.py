@@ -37,7 +37,8 @@ def kernel(*, fast: bool = False, inline: bool = False) -> Callable[[Callable[..
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-        cache_file = getattr(dispatcher._cache, "_cache_file", None)
+        # absent when numba is told not to compile
+        cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
         compiled: Callable[..., Any] = dispatcher

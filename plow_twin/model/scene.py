@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import Field, dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final
@@ -203,6 +203,17 @@ class Scene:
             raise SceneError(problems)
 
 
+_PARTS: Final[Mapping[str, type]] = {
+    "head": Head,
+    "frame": Frame,
+    "clearance": Clearance,
+    "contact": Contact,
+    "gravity": Gravity,
+    "initial": Initial,
+    "wear": Wear,
+}
+
+
 def check(scene: Scene) -> Iterator[Problem]:
     """Yield every problem of a scene: types, ranges, choices, then what only shows across fields."""
     found = list(_check_fields(scene, ""))
@@ -211,6 +222,9 @@ def check(scene: Scene) -> Iterator[Problem]:
         yield from _check_contact(scene.contact)
         yield from _check_rotation(scene)
         yield from _check_loads(scene.loads)
+        corners = list(scene.frame.labels.values())
+        if len(set(corners)) != len(corners):
+            yield Problem("frame.labels", dict(scene.frame.labels), "each corner once")
         for name, rate in zip(DOF_NAMES, scene.initial.v, strict=True):
             if name in scene.locked and rate != 0.0:
                 yield Problem("initial.v", scene.initial.v, f"0 for the locked {name}")
@@ -226,8 +240,14 @@ def _check_fields(part: Any, path: str) -> Iterator[Problem]:
     for spec in fields(part):
         value = getattr(part, spec.name)
         key = f"{path}{spec.name}"
-        if is_dataclass(value):
-            yield from _check_fields(value, f"{key}.")
+        kind = _PARTS.get(spec.name) if isinstance(part, Scene) else None
+        if kind is not None:
+            if isinstance(value, kind):
+                yield from _check_fields(value, f"{key}.")
+            elif value is not None or spec.name != "wear":
+                yield Problem(key, value, f"a {kind.__name__}")
+        elif spec.name in ("loads", "locked", "pairs") and not isinstance(value, (tuple, list)):
+            yield Problem(key, value, "a tuple")
         elif spec.name == "loads":
             for index, load in enumerate(value):
                 if not isinstance(load, Load):

@@ -5,7 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from plow_twin.model.kernel import kernel
-from plow_twin.solve.layout import AT_HARD_END, EVENT_PAIR, LENGTH, PIECE, SIGMA, STEPS, T0, USED, Status
+from plow_twin.solve.layout import (
+    AT_HARD_END,
+    EVENT_PAIR,
+    LENGTH,
+    PIECE,
+    SIGMA,
+    STALL,
+    STEPS,
+    T0,
+    TOUCHING,
+    USED,
+    Status,
+)
 from plow_twin.solve.step import account, begin, evaluate, finish, pair_outputs, pose_of, sigma_at, within_range
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
@@ -28,40 +40,64 @@ def _next(p, parts, state, w, hard_time, budget) -> int:
         return _OK
     if state.count[STEPS] >= budget:
         return _BUDGET
-    if not within_range(p, state):
+    if not within_range(p, state, state.y):
         return _RANGE
     return _OK if _lay_out(p, parts, state, w, hard_time) else _NON_FINITE
 
 
 @kernel()
-def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:
+def _present(state, w, y) -> None:
+    """Write the body coordinates at the present time to y, also within a step."""
+    if state.clock[LENGTH] >= 0.0:
+        evaluate(state, w, sigma_at(state, state.clock[USED]), y)
+    else:
+        y[:] = state.y
+
+
+@kernel()
+def _proceed(p, parts, state, w, totals, target, hard_time, budget) -> int:
     """Bring the motion to `target`; steps may reach beyond it, up to `hard_time`. Returns a `Status`."""
     while True:
         t0 = state.clock[T0]
         if t0 >= target and state.clock[LENGTH] < 0.0:
-            return _OK
+            return _OK if within_range(p, state, state.y) else _RANGE
         code = _next(p, parts, state, w, hard_time, budget)
         if code != _OK:
-            # the last good state is held; time goes on without it
-            state.clock[T0], state.clock[LENGTH] = target, -1.0
             return code
         low = sigma_at(state, state.clock[USED])
         if target < t0 + state.clock[LENGTH]:
             account(state, w, low, sigma_at(state, target - t0), totals)
             state.clock[USED] = target - t0
-            return _OK
+            _present(state, w, w.moved)
+            return _OK if within_range(p, state, w.moved) else _RANGE
         account(state, w, low, sigma_at(state, state.clock[LENGTH]), totals)
         finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
+
+
+@kernel()
+def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:
+    """Proceed to `target`; when that fails, time goes on but the head stays as it was, and nothing is counted."""
+    saved = w.saved
+    _present(state, w, saved[0])
+    saved[1, :], saved[2, :] = state.factor, state.depth
+    for pair in range(8):
+        w.modes[pair] = state.mode[pair]
+    code = _proceed(p, parts, state, w, totals, target, hard_time, budget)
+    if code != _OK:
+        state.y[:], state.factor[:], state.depth[:] = saved[0], saved[1], saved[2]
+        for pair in range(8):
+            state.mode[pair] = w.modes[pair]
+        state.clock[T0], state.clock[LENGTH], state.clock[USED] = target, -1.0, 0.0
+        state.step[TOUCHING] = state.step[STALL] = 0
+        totals.peak[:], totals.impulse[:], totals.makes[:] = 0.0, 0.0, 0
+    return code
 
 
 @kernel()
 def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth) -> None:
     """Write row i: the state at the present time and the totals, which are cleared."""
     y = w.moved
-    if state.clock[LENGTH] >= 0.0:
-        evaluate(state, w, sigma_at(state, state.clock[USED]), y)
-    else:
-        y[:] = state.y
+    _present(state, w, y)
     pose_of(y, parts.offset, q[i], v[i])
     pair_outputs(p, state, y, penetration[i], rate[i], force[i])
     for pair in range(8):
@@ -154,7 +190,10 @@ def end_step(p, parts, state, w, totals) -> None:
 
 @kernel()
 def lay_out_again(p, parts, state, w) -> None:
-    """Compute the step under way once more after a restore: its series are not part of the state."""
+    """Compute the step under way once more after a restore: its series are not part of the state.
+
+    Only the scene's own loads leave a step under way, and there it has no hard end.
+    """
     used, count = state.clock[USED], state.count.copy()
     _lay_out(p, parts, state, w, np.inf)
     state.count[:] = count
@@ -188,6 +227,8 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
             first[0] = row
         account(state, w, 0.0, sigma_at(state, length), totals)
         finish(p, state, w, totals, log, parts.wear, parts.law.fraction)
+    if not within_range(p, state, state.y):
+        return _RANGE
     while row < t.size:
         pose_of(state.y, parts.offset, q[row], v[row])
         if force is not None:

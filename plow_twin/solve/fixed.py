@@ -135,8 +135,11 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
     pair_outputs(p, state, y, pen, rate, now)
     while True:
         n = done[0]
-        if n % stride == 0:
-            row = n // stride
+        if not within_range(p, state, y):
+            return _RANGE
+        if n % stride == 0 or n == steps:
+            # the last row may lie closer than the others
+            row = (n + stride - 1) // stride
             pose_of(y, parts.offset, q[row], v[row])
             if force is not None:
                 pair_outputs(p, state, y, penetration[row], rate, force[row])
@@ -144,8 +147,6 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
             return _OK
         if log.length[0] + 8 > log.time.size:
             return _LOG_FULL
-        if not within_range(p, state):
-            return _RANGE
         t = n * dt
         if euler:
             _accelerations(p, parts, parts.offset, parts.free, state, t, z, load, k[0])

@@ -48,12 +48,11 @@ class Status(IntEnum):
     """How an advance ended."""
 
     OK = 0
-    STALLED = 1
-    OUT_OF_RANGE = 2
-    NON_FINITE = 3
-    BUDGET = 4
+    OUT_OF_RANGE = 1
+    NON_FINITE = 2
+    BUDGET = 3
     #: internal: the event log is full, the caller makes room and goes on
-    LOG_FULL = 5
+    LOG_FULL = 4
 
     @property
     def text(self) -> str:
@@ -63,7 +62,6 @@ class Status(IntEnum):
 
 _STATUS_TEXT: Final = {
     Status.OK: "done",
-    Status.STALLED: "time did not advance: contact modes kept changing at one instant",
     Status.OUT_OF_RANGE: "the head left the model's range: |theta| above 45 degrees or half the cavity penetrated",
     Status.NON_FINITE: "the motion became non-finite; load, stiffness or damping is too large for double precision",
     Status.BUDGET: "the budget of steps was used up before the time asked for",
@@ -145,6 +143,8 @@ WORK: Final = np.dtype(
         ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
         ("size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
+        ("saved", "f8", (3, PAIR_COUNT)),  # y, factor and depth before an advance
+        ("modes", "i8", (PAIR_COUNT,)),  # and the modes
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
     ]

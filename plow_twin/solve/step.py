@@ -485,12 +485,12 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:
 
 
 @kernel()
-def within_range(p, state) -> bool:
-    """Tell whether the model still holds: |theta| <= 45 degrees and no penetration beyond half the cavity."""
-    if abs(state.y[THETA]) > 0.7853981633974483:
-        return False
+def within_range(p, state, y) -> bool:
+    """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
     deepest = 0.0
     for pair in range(8):
         if p.enabled[pair] == 1:
-            deepest = max(deepest, gap_and_rate(p, state, pair)[0])
-    return deepest <= p.half_cavity
+            A = p.gap
+            depth = A[0, pair] * y[COS] + A[1, pair] * y[SIN] + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair]
+            deepest = max(deepest, depth - state.depth[pair])
+    return abs(y[THETA]) <= 0.7853981633974483 and deepest <= p.half_cavity
