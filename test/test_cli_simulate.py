@@ -97,6 +97,14 @@ def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
             ["simulate", "paper", "--t-end", "1", "--method", "rk4", "--dt", "1e-3", "--output-dt", "0.0015"],
             "output_dt",
         ),
+        (
+            ["simulate", "paper", "--t-end", "1e6", "--output-dt", "1e-7"],
+            "1e+13 rows, expected at most 10000000 rows: 0.1",
+        ),
+        (
+            ["simulate", "paper", "--t-end", "1e300", "--output-dt", "1e-300"],
+            "inf rows, expected at most 10000000 rows",
+        ),
         (["simulate", "missing.yaml", "--t-end", "1"], "missing.yaml"),
         (["simulate", "bad.yaml", "--t-end", "1"], "head.mass: got 2430.0, expected a known key, nearest is mass_kg"),
         (["replay", "missing.mcap"], "missing.mcap"),
@@ -126,6 +134,24 @@ def test_what_cannot_be_done_exits_with_1(tmp_path: Path) -> None:
         assert done.returncode == 1, done.stderr
         assert said in done.stderr
         assert "Traceback" not in done.stderr
+
+
+def test_too_little_memory_is_one_line_and_exits_with_1() -> None:
+    code = """
+import resource, sys
+from plow_twin import simulate
+from plow_twin.presets import scene_path
+from plow_twin.scene_file import load_scene
+from plow_twin.cli import main
+simulate(load_scene(scene_path("paper")), 0.1)
+used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (used + 2**28, used + 2**28))
+main(["simulate", "paper", "--t-end", "1", "--output-dt", "1.1e-7", "--quiet"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=110, check=False)
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.startswith("plow-twin: not enough memory")
+    assert "Traceback" not in done.stderr
 
 
 def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -13,6 +13,9 @@ from plow_twin.presets import scene_path
 
 if TYPE_CHECKING:
     from plow_twin.simulate import Result
+
+#: A row takes some 200 B.
+MOST_ROWS: Final = 10_000_000
 
 
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene.")
@@ -46,6 +49,7 @@ def simulate(
 ) -> int:
     """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc."""
     _check_usage(out, method, dt)
+    _check_rows(t_end, output_dt)
     result = _run(scene, quiet, t_end, output_dt, tol, method, dt)
     if out is not None:
         try:
@@ -83,6 +87,13 @@ def _check_usage(out: Path | None, method: str, dt: float | None) -> None:
         raise click.BadParameter("got a step with method events, expected rk4 or euler", param_hint="--dt")
     if method != "events" and dt is None:
         raise click.BadParameter(f"got nothing, expected the step of {method} [s]", param_hint="--dt")
+
+
+def _check_rows(t_end: float, output_dt: float | None) -> None:
+    rows = 0.0 if output_dt is None else t_end / output_dt
+    if rows > MOST_ROWS:
+        message = f"got {output_dt:g} s, {rows:.4g} rows, expected at most {MOST_ROWS} rows: {t_end / MOST_ROWS:g} s"
+        raise click.BadParameter(message, param_hint="--output-dt")
 
 
 def write_samples(result: Result, path: Path) -> None:
