@@ -18,6 +18,7 @@ from plow_twin.presets import scene_path
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import FileStatus
 from plow_twin.scene_file import load_scene
+from plow_twin.stream.journal import Travel
 from plow_twin.view import ViewSummary, to_rrd
 from plow_twin.view.section import ARROW_MM_PER_N, Section
 
@@ -123,6 +124,16 @@ def test_events_tell_touches_and_how_the_file_ended(
     short = to_rrd(cut, tmp_path / "cut.rrd")
     assert short.status is FileStatus.TRUNCATED and 0 < short.curve_rows < COUNT
     assert "truncated" in read(short.path)["/events"]["TextLog:text"].to_pylist()[-1][0]
+
+
+def test_only_changes_of_the_travel_speed_are_events(tmp_path: Path) -> None:
+    speeds = [1.5] * 20 + [0.0] * 20 + [1.5] * 20
+    entries = [Travel(BASE_NS + index * STEP_NS, speed) for index, speed in enumerate(speeds)]
+    run = record_run(tmp_path / "run", [paper_sample(0), *entries, paper_sample(100)])
+    to_rrd(run.file, tmp_path / "run.rrd")
+    lines = [text[0] for text in read(tmp_path / "run.rrd")["/events"]["TextLog:text"].to_pylist()]
+    expected = [f"travel along the face at {speed} m/s" for speed in ("1.5", "0", "1.5")]
+    assert [line for line in lines if "travel" in line] == expected
 
 
 def test_a_place_that_cannot_be_written_is_named(run: Run, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ class Events:
         self._touches: NDArray[np.float64] | None = None
         self._status: tuple[int, str] | None = None
         self._silent = False
+        self._speed_m_s: float | None = None
 
     def add(self, stamp_ns: int, step: int, text: str, level: str = "INFO") -> None:
         """Write one line."""
@@ -42,7 +43,9 @@ class Events:
                     self.add(stamp_ns, step, "excitation silent: the last load is held", "WARN")
                     self._silent = True
             case Travel(_, speed):
-                self.add(stamp_ns, step, f"travel along the face at {speed:g} m/s")
+                if speed != self._speed_m_s:  # sensors repeat it many times a second
+                    self.add(stamp_ns, step, f"travel along the face at {speed:g} m/s")
+                self._speed_m_s = speed
             case Reset(_, reason):
                 self.add(stamp_ns, step, f"reset: {reason}", "WARN")
             case Parameter(name, value):
