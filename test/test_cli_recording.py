@@ -56,6 +56,19 @@ def test_replay_of_a_flipped_sample_ends_with_1_and_names_the_step(run: Run, tmp
     assert "Traceback" not in done.stderr
 
 
+def test_replay_of_another_build_warns(run: Run, tmp_path: Path) -> None:
+    def other_build(record: dict[str, str]) -> dict[str, str]:
+        if "build" in record:
+            record["build"] = json.dumps(json.loads(record["build"]) | {"numba": "0.1"})
+        return record
+
+    done = plow_twin("replay", rewrite(run.file, tmp_path / "other.mcap", metadata=other_build), "--quiet")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr.startswith(
+        "plow-twin: warning: recorded by another build, which may round differently: numba 0.1"
+    )
+
+
 def test_a_cut_recording_ends_with_3_in_every_verb(run: Run, tmp_path: Path) -> None:
     data = run.file.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])

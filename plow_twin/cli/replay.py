@@ -33,6 +33,9 @@ def replay(recording: Path, as_json: bool, quiet: bool) -> int:
         console = output_console()
         for key, value in facts.items():
             console.print(f"{key:24} {value}", highlight=False, soft_wrap=True)
+    if report.build_differences:
+        other = ", ".join(f"{key} {there} (here {here})" for key, (there, here) in report.build_differences.items())
+        click.echo(f"plow-twin: warning: recorded by another build, which may round differently: {other}", err=True)
     if report.first_divergence is not None:
         click.echo(f"plow-twin: diverged: {report.first_divergence}", err=True)
     return report.exit_code
