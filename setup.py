@@ -14,7 +14,8 @@ EXTRAS = {
         f"ros-jazzy-rclpy[fastrtps]==7.1.6{ROS_WHEELS}",
         f"ros-jazzy-common-interfaces==5.3.6{ROS_WHEELS}",
     ],
-    "record": ["mcap>=1.3", "rosbags>=0.11"],
+    # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
+    "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18"],
     "view": ["rerun-sdk>=0.41"],
     "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9"],
     "test": ["pytest>=8", "pytest-timeout", "hypothesis"],

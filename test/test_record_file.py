@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import random
+import re
+import runpy
 import subprocess
 import sys
 from collections import Counter
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import setuptools
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
@@ -199,6 +204,25 @@ def test_the_documentation_lists_every_key_of_header_and_journal() -> None:
     for kind in (Hold, Travel, Reset, Parameter, Snapshot, Digest, Loss, Dropped):
         keys |= {kind.__name__.lower(), *(spec.name for spec in fields(kind))}
     assert {key for key in keys if f"`{key}`" not in text} == set()
+
+
+def test_the_extra_brings_every_library_that_is_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    root = Path(__file__).resolve().parent.parent
+    imported: set[str] = set()
+    for path in (root / "plow_twin" / "record").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module:
+                imported.add(node.module.partition(".")[0])
+    monkeypatch.chdir(root)
+    declared: dict[str, Any] = {}
+    monkeypatch.setattr(setuptools, "setup", declared.update)
+    runpy.run_path("setup.py")
+    wanted = [*declared["install_requires"], *declared["extras_require"]["record"]]
+    names = {re.split("[^A-Za-z0-9_-]", requirement.replace("ruamel.yaml", "ruamel"))[0] for requirement in wanted}
+    names.add("llvmlite")  # of numba, at the version that numba asks for
+    assert imported - names - sys.stdlib_module_names - {"plow_twin"} == set()
 
 
 def test_a_sample_that_is_not_finite_is_refused(tmp_path: Path) -> None:
