@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
+from plow_twin.model.scene import Wear
 from plow_twin.presets import scene_path
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
@@ -58,10 +59,16 @@ class Run:
 
 
 def record_run(
-    folder: Path, entries: Iterable[Entry], *, frame_every: int = 1, pause_every: int = 100, **options: Any
+    folder: Path,
+    entries: Iterable[Entry],
+    *,
+    frame_every: int = 1,
+    pause_every: int = 100,
+    wear: Wear | None = None,
+    **options: Any,
 ) -> Run:
     """Drive a twin of the paper's head by entries and record it as the node does."""
-    scene = load_scene(scene_path("paper"))
+    scene = replace(load_scene(scene_path("paper")), wear=wear)
     header = RunHeader(dump_scene(scene), parameters={"hold": "hold"})
     recorder = Recorder(folder, header, **options)
     run = Run(folder, recorder.path, LossReport({}, False, None))

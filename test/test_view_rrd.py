@@ -14,6 +14,7 @@ from rerun.chunk import RrdReader
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Wear
 from plow_twin.presets import scene_path
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import FileStatus
@@ -82,6 +83,19 @@ def test_curves_of_penetration_clearance_and_load(run: Run, view: tuple[ViewSumm
     assert set(tables) >= {"/wear/pad_top_left_top", "/wear/pad_top_left_top/p95", "/quality/sample_interval_ms"}
     np.testing.assert_array_equal(scalars(tables["/load/fx"]), [paper_sample(i).wrench[0] / 1e3 for i in range(COUNT)])
     assert set(scalars(tables["/quality/sample_interval_ms"])) == {1.0}
+
+
+def test_the_growth_of_the_clearance_is_drawn_in_micrometres(tmp_path: Path) -> None:
+    wear = Wear(1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0, prior_m2_n=(1e-15, 1e-13))
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), wear=wear)
+    to_rrd(run.file, tmp_path / "run.rrd")
+    tables = read(tmp_path / "run.rrd")
+    sent = [message for topic, message in run.outputs if topic == "/clearance" and isinstance(message, JointState)]
+    for name, new_m in (("horizontal", 0.025), ("vertical", 0.030)):
+        low, best, high = (scalars(tables[f"/growth/{name}{point}"]) for point in ("/p05", "", "/p95"))
+        index = sent[0].name.index(name)
+        np.testing.assert_allclose(best, [1e6 * (m.position[index] - new_m) for m in sent], rtol=0, atol=1e-9)
+        assert 0.0 < low[-1] < 0.2 * best[-1] < best[-1] < 0.2 * high[-1]
 
 
 def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:

@@ -48,12 +48,13 @@ def blueprint(section: Section) -> rrb.Blueprint:
         _plot("force", "Contact force, largest between two messages [kN]"),
         _plot("load", "Load on the head"),
         rrb.Tabs(
+            _plot("growth", "Clearance: growth by wear, 5..95 % [um]", rrb.Corner2D.LeftTop),
             _plot("clearance", "Clearance with 5..95 % interval [mm]"),
             _plot("penetration", "Penetration, negative is a gap [mm]"),
             _plot("wear", "Wear depth of the pads with 5..95 % interval [mm]"),
             active_tab=0,
         ),
-        row_shares=[5, 3, 3],
+        row_shares=[5, 2, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(rrb.Vertical(picture, below, row_shares=[7, 2]), curves, column_shares=[5, 6]),
@@ -63,8 +64,8 @@ def blueprint(section: Section) -> rrb.Blueprint:
     )
 
 
-def _plot(origin: str, name: str) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=rrb.Corner2D.RightTop)
+def _plot(origin: str, name: str, legend: rrb.Corner2D = rrb.Corner2D.RightTop) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend)
 
 
 def style_curves(stream: rr.RecordingStream) -> None:
@@ -120,6 +121,7 @@ Where a corner of the frame meets a wall of the cavity, an arrow shows the force
 - grey: frame, with its corners; white: the cavity and, schematically, the body of the head; violet: the load on it
 - force curves: the largest force between two messages, no peak is left out (`force_at_stamp`: the force at the stamp)
 - the cross-section is thinned in time; curves keep every row
+- growth of the clearance: over the clearance without wear, in micrometres; the thin lines bound its 5..95 % interval
 - timelines: `{ROS_TIME}` is the stamp, `{STEP}` counts the advances of the model
 
 | | |

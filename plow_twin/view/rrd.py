@@ -12,7 +12,7 @@ import numpy as np
 import rerun as rr
 
 from plow_twin.errors import RecordingError
-from plow_twin.model.scene import Scene
+from plow_twin.model.scene import Clearance, Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus, JointState, Odometry
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
@@ -80,7 +80,7 @@ def to_rrd(
         stream.save(out, default_blueprint=layout.blueprint(section))
     except Exception as error:  # the SDK raises RuntimeError and OSError alike
         raise RecordingError(f"{out}: cannot be written: {error}") from error
-    run = _Run(stream, reader.header, section, section_hz)
+    run = _Run(stream, reader.header, section, scene.clearance, section_hz)
     run.start(scene, reader.path)
     for index, record in enumerate(reader):
         if isinstance(record, EntryRecord):
@@ -100,7 +100,9 @@ def to_rrd(
 class _Run:
     """Turn records into curves, moments of the cross-section and events."""
 
-    def __init__(self, stream: rr.RecordingStream, header: RunHeader, section: Section, section_hz: float) -> None:
+    def __init__(
+        self, stream: rr.RecordingStream, header: RunHeader, section: Section, clearance: Clearance, section_hz: float
+    ) -> None:
         self.stream = stream
         self.header = header
         self.section = section
@@ -116,7 +118,7 @@ class _Run:
         self.names = Batches(stream, "section/head/name", rr.Points2D, ("positions",))
         self.load_arrow = Batches(stream, "section/load", rr.Arrows2D, ("origins", "vectors", "labels"))
         self.events = Events(stream)
-        self.slow: tuple[Curves, Curves] | None = None
+        self.slow: tuple[Curves, Curves, Curves] | None = None
         self.section_rows = 0
         self.step = -1
         self._spacing_ns = round(1e9 / section_hz)
@@ -127,6 +129,7 @@ class _Run:
         self._contact: JointState | None = None
         self._early: list[tuple[int, DiagnosticStatus]] = []
         self._wrench = (0.0, 0.0, 0.0)
+        self._new_m = {"horizontal": clearance.horizontal_m, "vertical": clearance.vertical_m}
         self._handlers: dict[str, Callable[[OutputRecord, Any], None]] = {
             header.topic("contact_forces"): self._contact_forces,
             header.topic("contact_peaks"): self._contact_peaks,
@@ -236,11 +239,15 @@ class _Run:
         if self.slow is None:
             names = list(zip(message.name, pads, strict=True))
             total = [f"clearance/{name}" for name, pad in names if not pad]
+            growth = [f"growth/{name}" for name, pad in names if not pad]
             wear = [f"wear/{name}" for name, pad in names if pad]
-            layout.style_clearances(self.stream, (*total, *wear))
-            self.slow = (Curves(self.stream, total), Curves(self.stream, wear))
-        for curves, chosen in zip(self.slow, (~pads, pads), strict=True):
-            curves.add(message.stamp_ns, max(self.step, 0), 1e3 * message.position[chosen])
+            layout.style_clearances(self.stream, (*total, *growth, *wear))
+            self.slow = (Curves(self.stream, total), Curves(self.stream, growth), Curves(self.stream, wear))
+        total_m, depth_m = message.position[~pads], message.position[pads]
+        new_m = [self._new_m[name.partition("/")[0]] for name, pad in zip(message.name, pads, strict=True) if not pad]
+        rows = (1e3 * total_m, 1e6 * (total_m - new_m), 1e3 * depth_m)
+        for curves, row in zip(self.slow, rows, strict=True):
+            curves.add(message.stamp_ns, max(self.step, 0), row)
 
     def _status(self, record: OutputRecord, message: DiagnosticStatus) -> None:
         if self._first_ns is None:
