@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -181,3 +182,11 @@ def test_info_lists_marks_and_versions() -> None:
     environment = plow_twin("info", "--json")
     assert environment.returncode == 0, environment.stderr
     assert json.loads(environment.stdout)["numpy"] == np.__version__
+
+
+def test_words_of_the_paper_scene_say_in_a_comment_what_they_rest_on() -> None:
+    text = scene_path("paper").read_text(encoding="utf-8")
+    words = re.findall(r"^ *(rotation|labels|law|locked|pairs|wear): (?:[^#\n]*)(.*)$", text, re.MULTILINE)
+    assert {key for key, _ in words} == {"rotation", "labels", "law", "locked", "pairs", "wear"}
+    for key, comment in words:
+        assert re.match("# (given|reconstructed|assumed): .", comment), f"{key}: {comment!r}"
