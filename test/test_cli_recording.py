@@ -89,6 +89,15 @@ def test_a_recording_stopped_early_ends_with_3_in_every_verb(tmp_path: Path) -> 
         assert verb == "view" or f"expected at least {2**62} B" in done.stdout
 
 
+def test_a_recording_with_counted_loss_ends_with_3_in_every_verb(tmp_path: Path) -> None:
+    lossy = record_run(tmp_path / "run", map(paper_sample, range(400)), queue_size=40, pause_every=200)
+    assert lossy.loss.closed and lossy.loss.lost and lossy.loss.error is None
+    for verb in ("replay", "view", "info"):
+        done = plow_twin(verb, lossy.folder)
+        assert done.returncode == 3, f"{verb}: {done.stderr}"
+        assert "lost" in done.stdout + done.stderr
+
+
 def test_info_counts_what_a_recording_holds(run: Run) -> None:
     done = plow_twin("info", run.file, "--json")
     assert done.returncode == 0, done.stderr

@@ -25,7 +25,9 @@ def view(recording: Path, out: Path | None, quiet: bool) -> int:
         summary = to_rrd(recording, out, on_progress=on_progress)
     if summary.status is not FileStatus.COMPLETE:
         click.echo(f"plow-twin: {recording}: {summary.status.value}", err=True)
+    if summary.lost:
+        click.echo(f"plow-twin: {recording}: lost {dict(summary.lost)}", err=True)
     if not quiet:
         click.echo(f"{out}: {summary.curve_rows} force rows, {summary.section_rows} pictures, {summary.events} events")
         click.echo(f"look at it with: rerun {out}")
-    return DONE if summary.status is FileStatus.COMPLETE else DONE_WITH_LOSS
+    return DONE if summary.status is FileStatus.COMPLETE and not summary.lost else DONE_WITH_LOSS

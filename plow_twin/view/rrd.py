@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -33,7 +33,10 @@ _WHITE: Final = (235, 235, 235)
 
 @dataclass(frozen=True)
 class ViewSummary:
-    """What a .rrd holds: first stamp, rows of the curves, moments of the cross-section, events, the recording's end."""
+    """What a .rrd holds: first stamp, rows of the curves, moments of the cross-section, events.
+
+    `status` is how the recording ended, `lost` what its recorder counted as lost, by topic.
+    """
 
     path: Path
     first_ns: int
@@ -41,6 +44,7 @@ class ViewSummary:
     section_rows: int
     events: int
     status: FileStatus
+    lost: Mapping[str, int]
 
 
 def to_rrd(
@@ -92,9 +96,13 @@ def to_rrd(
         if on_progress is not None and index % 1000 == 0:
             on_progress(reader.position)
     run.finish(reader.status)
+    if on_progress is not None:
+        on_progress(1.0)
     stream.flush()
     stream.disconnect()
-    return ViewSummary(out, run.first_ns, run.force.sent, run.section_rows, run.events.count, reader.status)
+    return ViewSummary(
+        out, run.first_ns, run.force.sent, run.section_rows, run.events.count, reader.status, reader.lost
+    )
 
 
 class _Run:
