@@ -28,9 +28,10 @@ lint: $(INSTALLED)
 	"$(VENV)/bin/ruff" check .
 	"$(VENV)/bin/mypy"
 
-# the peers come on top; one that cannot be installed here is named as not run
+# the peers come on top; where they cannot all be installed, those that lack are named as not run
+bench: PIP := "$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt
 bench: $(INSTALLED)
-	"$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt -e ".[bench]"
+	$(PIP) -e ".[bench]" || $(PIP) matplotlib
 	"$(VENV)/bin/python" benchmark/run.py $(BENCH_ARGS)
 
 $(INSTALLED): setup.py setup.cfg package.xml pyproject.toml requirements/constraints.txt

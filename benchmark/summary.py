@@ -162,7 +162,7 @@ def _plain_line(row: Row) -> str:
         row.scene, cell(row.simulated_s, "g"), cell(row.wall_ms, ".4g"), cell(row.steps, "d"), cell(row.events, "d"),
         cell(row.error, ".1e"), last,
     )  # fmt: skip
-    return "| " + " | ".join(cells) + " |"
+    return "| " + " | ".join(words.replace("|", "\\|") for words in cells) + " |"
 
 
 def _not_run(rows: Sequence[Row]) -> str:
