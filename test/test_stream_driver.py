@@ -84,6 +84,25 @@ def test_a_jump_of_the_stamps_starts_the_model_anew(jump_ns: int, key: str) -> N
     assert bench.kinds().count("Reset") == counters(bench.driver)[key] == counters(bench.driver)["resets"] == 1
 
 
+def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_goes_on() -> None:
+    bench = Bench(Policy(excitation_timeout_s=0.1))
+    driver = bench.driver
+    driver.sample(T0, LOAD, now_ns=0)
+    for tick in range(1, 31):
+        driver.silence(tick * 100 * MS)
+    digest = driver.session.twin.digest()
+    for index in range(1, 2000, 100):
+        assert driver.sample(T0 + index * MS, LOAD, now_ns=3000 * MS) is None
+    assert counters(driver)["dropped_late"] == 20
+    assert "Reset" not in bench.kinds()
+    assert driver.session.twin.digest() == digest
+    assert driver.sample(T0 + 3000 * MS, LOAD, now_ns=3000 * MS) is not None
+    # repeated just after a jump, it is a duplicate and not late
+    assert driver.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is not None
+    assert driver.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
+    assert counters(driver)["dropped_duplicate"] == 1
+
+
 def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_reset() -> None:
     bench = Bench(Policy(failure_limit=3))
     driver = bench.driver

@@ -28,6 +28,10 @@ MS = NS_PER_S // 1000
         (T0 - NS_PER_S, 1.0, T0, Verdict.OUT_OF_ORDER),
         (T0 + MS, 1.0, T0 + 5 * MS, Verdict.LATE),
         (T0 + 5 * MS, 1.0, T0 + 5 * MS, Verdict.LATE),
+        # a burst after a long silence, which the hold policy has bridged
+        (T0 + MS, 1.0, T0 + 9 * NS_PER_S, Verdict.LATE),
+        (T0 - MS, 1.0, T0 + 9 * NS_PER_S, Verdict.OUT_OF_ORDER),
+        (T0 - NS_PER_S - 1, 1.0, T0 + 9 * NS_PER_S, Verdict.JUMP_BACK),
         (T0 - NS_PER_S - 1, 1.0, T0, Verdict.JUMP_BACK),
         (T0 + 10 * NS_PER_S, 1.0, T0, Verdict.ACCEPTED),
         (T0 + 10 * NS_PER_S + 1, 1.0, T0, Verdict.JUMP_FORWARD),

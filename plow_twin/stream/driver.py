@@ -67,7 +67,7 @@ class Driver:
         if not verdict.used:
             return None
         if verdict.resets:
-            self.reset(stamp_ns, verdict.value)
+            self._restart_model(stamp_ns, verdict.value)
         self._received_ns, self._newest_ns, self._zeroed = now_ns, stamp_ns, False
         return self._advance(Sample(stamp_ns, wrench), now_ns, State.RUNNING)
 
@@ -94,7 +94,7 @@ class Driver:
         if not verdict.used:
             return None
         if verdict.resets:
-            self.reset(stamp_ns, f"clock {verdict.value}")
+            self._restart_model(stamp_ns, f"clock {verdict.value}")
         return self._advance(Hold(stamp_ns), now_ns, State.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
@@ -107,13 +107,9 @@ class Driver:
 
     def reset(self, stamp_ns: int, reason: str) -> None:
         """Put the model back to its initial state; the next sample starts its time anew."""
-        self.session.apply(Reset(stamp_ns, reason))
+        self._restart_model(stamp_ns, reason)
         self.intake.restart()
         self.clock.restart()
-        self.resets += 1
-        self._failures_in_row = 0
-        self._newest_ns = None
-        self.state = State.WAITING
 
     def resume(self, now_ns: int) -> None:
         """Let silence count from now on: the time spent inactive is not caught up."""
@@ -122,6 +118,13 @@ class Driver:
     def close(self) -> None:
         """End the journal."""
         self.session.close()
+
+    def _restart_model(self, stamp_ns: int, reason: str) -> None:
+        self.session.apply(Reset(stamp_ns, reason))
+        self.resets += 1
+        self._failures_in_row = 0
+        self._newest_ns = None
+        self.state = State.WAITING
 
     def _advance(self, entry: Entry, now_ns: int, state: State) -> Advance | None:
         before_ns = self.session.stamp_ns

@@ -124,17 +124,17 @@ class Intake:
             return Verdict.NON_FINITE
         if stamp_ns <= 0:
             return Verdict.UNSTAMPED
-        newest_ns = self._newest_ns
-        latest_ns = max((ns for ns in (newest_ns, reached_ns) if ns is not None), default=None)
-        if latest_ns is None:
+        newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
+        if newest_ns is None:
             return Verdict.ACCEPTED
-        if stamp_ns == newest_ns:
+        if stamp_ns == self._newest_ns:
             return Verdict.DUPLICATE
-        ahead_ns = stamp_ns - latest_ns
+        ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         if ahead_ns > self.jump_forward_s * NS_PER_S:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.ACCEPTED
-        if -ahead_ns > self.jump_back_s * NS_PER_S:
+        # against the sender's own stamps: how far the hold policy went ahead says nothing of its clock
+        if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
-        return Verdict.LATE if newest_ns is None or stamp_ns > newest_ns else Verdict.OUT_OF_ORDER
+        return Verdict.LATE if self._newest_ns is None or stamp_ns > newest_ns else Verdict.OUT_OF_ORDER
