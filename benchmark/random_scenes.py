@@ -24,8 +24,8 @@ DATA = HERE / "data" / "random_scenes.npz"
 COUNT, SEED = 200, 20150419
 T_END, OUTPUT_DT = 1.0, 0.02
 #: Settings (tolerance of a step, longest step in contact): two of each arithmetic, which must agree.
-LONG_DOUBLE = (1e-16, 0.3), (1e-15, 0.45)
-QUAD = (1e-21, 0.3), (1e-19, 0.45)
+LONG_DOUBLE = (1e-16, 0.6), (1e-15, 1.0)
+QUAD = (1e-21, 0.6), (1e-19, 1.0)
 #: Disagreement in clearances above which the pair is run again in 113-bit arithmetic.
 AGREED = 1e-11
 PERTURBATION = 1e-12

@@ -277,10 +277,25 @@ static real summit(const probe *p, real h)
     return high;
 }
 
-/* Root in [0, high] of a guard that is <= 0 at 0 and > 0 at high, from above: Illinois, then bisection. */
-static real root(const probe *p, real start, real high, real value)
+/* Point in [0, h] past the fall of a guard that falls first and rises later: there it is well below rounding noise. */
+static real valley(const probe *p, real h)
 {
-    real low = 0, below = start < 0 ? start : -1e-30L, v[2] = {0, 0};
+    real low = 0, high = h, v[2] = {0, 0};
+    for (int i = 0; i < 20; i++) {
+        real x = (low + high) / 2;
+        at(p, x, v);
+        if (v[0] <= 0 && v[1] < 0)
+            low = x;
+        else
+            high = x;
+    }
+    return low;
+}
+
+/* Root in [low, high] of a guard that is `start` <= 0 at low and `value` > 0 at high, from above: Illinois, bisection. */
+static real root(const probe *p, real low, real start, real high, real value)
+{
+    real below = start < 0 ? start : -1e-30L, v[2] = {0, 0};
     int side = 0;
     for (int i = 0; i < 200 && high - low > 1e-19L + 1e-18L * p->t; i++) {
         real x = i < 40 ? (below * high - value * low) / (below - value) : (low + high) / 2;
@@ -328,7 +343,12 @@ static real first_event(const scene *s, const contacts *k, real t, const real *z
             }
             if (high < 0)
                 continue;
-            real x = root(&p, a[0], high, value);
+            real low = 0, start[2] = {a[0], a[1]};
+            if (a[1] < 0) {
+                low = valley(&p, high);
+                at(&p, low, start);
+            }
+            real x = root(&p, low, start[0], high, value);
             if (best < 0 || x < best) {
                 best = x;
                 *pair = i;

@@ -54,14 +54,14 @@ def test_errors_on_the_bench_scenes_are_within_the_tolerance(
 
 
 def test_random_scenes_stay_near_their_references(rows: list[dict[str, str]]) -> None:
-    """Error in tolerances, for a scene that multiplies errors: at most what it makes of one tolerance."""
+    """Error in tolerances: at most ten, or a few times what the scene makes of one tolerance at the start."""
     calm = [
         row for row in rows
         if row["section"] == "random_scenes" and row["status"] == "ok" and float(row["amplification"]) < 1e4
     ]  # fmt: skip
     assert len(calm) >= 20
     for row in calm:
-        assert float(row["value"]) <= max(10.0, float(row["amplification"])), row["scene"]
+        assert float(row["value"]) <= max(10.0, 5.0 * float(row["amplification"])), row["scene"]
 
 
 def test_work_grows_with_contact_events_not_with_time(rows: list[dict[str, str]]) -> None:
@@ -115,6 +115,6 @@ def test_saved_references_belong_to_the_saved_scenes() -> None:
         q, lines = saved["q"], saved["lines"]
         assert q.shape == (200, 51, 3) and len(lines) == 200
         calm = saved["amplification"] < 1e3
-        assert calm.sum() > 100 and (saved["disagreement"][calm] < 1e-9).all()
+        assert calm.sum() > 100 and (saved["disagreement"][calm] < 1e-10).all()
     initial = np.array([[float(word) for word in str(line).split()[17:20]] for line in lines])
     assert np.abs(q[:, 0] - initial).max() < 1e-15
