@@ -27,6 +27,7 @@ def blocks(page: Path, language: str) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_and_named_files_exist(page: Path) -> None:
     text = page.read_text()
+    assert not re.search(r"PLACEHOLDER|TODO|TBD", text)
     for target in re.findall(r"\]\(([^)#]+)\)", text):
         assert "://" in target or (page.parent / target).exists(), target
     for name in re.findall(r"`((?:plow_twin|config|test|docs|tools|benchmark|launch)/[\w/.]+)`", text):
