@@ -86,6 +86,7 @@ class TwinNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take no samples; the state of the model is kept."""
         super().on_deactivate(state)
+        gc.unfreeze()
         self._running().deactivate()
         return self._entered("inactive")
 
@@ -106,6 +107,8 @@ class TwinNode(LifecycleNode):
 
     def release(self) -> None:
         """Give back everything and close the recording; can be called at any time."""
+        # a frozen runtime, being part of cycles, would never be given back
+        gc.unfreeze()
         runtime, self.runtime = self.runtime, None
         lost = runtime.close() if runtime is not None else None
         if lost is not None:
