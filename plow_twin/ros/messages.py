@@ -45,7 +45,8 @@ class ToolForces:
     """The wrench of measured forces along the directions of the scene's loads.
 
     1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; a pure moment
-    counts in N m. A table has no direction of its own and cannot be measured in this way.
+    counts in N m. A table, or a constant of zero, has no direction of its own and cannot be measured in this way: it may
+    be named, and its effort is ignored.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -54,6 +55,7 @@ class ToolForces:
             for load in scene.loads
             if isinstance(load, Harmonic | Constant) and np.any(load_direction(load))
         }
+        self._known = frozenset(load.name for load in scene.loads)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -62,11 +64,15 @@ class ToolForces:
 
     def wrench(self, message: JointState) -> Wrench | None:
         """Return the total wrench, or None when the message does not give each measurable load exactly once."""
-        if len(message.effort) != len(message.name) or sorted(message.name) != sorted(self._directions):
+        named = set(message.name)
+        if len(message.effort) != len(message.name) or len(named) != len(message.name):
+            return None
+        if not self._directions.keys() <= named <= self._known:
             return None
         total = np.zeros(3)
         for name, effort in zip(message.name, message.effort, strict=True):
-            total += effort * self._directions[name]
+            if name in self._directions:
+                total += effort * self._directions[name]
         return (float(total[0]), float(total[1]), float(total[2]))
 
 
