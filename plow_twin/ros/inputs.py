@@ -67,30 +67,34 @@ class Inputs:
         self.refused_publishers = 0
         excitation = self._excitation if source == "excitation" else self._not_selected
         tool_forces = self._tool_force_sample if source == "tool_forces" else self._not_selected
-        self._subscriptions = [
-            self._subscribe(WrenchStamped, "excitation", excitation, depth),
-            self._subscribe(JointState, "tool_forces", tool_forces, depth),
-            self._subscribe(TwistStamped, "travel", self._travel_speed, _SLOW_DEPTH),
-            self._subscribe(PoseStamped, "head_pose", self._measured_pose, _SLOW_DEPTH),
-        ]
+        self._subscriptions: list[Any] = []
+        try:
+            self._subscribe(WrenchStamped, "excitation", excitation, depth)
+            self._subscribe(JointState, "tool_forces", tool_forces, depth)
+            self._subscribe(TwistStamped, "travel", self._travel_speed, _SLOW_DEPTH)
+            self._subscribe(PoseStamped, "head_pose", self._measured_pose, _SLOW_DEPTH)
+        except BaseException:  # an override of the quality of service may be wrong for any of them
+            self.close()
+            raise
 
     def residual(self, q: NDArray[Any]) -> tuple[float, float, float] | None:
         """Return model minus measured pose, or None without a measurement."""
         if self.measured is None:
             return None
         x, y, theta = (float(model) - data for model, data in zip(q, self.measured, strict=True))
-        return x, y, theta
+        # a quaternion and its negative are the same turn
+        return x, y, math.remainder(theta, 2.0 * math.pi)
 
     def close(self) -> None:
         """Take the subscriptions off the node."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
 
-    def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], depth: int) -> Any:
+    def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], depth: int) -> None:
         events = SubscriptionEventCallbacks(
             message_lost=self._message_lost, incompatible_qos=lambda event: self._incompatible(topic, event)
         )
-        return self._node.create_subscription(
+        subscription = self._node.create_subscription(
             kind,
             topic,
             callback,
@@ -98,6 +102,7 @@ class Inputs:
             event_callbacks=events,
             qos_overriding_options=OVERRIDABLE,
         )
+        self._subscriptions.append(subscription)
 
     def _message_lost(self, event: Any) -> None:
         self.lost += event.total_count_change

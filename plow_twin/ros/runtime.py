@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -70,9 +71,18 @@ class Runtime:
         self.withheld = 0
         self._received_ns = 0
         self._q: NDArray[np.float64] | None = None
-        # the last thing that can fail: after it the node's topics are made
+        with ExitStack() as made:
+            self._make(twin, made)
+            made.pop_all()
+
+    def _make(self, twin: Twin, made: ExitStack) -> None:
+        """Open the recording and make everything on the node; what is made is noted to be undone on an error."""
+        node, settings = self._node, self._settings
         self.recording = self._record()
+        if self.recording:
+            made.callback(self.recording.close)
         self._publishers = FramePublishers(node, settings.frame_id, settings.child_frame_id)
+        made.callback(self._publishers.close)
         session = Session(twin, on_entry=self.recording.journal if self.recording else _ignore)
         self.driver = Driver(session, self._intake(), policy(settings))
         self.inputs = Inputs(
@@ -84,9 +94,14 @@ class Runtime:
             self._on_sample,
             self.driver.travel,
         )
+        made.callback(self.inputs.close)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timers = [self._timer(rate, callback) for rate, callback in self._periodic()]
+        self._timers: list[Any] = []
+        for rate, callback in self._periodic():
+            self._timers.append(self._timer(rate, callback))
+            made.callback(node.destroy_timer, self._timers[-1])
         self._reset_service = node.create_service(Trigger, "~/reset", self._on_reset)
+        made.callback(node.destroy_service, self._reset_service)
         session.start()
 
     @property

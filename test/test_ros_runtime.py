@@ -1,0 +1,110 @@
+"""What a node holds is given back: in this process, where threads, objects and topics can be counted."""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import threading
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ros_processes  # noqa: F401  (imports ROS without the warnings of its own modules)
+from geometry_msgs.msg import PoseStamped
+from rclpy.context import Context
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+
+from plow_twin.model.scene import Constant, Table
+from plow_twin.presets import scene_path
+from plow_twin.ros.messages import ToolForces
+from plow_twin.ros.node import TwinNode
+from plow_twin.scene_file import load_scene
+
+PAPER = load_scene(scene_path("paper"))
+
+
+@contextmanager
+def _node(**parameters: Any) -> Iterator[TwinNode]:
+    context = Context()
+    context.init(args=[])
+    overrides = [Parameter(name.replace("__", "."), value=value) for name, value in parameters.items()]
+    node = TwinNode(namespace=f"/r{os.getpid()}", context=context, parameter_overrides=overrides)
+    try:
+        yield node
+    finally:
+        node.release()
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def test_a_failed_configure_leaves_nothing_behind(tmp_path: Path) -> None:
+    # the last of the inputs: those before it have been made by then
+    override = f"qos_overrides./r{os.getpid()}/head_pose.subscription.reliability"
+    with _node(**{override: "bogus", "record_path": str(tmp_path / "run")}) as node:
+        threads = set(threading.enumerate())
+        topics = ("contact_forces", "head_state", "excitation", "travel")
+        before = len(list(node.publishers)), len(list(node.subscriptions)), len(list(node.timers))
+        for _ in range(2):
+            assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
+            assert "bogus" in node.reason
+            assert set(threading.enumerate()) == threads
+            assert (len(list(node.publishers)), len(list(node.subscriptions)), len(list(node.timers))) == before
+        assert [node.count_publishers(topic) for topic in topics] == [0] * len(topics)
+
+
+def test_no_runtime_outlives_its_cycle() -> None:
+    seen: list[weakref.ref[Any]] = []
+    with _node() as node:
+        for _ in range(3):
+            assert node.start()
+            assert node.runtime is not None
+            seen.append(weakref.ref(node.runtime))
+            assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+            assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+            gc.collect()
+            assert [reference() for reference in seen] == [None] * len(seen)
+        assert node.start()
+        assert node.runtime is not None
+        seen.append(weakref.ref(node.runtime))
+        node.release()  # straight out of the active state
+        gc.collect()
+        assert seen[-1]() is None
+    assert gc.get_freeze_count() == 0
+
+
+def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
+    with _node() as node:
+        assert node.start()
+        assert node.runtime is not None
+        found = []
+        for number, sign in enumerate((1.0, -1.0), 1):
+            message = PoseStamped()
+            message.header.stamp.sec = number
+            message.pose.orientation.z, message.pose.orientation.w = sign * math.sin(5e-3), sign * math.cos(5e-3)
+            node.runtime.inputs._measured_pose(message)
+            residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
+            assert residual is not None
+            found.append(residual[2])
+    assert found == pytest.approx([-0.008, -0.008], abs=1e-12)
+
+
+def test_loads_without_a_direction_may_be_named_and_count_nothing() -> None:
+    bias = Constant(name="bias", force_n=(0.0, 0.0))
+    table = Table(name="cut", t=(0.0, 1.0), wrench=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
+    tools = ToolForces(replace(PAPER, loads=(*PAPER.loads, bias, table)))
+    required = [load.name for load in PAPER.loads]
+    plain = tools.wrench(JointState(name=required, effort=[2.0] * len(required)))
+    assert plain is not None
+    every = [*required, "bias", "cut"]
+    assert tools.wrench(JointState(name=every, effort=[*[2.0] * len(required), 7.0, math.nan])) == plain
+    for wrong in (every[1:], [*every, "cut"], [*every, "drum"], []):
+        assert tools.wrench(JointState(name=wrong, effort=[1.0] * len(wrong))) is None
+    assert tools.wrench(JointState(name=every, effort=[1.0])) is None
