@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,6 +115,15 @@ def test_a_fixed_rate_loses_no_impact(tmp_path: Path) -> None:
     np.testing.assert_allclose(_column(peaks, "velocity").sum(axis=0), series.impulse.sum(axis=0), rtol=1e-12)
 
 
+def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_path: Path) -> None:
+    settings = {"publish_mode": "fixed_rate", "publish_rate": 1.0, "step_rate": 1000.0, "excitation_timeout": 60.0}
+    with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
+        forces = running.probe.listen(JointState, "contact_forces")
+        running.probe.excitation()(T0, (1.0, 2.0, 3.0))
+        running.probe.until(lambda: forces, "a frame")
+        assert float(running.probe.figures("output")["latency_max_ms"]) > 0.0
+
+
 def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_timeout=60.0) as running:
         probe = running.probe
@@ -167,6 +177,16 @@ def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> 
         send(T0 + 5 * MS, (0.0, 0.0, 0.0))
         probe.until(lambda: len(forces) == 2, "recovery")
         probe.until(lambda: probe.status[-1].level == b"\x00", "status OK")
+        # once more, the straight line out of it too, and a good one at once: the next report says so all the same
+        send(T0 + 6 * MS, (1e200, 1e200, 1e200))
+        for index in (7, 8):
+            send(T0 + index * MS, (0.0, 0.0, 0.0))
+        probe.until_figure("state", "solver_failures", "5")
+        parts = [report["plow_twin: state"] for report in probe.reports]
+        levels = [part.level for part in parts if value(part, "solver_failures") == "5"]
+        assert levels[0] == b"\x02"
+        probe.until(lambda: probe.reports[-1]["plow_twin: state"].level == b"\x00", "no failure since")
+    forces = forces[:2]
     assert [stamp_ns(message.header) - T0 for message in forces] == [0, 5 * MS]
 
 
@@ -209,6 +229,7 @@ def test_best_effort_and_reliable_publishers_connect(tmp_path: Path, reliability
 
 
 def test_silence_is_held_and_said(tmp_path: Path) -> None:
+    started_ns = time.time_ns()
     with bench(tmp_path, excitation_timeout=0.2) as running:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
@@ -222,6 +243,11 @@ def test_silence_is_held_and_said(tmp_path: Path) -> None:
         assert states == ["waiting", "running", "stale", "running", "stale"]
         assert [status.level for status in probe.status[-3:]] == [b"\x01", b"\x00", b"\x01"]
         assert value(probe.status[-1], "stale_inputs") == "excitation"
+        # the stamps go on with the clock, the newest sample does not
+        probe.until(lambda: stamp_ns(forces[-1].header) > T0 + 9_200 * MS, "held frames")
+        sent_ns = T0 + 9_000 * MS
+        assert float(probe.figures("input")["newest_sample_age_s"]) <= (time.time_ns() - sent_ns) * 1e-9
+        assert float(probe.figures("input")["newest_sample_age_s"]) > (started_ns - sent_ns) * 1e-9
         assert {key: value(probe.status[-1], key) for key in ("horizontal", "vertical", "pads")} == {
             "horizontal": "prior",
             "vertical": "prior",

@@ -134,3 +134,26 @@ def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:
             assert (advance.q == direct.advance((stamp - T0) * 1e-9).q).all()
     bench.driver.clock_tick(T0 - 100 * NS_PER_S, now_ns=0)
     assert isinstance(bench.journal[-2], Reset)
+
+
+def test_model_time_goes_on_where_it_was_after_an_inactive_hour() -> None:
+    bench, hour = Bench(excitation="scene"), 3600 * NS_PER_S
+    driver = bench.driver
+    driver.resume(0)
+    for now in (0, 500 * MS):
+        driver.clock_tick(T0 + now, now)
+    driver.resume(hour)
+    assert driver.clock_tick(T0 + hour, hour) is None
+    advance = driver.clock_tick(T0 + hour + 200 * MS, hour + 200 * MS)
+    assert advance is not None
+    direct = Twin(SCENE)
+    direct.advance(0.5)
+    assert (advance.t, advance.q.tobytes()) == (700 * MS * 1e-9, direct.advance(700 * MS * 1e-9).q.tobytes())
+    assert "Reset" not in bench.kinds()
+    # a step of the clock, and a reset, start on the clock itself
+    driver.clock_tick(T0 + 2 * hour, hour)
+    assert bench.journal[-2:] == [Reset(T0 + 2 * hour, "clock jump_forward"), Hold(T0 + 2 * hour)]
+    driver.resume(3 * hour)
+    driver.reset(T0 + 2 * hour, "service")
+    driver.clock_tick(T0 + 3 * hour, 3 * hour)
+    assert bench.journal[-1] == Hold(T0 + 3 * hour)

@@ -40,6 +40,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "source": "excitation source in use",
         "samples_in": "samples that arrived on the excitation topics",
         "samples_used": "samples that the model was advanced to",
+        "newest_sample_age_s": "the node's time minus the stamp of the newest sample used [s]; empty without one",
         "samples_missing": "samples that expected_rate asks for and that never came",
         "messages_lost": "messages that the middleware reports as lost on the way",
         "dropped_non_finite": "dropped: a number is not finite",
@@ -135,6 +136,8 @@ class Health:
     def state(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> Part:
         """Return lifecycle, stream and solver."""
         level, message, _ = summary(lifecycle, reason, runtime)
+        if runtime is not None and self._grown({"solver_failures": runtime.driver.failures}, ("solver_failures",)):
+            level, message = ERROR, f"{State.FAILED.value}: {runtime.driver.failure}"
         values = dict.fromkeys(KEYS["state"], "")
         values |= {"lifecycle": lifecycle, "reason": reason}
         if runtime is not None:
@@ -155,9 +158,10 @@ class Health:
     def input(self, runtime: Runtime) -> Part:
         """Return what arrived and what became of it."""
         counted = counters(runtime.driver)
-        inputs, residual = runtime.inputs, runtime.residual()
+        inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.newest_sample_age_s()
         values = {key: str(counted[key]) for key in KEYS["input"] if key in counted} | {
             "source": runtime.source,
+            "newest_sample_age_s": "" if age_s is None else f"{age_s:.3f}",
             "messages_lost": str(inputs.lost),
             "travel_used": str(inputs.travel.used),
             "travel_dropped": str(inputs.travel.arrived - inputs.travel.used),
@@ -224,7 +228,6 @@ _TROUBLE: Final = (
     "out_of_plane",
     "samples_missing",
     "messages_lost",
-    "solver_failures",
 )
 
 

@@ -123,6 +123,11 @@ class Runtime:
         """Return model minus newest measured pose: x, y [m], theta [rad], or None without a measurement."""
         return self.inputs.residual(self._q) if self._q is not None else None
 
+    def newest_sample_age_s(self) -> float | None:
+        """Return the node's time minus the stamp of the newest sample used [s], or None before one."""
+        newest_ns = self.driver.newest_ns
+        return None if newest_ns is None else (self._ros_time_ns() - newest_ns) * 1e-9
+
     def record_status(self, name: str, hardware_id: str, report: Part) -> None:
         """Put a published status into the recording."""
         if self.recording:
@@ -207,8 +212,11 @@ class Runtime:
         self._advanced(self.driver.sample(stamp_ns, wrench, now_ns))
 
     def _on_silence(self) -> None:
-        self._received_ns = 0
-        self._advanced(self.driver.silence(time.monotonic_ns()))
+        advance = self.driver.silence(time.monotonic_ns())
+        if advance is not None:
+            # what is published next answers no message
+            self._received_ns = 0
+        self._advanced(advance)
 
     def _on_clock(self) -> None:
         self._received_ns = now_ns = time.monotonic_ns()

@@ -60,6 +60,14 @@ class Driver:
         self._received_ns = 0
         self._newest_ns: int | None = None
         self._zeroed = False
+        #: what the stamps of the scene's own loads lie behind the clock [ns]: time spent inactive
+        self._behind_ns = 0
+        self._resumed = False
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest sample used [ns]; None before the first and after a reset."""
+        return self._newest_ns
 
     def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Advance | None:
         """Judge a sample and, when it is used, advance to it."""
@@ -89,11 +97,26 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, State.STALE)
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Advance | None:
-        """Advance under the scene's own loads to the time `stamp_ns` of the node's clock."""
+        """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
+
+        The first call after `resume` only finds out how long that was.
+        """
+        reached_ns = self.session.stamp_ns
+        if reached_ns is None:
+            self._behind_ns = 0
+        elif self._resumed and stamp_ns > 0:
+            self._behind_ns = stamp_ns - reached_ns
+        self._resumed = self._resumed and stamp_ns <= 0
+        stamp_ns -= self._behind_ns
         verdict = self.clock.judge(stamp_ns, (), self.session.stamp_ns)
         if not verdict.used:
             return None
         if verdict.resets:
+            # the model starts anew: on the clock itself
+            stamp_ns += self._behind_ns
+            self._behind_ns = 0
+            self.clock.restart()
+            self.clock.judge(stamp_ns, ())
             self._restart_model(stamp_ns, f"clock {verdict.value}")
         return self._advance(Hold(stamp_ns), now_ns, State.RUNNING)
 
@@ -112,8 +135,9 @@ class Driver:
         self.clock.restart()
 
     def resume(self, now_ns: int) -> None:
-        """Let silence count from now on: the time spent inactive is not caught up."""
+        """Let silence and the clock count from now on: the time spent inactive is not caught up."""
         self._received_ns = now_ns
+        self._resumed = True
 
     def close(self) -> None:
         """End the journal."""
