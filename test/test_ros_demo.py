@@ -1,4 +1,4 @@
-"""The main job, live, as a user starts it: publisher, node and recorder as processes, summed up from the recording."""
+"""The main job, live, as a user starts it: publisher and node as processes, summed up from the recording."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ros_processes import ROOT
 
 from plow_twin.model.loads import compile_loads
 from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.ros.demo import program
 from plow_twin.ros.run_summary import summarise
 from plow_twin.scene_file import load_scene
 from plow_twin.twin import Twin
@@ -34,10 +35,14 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
         "horizontal clearance 25.000",
         " nm, deepest pad",
         "real-time factor ",
-        "plow-twin replay ",
-        "rerun ",
+        "  look at it: ",
     ):
         assert line in done.stdout, done.stdout
+    if speed == "fast":
+        # what is printed can be run from here, with nothing of the environment on PATH
+        (again,) = (line.partition(":  ")[2] for line in done.stdout.splitlines() if "again, bit for bit" in line)
+        bare = dict(os.environ) | {"PATH": "/usr/bin:/bin"}
+        assert subprocess.run(again, shell=True, cwd=ROOT, env=bare, capture_output=True, timeout=100).returncode == 0
     (folder,) = tmp_path.iterdir()
     reader = RunReader(folder / "run")
     assert sum(1 for _ in reader) > 12000
@@ -61,6 +66,20 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     assert 0.025 < low < horizontal < high
     for shares in summary.contact_sets.values():
         assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_a_program_is_named_as_a_shell_in_this_folder_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "my project" / ".venv" / "bin"
+    folder.mkdir(parents=True)
+    (folder / "plow-twin").touch()
+    monkeypatch.setattr(sys, "executable", str(folder / "python"))
+    monkeypatch.chdir(tmp_path / "my project")
+    assert program("plow-twin", "plow_twin") == ".venv/bin/plow-twin"
+    assert program("rerun", "rerun") == ".venv/bin/python -m rerun"
+    monkeypatch.chdir(folder)
+    assert program("plow-twin", "plow_twin") == "./plow-twin"
+    monkeypatch.chdir("/")
+    assert program("plow-twin", "plow_twin") in (f"'{folder}/plow-twin'", f"'{str(folder)[1:]}/plow-twin'")
 
 
 def test_a_demo_whose_node_cannot_start_fails_and_says_why(tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
-"""The main job, live: publisher, node and recorder in processes of their own, watched and summed up."""
+"""The main job, live: a publisher process and a node process with its recorder, watched and summed up."""
 
 from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -318,11 +319,23 @@ def _force_table(summary: RunSummary) -> Table:
     return table
 
 
+def program(name: str, module: str) -> str:
+    """Return how a shell in the present folder starts a program of this environment, on PATH or not."""
+    beside = Path(sys.executable).with_name(name)
+    path, arguments = (beside, []) if beside.exists() else (Path(sys.executable), ["-m", module])
+    relative = os.path.relpath(path)
+    # a bare name would be looked for on PATH
+    relative = relative if os.sep in relative else os.path.join(os.curdir, relative)
+    return shlex.join([min(str(path), relative, key=len), *arguments])
+
+
 def _print_places(console: Console, recording: Path, view: Path | None) -> None:
+    again = f"{program('plow-twin', 'plow_twin')} replay {shlex.quote(str(recording))}"
     console.print(f"recording  {recording}", highlight=False, soft_wrap=True)
-    console.print(f"  again, bit for bit:  plow-twin replay {recording}", highlight=False, soft_wrap=True)
+    console.print(f"  again, bit for bit:  {again}", highlight=False, soft_wrap=True)
     if view is None:
         console.print("no view: rerun is not installed (pip install 'plow_twin[view]')", markup=False, highlight=False)
         return
+    look = f"{program('rerun', 'rerun')} {shlex.quote(str(view))}"
     console.print(f"view       {view}", highlight=False, soft_wrap=True)
-    console.print(f"  look at it:          rerun {view}", highlight=False, soft_wrap=True)
+    console.print(f"  look at it:          {look}", highlight=False, soft_wrap=True)
