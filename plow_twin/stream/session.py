@@ -34,7 +34,8 @@ class Session:
     origin_ns
         Stamp of model time 0, or None: the first stamp.
     on_entry
-        Receives each accepted entry before it is applied, and each digest after the advance that it covers.
+        Receives each entry in order of time just before it is applied, and each digest after the advance that it
+        covers. An entry that the twin then refuses (a number is not finite) has been emitted: a replay refuses it too.
     """
 
     def __init__(self, twin: Twin, origin_ns: int | None = None, on_entry: Callable[[Entry], object] = _ignore) -> None:
@@ -63,8 +64,8 @@ class Session:
         Raises
         ------
         ValueError
-            The entry cannot be applied (its stamp lies before the time reached, a number is not finite); nothing is
-            changed then.
+            The entry cannot be applied (its stamp lies before the time reached, a number is not finite); the
+            motion is unchanged then.
         """
         match entry:
             case Sample(stamp_ns, wrench):
