@@ -95,8 +95,8 @@ class Probe:
     def listen(self, kind: type, topic: str) -> list[Any]:
         """Return the list that all messages from now on are added to."""
         heard: list[Any] = []
-        self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
-        self.until(lambda: self.node.count_publishers(topic) > 0, f"a publisher of {topic}")
+        subscription = self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
+        self.until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
         return heard
 
     def until(self, reached: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> None:
@@ -124,12 +124,18 @@ class Probe:
             f"{part} {key} = {expected}",
         )
 
+    def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 1000) -> Any:
+        """Return a publisher, once the twin says that it is connected to it."""
+        key = f"publishers_{topic}"
+        before = value(self.status[-1], key)
+        publisher = self.node.create_publisher(kind, topic, profile)
+        self.until(lambda: value(self.status[-1], key) not in (before, "", "0"), f"the twin to read {topic}")
+        self.until(lambda: publisher.get_subscription_count() > 0, f"a reader of {topic}")
+        return publisher
+
     def excitation(self, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE) -> Callable[..., None]:
         """Return a function that publishes a sample, once the twin reads it."""
-        profile = QoSProfile(depth=5000, reliability=reliability)
-        publisher = self.node.create_publisher(WrenchStamped, "excitation", profile)
-        self.until(lambda: publisher.get_subscription_count() > 0, "a reader of excitation")
-        self.pause(0.3)
+        publisher = self.publisher(WrenchStamped, "excitation", QoSProfile(depth=5000, reliability=reliability))
 
         def send(stamp_ns: int, wrench: Sequence[float], **components: float) -> None:
             message = WrenchStamped()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import itertools
 import math
 import signal
 import time
@@ -130,9 +131,7 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         forces = probe.listen(JointState, "contact_forces")
         send = probe.excitation()
         good = (30e3, 0.0, -40e3)
-        other = probe.node.create_publisher(JointState, "tool_forces", 10)
-        probe.until(lambda: other.get_subscription_count() > 0, "a reader of tool_forces")
-        probe.pause(0.3)
+        other = probe.publisher(JointState, "tool_forces")
         send(T0, good)
         for bad in ((math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, -math.inf)):
             send(T0 + MS, bad)
@@ -239,7 +238,8 @@ def test_silence_is_held_and_said(tmp_path: Path) -> None:
         send(T0 + 9_000 * MS, (30e3, 0.0, 0.0))
         probe.until(lambda: stamp_ns(forces[-1].header) >= T0 + 9_000 * MS, "the sample after it")
         probe.until(lambda: sum(status.level == b"\x01" for status in probe.status) == 2, "silence again")
-        states = [value(status, "stream") for status in probe.status if value(status, "lifecycle") == "active"]
+        streams = (value(status, "stream") for status in probe.status if value(status, "lifecycle") == "active")
+        states = [state for state, _ in itertools.groupby(streams)]
         assert states == ["waiting", "running", "stale", "running", "stale"]
         assert [status.level for status in probe.status[-3:]] == [b"\x01", b"\x00", b"\x01"]
         assert value(probe.status[-1], "stale_inputs") == "excitation"
@@ -305,10 +305,7 @@ def test_travel_rules_the_wear_and_a_measured_pose_is_compared(tmp_path: Path) -
         probe = running.probe
         clearances, rates = probe.listen(JointState, "clearance"), probe.listen(JointState, "wear_rate")
         send = probe.excitation()
-        travel = probe.node.create_publisher(TwistStamped, "travel", 10)
-        pose = probe.node.create_publisher(PoseStamped, "head_pose", 10)
-        probe.until(lambda: travel.get_subscription_count() and pose.get_subscription_count(), "their readers")
-        probe.pause(0.3)
+        travel, pose = probe.publisher(TwistStamped, "travel"), probe.publisher(PoseStamped, "head_pose")
         for index in range(1000):
             send(T0 + index * MS, (32e3, 0.0, -45e3))
             probe.pace(index)
@@ -341,9 +338,7 @@ def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_source="tool_forces", excitation_timeout=60.0, **reliable) as running:
         probe = running.probe
         heads = probe.listen(Odometry, "head_state")
-        publisher = probe.node.create_publisher(JointState, "tool_forces", 1000)
-        probe.until(lambda: publisher.get_subscription_count() > 0, "a reader of tool_forces")
-        probe.pause(0.3)
+        publisher = probe.publisher(JointState, "tool_forces")
         for index, share in enumerate(scale):
             # any order of the names will do
             names = sorted(amplitudes, reverse=bool(index % 2))
@@ -360,18 +355,20 @@ def test_tool_forces_drive_the_model_like_their_sum(tmp_path: Path) -> None:
     np.testing.assert_allclose(poses, series.q[:, :2], rtol=1e-9, atol=1e-15)
 
 
+def _at(heads: list[Odometry], stamp: int) -> bool:
+    return bool(heads) and stamp_ns(heads[-1].header) == stamp
+
+
 def test_the_scenes_own_loads_run_by_the_nodes_clock(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_source="scene", use_sim_time="true") as running:
         probe = running.probe
         heads = probe.listen(Odometry, "head_state")
         clock = probe.node.create_publisher(Clock, "/clock", 10)
-        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
-        probe.pause(0.3)
         for step in range(5):
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(T0 + step * 300 * MS, 1_000_000_000)
-            clock.publish(message)
-            probe.until(lambda: heads and stamp_ns(heads[-1].header) == T0 + step * 300 * MS, "its answer")  # noqa: B023
+            # again and again: the twin's side of the connection may lag behind this one's
+            probe.until(lambda: clock.publish(message) or _at(heads, T0 + step * 300 * MS), "its answer")  # noqa: B023
     twin = Twin(PAPER)
     for index, head in enumerate(heads):
         q = twin.advance((stamp_ns(head.header) - T0) * 1e-9).q

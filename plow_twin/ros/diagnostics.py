@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from plow_twin.ros.inputs import TOPICS
 from plow_twin.stream.driver import State, counters
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated or not_observable",
     "vertical": "the same of the vertical clearance",
     "pads": "the same of the pads' wear",
+    **{f"publishers_{topic}": f"publishers of `{topic}` that this node is connected to" for topic in TOPICS},
 }
 
 
@@ -121,6 +123,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None) -> tuple[bytes
     values["stream"] = state.name.lower()
     values["stale_inputs"] = "excitation" if state is State.STALE else ""
     values |= dict.fromkeys(("horizontal", "vertical", "pads"), "prior")
+    values |= {f"publishers_{topic}": str(count) for topic, count in runtime.inputs.publishers.items()}
     if lifecycle != "active":
         return OK, lifecycle, values
     message = f"{state.value}: {runtime.driver.failure}" if state is State.FAILED else state.value

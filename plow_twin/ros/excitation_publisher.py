@@ -43,7 +43,6 @@ WINDOW: Final = 200
 _CLOCK_EVERY: Final = 10
 #: Without an answer for so long, the samples under way count as lost [s].
 _STALL_S: Final = 2.0
-_SETTLE_S: Final = 0.3
 #: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
 _STAMP: Final = struct.Struct("<4xiI")
 
@@ -68,7 +67,7 @@ class ExcitationPublisher(Node):
         self._message = WrenchStamped()
         self._message.header.frame_id = "slide_frame"
         self._samples = self.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=1000))
-        self._twin_active = False
+        self._twin_reads = False
         self._answered_ns = FIRST_STAMP_NS
         self.sent = 0
         #: longest delay of a sample behind its time on the grid [s]
@@ -89,13 +88,11 @@ class ExcitationPublisher(Node):
             if self._stop.stopped or time.monotonic() > give_up:
                 return False
             self._executor.spin_once(timeout_sec=0.05)
-        # the twin's side of the connections may lag behind this one's
-        time.sleep(_SETTLE_S)
         return True
 
     def _connected(self) -> bool:
         answering = self._answers is None or self.count_publishers("contact_peaks") > 0
-        return self._twin_active and self._samples.get_subscription_count() > 0 and answering
+        return self._twin_reads and self._samples.get_subscription_count() > 0 and answering
 
     def run_real(self) -> None:
         """Send each sample at its own time, stamped with that time."""
@@ -147,7 +144,9 @@ class ExcitationPublisher(Node):
         self.sent += 1
 
     def _on_status(self, message: DiagnosticStatus) -> None:
-        self._twin_active = any(value.key == "lifecycle" and value.value == "active" for value in message.values)
+        values = {value.key: value.value for value in message.values}
+        # the twin's side of the connection may lag behind this one's
+        self._twin_reads = values.get("lifecycle") == "active" and values.get("publishers_excitation", "0") != "0"
 
     def _on_answer(self, data: bytes) -> None:
         sec, nanosec = _STAMP.unpack_from(data)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from numpy.typing import NDArray
@@ -19,6 +19,8 @@ from plow_twin.stream.intake import Intake, Verdict
 
 #: Depth of the optional inputs' queues.
 _SLOW_DEPTH = 200
+#: The input topics.
+TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose")
 
 
 class Inputs:
@@ -40,6 +42,8 @@ class Inputs:
         Receives stamp [ns] and wrench of each sample from the selected source.
     on_travel
         Receives stamp [ns] and speed along the face [m/s].
+    on_matched
+        Called when the number of publishers of an input has changed.
     """
 
     def __init__(
@@ -51,11 +55,13 @@ class Inputs:
         intake: Intake,
         on_sample: Callable[[int, Wrench], None],
         on_travel: Callable[[int, float], None],
+        on_matched: Callable[[], None],
     ) -> None:
         self._node = node
         self._intake = intake
         self._on_sample = on_sample
         self._on_travel = on_travel
+        self._on_matched = on_matched
         self._tool_forces = ToolForces(scene)
         self.active = False
         #: messages that the middleware reports as lost before they could be read
@@ -65,6 +71,8 @@ class Inputs:
         #: newest measured pose x, y [m], theta [rad]
         self.measured: tuple[float, float, float] | None = None
         self.refused_publishers = 0
+        #: publishers that each input is connected to
+        self.publishers = dict.fromkeys(TOPICS, 0)
         excitation = self._excitation if source == "excitation" else self._not_selected
         tool_forces = self._tool_force_sample if source == "tool_forces" else self._not_selected
         self._subscriptions: list[Any] = []
@@ -92,7 +100,9 @@ class Inputs:
 
     def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], depth: int) -> None:
         events = SubscriptionEventCallbacks(
-            message_lost=self._message_lost, incompatible_qos=lambda event: self._incompatible(topic, event)
+            message_lost=self._message_lost,
+            incompatible_qos=lambda event: self._incompatible(topic, event),
+            matched=lambda event: self._matched(topic, event),
         )
         subscription = self._node.create_subscription(
             kind,
@@ -113,6 +123,10 @@ class Inputs:
             f"{topic}: nothing is received from a publisher of incompatible quality of service "
             f"({event.last_policy_kind})"
         )
+
+    def _matched(self, topic: str, event: Any) -> None:
+        self.publishers[topic] = event.current_count
+        self._on_matched()
 
     def _excitation(self, message: WrenchStamped) -> None:
         if not self.active:

@@ -62,16 +62,17 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
 
     from plow_twin.ros.node import TwinNode
     from plow_twin.ros.parameters import ParameterError
+    from plow_twin.ros.solver_start import leave
 
     rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
-        node = TwinNode()
+        node = TwinNode(stop_asked=lambda: stop.stopped)
+        stop.interrupt = False
         executor = make_executor()
         executor.add_node(node)
         if node.autostart:
             node.start()
-        stop.interrupt = False
         while not stop.stopped and rclpy.utilities.ok():
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)
@@ -84,7 +85,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
             node.release()
             node.destroy_node()
         rclpy.utilities.try_shutdown()
-    return 0
+    return leave(0)
 
 
 if __name__ == "__main__":

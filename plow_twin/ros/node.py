@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import time
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -24,7 +25,8 @@ class TwinNode(LifecycleNode):
     """The twin on ROS 2.
 
     Takes the keyword arguments of `rclpy.node.Node`, so that several can live in one process and executor. Code that
-    makes one calls `start` for what the parameter `autostart` does in the program.
+    makes one calls `start` for what the parameter `autostart` does in the program. `stop_asked` is looked at while the
+    solver is compiled.
 
     Raises
     ------
@@ -32,8 +34,11 @@ class TwinNode(LifecycleNode):
         Some parameters given at start cannot be used; the message lists them all.
     """
 
-    def __init__(self, node_name: str = "plow_twin", **options: Any) -> None:
+    def __init__(
+        self, node_name: str = "plow_twin", *, stop_asked: Callable[[], bool] = lambda: False, **options: Any
+    ) -> None:
         super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
+        self._stop_asked = stop_asked
         self.runtime: Runtime | None = None
         self.lifecycle = "unconfigured"
         #: why the last configure failed
@@ -62,7 +67,7 @@ class TwinNode(LifecycleNode):
         """Load the scene, compile the solver, open the recording, make all topics; fails with a reason."""
         settings = self._table.settings
         try:
-            self.runtime = Runtime(self, settings, self._publish_status)
+            self.runtime = Runtime(self, settings, self._publish_status, self._stop_asked)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
         except Exception:  # rclpy would swallow it

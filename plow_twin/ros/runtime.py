@@ -20,6 +20,7 @@ from plow_twin.ros.inputs import Inputs
 from plow_twin.ros.messages import Wrench
 from plow_twin.ros.parameters import Settings
 from plow_twin.ros.publishers import TOPICS, FramePublishers
+from plow_twin.ros.solver_start import warm_up
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.driver import Driver, Policy
 from plow_twin.stream.health import DurationHistogram
@@ -47,14 +48,20 @@ class Runtime:
         Its parameters.
     changed
         Called when the state of the stream may have changed.
+    stop_asked
+        Whether the process shall end; looked at while the solver is compiled.
 
     Raises
     ------
     SceneError, RecordingError, OSError
         The scene or the recording cannot be used.
+    StartAbandoned
+        A stop was asked for before the solver was ready.
     """
 
-    def __init__(self, node: Node, settings: Settings, changed: Callable[[], None]) -> None:
+    def __init__(
+        self, node: Node, settings: Settings, changed: Callable[[], None], stop_asked: Callable[[], bool]
+    ) -> None:
         self._node = node
         self._settings = settings
         self._changed = changed
@@ -64,7 +71,7 @@ class Runtime:
         node.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
         twin = Twin(self.scene, tol=settings.tolerance, excitation="sampled" if sampled else "scene")
         #: seconds that compiling or loading the solver took
-        self.compile_s = twin.warm_up()
+        self.compile_s = warm_up(twin, stop_asked)
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
         #: frames that were not published because a number was not finite
@@ -93,6 +100,7 @@ class Runtime:
             self.driver.intake,
             self._on_sample,
             self.driver.travel,
+            self._changed,
         )
         made.callback(self.inputs.close)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
