@@ -17,6 +17,8 @@ EXTRAS = {
     # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
     "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18"],
     "view": ["rerun-sdk>=0.41"],
+    "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1"],
+    "dask": ["distributed>=2024.1"],
     "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9"],
     "test": ["pytest>=8", "pytest-timeout", "hypothesis"],
 }

@@ -26,8 +26,9 @@ ROOMS = {
     "stream": CORE,
     "record": CORE | {"scene_file", "stream"},
     "view": CORE | {"scene_file", "stream", "record"},
+    "study": CORE | {"scene_file", "presets", "stream", "record", "view"},
     "ros": CORE | {"scene_file", "presets", "stream", "record", "view"},
-    "cli": CORE | {"scene_file", "presets", "stream", "record", "view", "ros"},
+    "cli": CORE | {"scene_file", "presets", "stream", "record", "view", "study", "ros"},
     "__init__": CORE,
     "__main__": {"cli"},
 }
@@ -42,6 +43,7 @@ LIBRARIES = {
     "scene_file": {"yaml", "jsonschema"},
     "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite"},
     "view": {"rerun"},
+    "study": {"scipy", "yaml", "jsonschema", "matplotlib", "pyarrow", "distributed", "jinja2", "rerun"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", "rich", *MESSAGES},
     "cli": {"click", "rich"},
 }
@@ -80,6 +82,7 @@ def test_imports_point_one_way(path: Path) -> None:
         ("import plow_twin", {"jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"}),
         ("import plow_twin.stream.session", {"jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"}),
         ("import plow_twin.cli, plow_twin.record.replay", {"mcap", "rosbags", "rerun", "rclpy"}),
+        ("import plow_twin.cli, plow_twin.study", {"matplotlib", "pyarrow", "distributed", "jinja2", "rerun"}),
     ],
 )
 def test_heavy_libraries_are_imported_where_they_are_used(statement: str, unwanted: set[str]) -> None:

@@ -14,6 +14,7 @@ from plow_twin.cli.demo import demo
 from plow_twin.cli.info import info
 from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
+from plow_twin.cli.study import study
 from plow_twin.cli.view import view
 from plow_twin.errors import PlowTwinError, SceneError
 from plow_twin.record.header import package_version
@@ -34,6 +35,10 @@ EXTRA_OF_MODULE: Final = {
     "mcap": "record",
     "rosbags": "record",
     "rerun": "view",
+    "matplotlib": "study",
+    "pyarrow": "study",
+    "jinja2": "study",
+    "distributed": "dask",
 }
 
 
@@ -46,7 +51,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, replay, view, info):
+for _verb in (simulate, demo, replay, view, info, study):
     commands.add_command(_verb)
 
 
