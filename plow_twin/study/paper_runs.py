@@ -1,0 +1,179 @@
+"""The runs behind the comparison with the paper, all computed from one scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.ensemble import simulate_many
+from plow_twin.errors import Problem, SceneError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Clearance, Harmonic, Scene
+from plow_twin.simulate import Result, simulate
+from plow_twin.study.paper_rotation import Rotation, rotation_scenes
+from plow_twin.study.paper_sets import letters_of_pairs
+from plow_twin.study.paper_values import (
+    CASE_M,
+    CORNERS,
+    FACE_GRID_M,
+    FACE_T_END_S,
+    FACES,
+    FIXED_M,
+    GRID_M,
+    OMEGA_RAD_S,
+    PERIOD_S,
+)
+
+Array = NDArray[np.float64]
+OnProgress = Callable[[float], object]
+
+#: Shortest run that has a settled period of the load to look at.
+SHORTEST_S = 2.0 * PERIOD_S
+#: Rows of the figures [s]; forces change over tens of milliseconds.
+OUTPUT_DT_S = 1e-3
+#: Steps of the curves between the five places where the paper's are read.
+_FINE_STEPS = 10
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Largest force of each corner over both senses [N], shape (n, 4), against a clearance [m], shape (n,)."""
+
+    clearance_m: Array
+    largest_n: Array
+
+    def on_grid(self) -> Array:
+        """Return the forces at the five places of the paper's grid, shape (5, 4)."""
+        return self.largest_n[::_FINE_STEPS]
+
+
+@dataclass(frozen=True)
+class FaceRun:
+    """A run of 20 s at a clearance [m] and the force on each inner face [N] in time, shape (n, 4) as `FACES`."""
+
+    clearance_m: float
+    t: Array
+    face_n: Array
+
+
+@dataclass(frozen=True)
+class PaperRuns:
+    """Everything that is computed. `scale` is the scene's clearance over the published one: horizontal, vertical."""
+
+    scene: Scene
+    t_end: float
+    scale: tuple[float, float]
+    case: Result
+    vertical: Sweep
+    horizontal: Sweep
+    faces: FaceRun
+    faces_vertical: tuple[FaceRun, ...]
+    faces_horizontal: tuple[FaceRun, ...]
+    rotation: Rotation | None
+    failed: int
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise `SceneError` for a scene that cannot be compared with the paper."""
+    problems = []
+    if tuple(sorted(scene.frame.labels)) != CORNERS:
+        problems.append(
+            Problem("frame.labels", dict(scene.frame.labels), "the letters a, b, c, d, one for each corner")
+        )
+    omegas = {load.omega_rad_s for load in scene.loads if isinstance(load, Harmonic)}
+    if omegas != {OMEGA_RAD_S}:
+        problems.append(Problem("loads", sorted(omegas), f"harmonics of {OMEGA_RAD_S:g} rad/s, as the paper has them"))
+    for name, value in zip(("horizontal_m", "vertical_m"), _clearances(scene), strict=True):
+        if not value > 0.0:
+            problems.append(Problem(f"clearance.{name}", value, "a clearance > 0 [m]"))
+    if problems:
+        raise SceneError(problems, "comparison with the paper")
+
+
+def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress: OnProgress | None = None) -> PaperRuns:
+    """Run everything that the figures and the table need.
+
+    Parameters
+    ----------
+    scene : Scene
+        At the clearance of the paper's Figs 6 to 9, whatever its convention: the other clearances are scaled alike.
+    t_end : float
+        End of the runs in s, at least `SHORTEST_S`; those of section 5 end at 20 s or with it.
+    workers, on_progress
+        Threads, all cores by default; receives the share done.
+
+    Raises
+    ------
+    SceneError
+        The scene cannot be compared: labels, loads or clearances.
+    """
+    check_scene(scene)
+    scale = (scene.clearance.horizontal_m / CASE_M[0], scene.clearance.vertical_m / CASE_M[1])
+    tell = on_progress or (lambda share: None)
+    case = simulate(scene, t_end, OUTPUT_DT_S)
+    rotation = rotation_scenes(scene, t_end, OUTPUT_DT_S)
+    tell(0.1)
+    fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
+    cells = [(FIXED_M, value) for value in fine] + [(value, FIXED_M) for value in fine]
+    scenes = [_at(scene, scale, *cell) for cell in cells]
+
+    def on_member(done: int) -> None:
+        tell(0.1 + 0.7 * done / len(scenes))
+
+    many = simulate_many(scenes, t_end, t_end, workers=workers, on_progress=on_member)
+    peak = np.where((many.status == 0)[:, None], many.peak, np.nan)
+    largest = _by_corner(scene, peak)
+    end = min(FACE_T_END_S, t_end)
+    vertical = [_face_run(_at(scene, scale, FIXED_M, value), value, end) for value in FACE_GRID_M]
+    tell(0.9)
+    horizontal = [_face_run(_at(scene, scale, value, FIXED_M), value, end) for value in FACE_GRID_M]
+    rows = case.t <= end
+    faces = FaceRun(CASE_M[1], case.t[rows], face_forces(case.force[rows]))
+    count = int((many.status != 0).sum())
+    tell(1.0)
+    return PaperRuns(
+        scene, t_end, scale, case, Sweep(fine, largest[: len(fine)]), Sweep(fine, largest[len(fine) :]), faces,
+        tuple(vertical), tuple(horizontal), rotation, count,
+    )  # fmt: skip
+
+
+def _clearances(scene: Scene) -> tuple[float, float]:
+    return scene.clearance.horizontal_m, scene.clearance.vertical_m
+
+
+def _at(scene: Scene, scale: tuple[float, float], horizontal_m: float, vertical_m: float) -> Scene:
+    return replace(scene, clearance=Clearance(float(scale[0] * horizontal_m), float(scale[1] * vertical_m)))
+
+
+def _by_corner(scene: Scene, peak: Array) -> Array:
+    """Return the larger peak of each corner's two pairs, shape (m, 4), from the peaks of the pairs, shape (m, 8)."""
+    letters = letters_of_pairs(scene)
+    pairs = [[pair for pair, letter in enumerate(letters) if letter == corner] for corner in CORNERS]
+    return np.stack([peak[:, index].max(axis=1) for index in pairs], axis=1)
+
+
+def _face_run(scene: Scene, clearance_m: float, t_end: float) -> FaceRun:
+    result = simulate(scene, t_end, OUTPUT_DT_S)
+    return FaceRun(clearance_m, result.t, face_forces(result.force))
+
+
+def face_of_pair() -> list[str]:
+    """Return the inner face of the head that each pair touches, shape (8,)."""
+    return [name.rpartition("_")[2] for name in PAIR_NAMES]
+
+
+def face_forces(force: Array) -> Array:
+    """Return the force on each inner face [N], shape (n, 4) as `FACES`, from that of the pairs, shape (n, 8)."""
+    faces = face_of_pair()
+    columns: Sequence[Array] = [
+        force[:, [pair for pair, name in enumerate(faces) if name == face]].sum(axis=1) for face in FACES
+    ]
+    return np.stack(columns, axis=1)
+
+
+def deepest_m(runs: PaperRuns) -> float:
+    """Return the deepest penetration of the case's rows in m."""
+    return float(runs.case.penetration.max())

@@ -1,0 +1,89 @@
+"""What the paper publishes, as data with its place in the text; every number here is `given`.
+
+Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
+and Shock 34(19), 2015. Its curves are known through its text alone, so places are sections and figures. The criteria by
+which a run is said to agree stand at the end; they are ours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+Sense = Literal["ccw", "cw"]
+SENSE_NAMES: Final[dict[Sense, str]] = {"ccw": "counter-clockwise", "cw": "clockwise"}
+CORNERS: Final = ("a", "b", "c", "d")
+FACES: Final = ("top", "right", "bottom", "left")
+
+#: Clearance of Figs 6 to 9 (section 3): horizontal, vertical [m].
+CASE_M: Final = (0.025, 0.030)
+#: The clearance that stays fixed in Figs 10 and 11, and the other one, read off at five places [m] (section 4).
+FIXED_M: Final = 0.020
+GRID_M: Final = (0.020, 0.0225, 0.025, 0.0275, 0.030)
+#: Figs 14 and 15, section 5: both clearances take these values [m]; the simulation lasts that long [s].
+FACE_GRID_M: Final = (0.020, 0.025, 0.030)
+FACE_T_END_S: Final = 20.0
+#: Angular frequency of the loads [rad/s] (section 3) and their period [s].
+OMEGA_RAD_S: Final = 2.0
+PERIOD_S: Final = 2.0 * math.pi / OMEGA_RAD_S
+
+
+@dataclass(frozen=True)
+class Force:
+    """A published force: the largest of its kind over the four points, so it names the point too."""
+
+    sense: Sense
+    statistic: Literal["max", "mean_in_contact"]
+    corner: str
+    value_n: float
+
+
+FORCES: Final = (
+    Force("ccw", "mean_in_contact", "a", 74e3),
+    Force("cw", "mean_in_contact", "b", 82e3),
+    Force("ccw", "max", "a", 153e3),
+    Force("cw", "max", "b", 177e3),
+)
+FORCES_SOURCE: Final = "section 3, Fig. 7"
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A contact set that the paper quotes at a time [s]."""
+
+    time_s: float
+    sense: Sense
+    corners: str
+    figure: str
+
+
+MOMENTS: Final = (
+    Moment(53.8, "ccw", "b", "Fig. 8"),
+    Moment(53.03, "ccw", "ad", "Fig. 8"),
+    Moment(52.95, "ccw", "abd", "Fig. 8"),
+    Moment(56.55, "cw", "a", "Fig. 9"),
+    Moment(56.8, "cw", "bc", "Fig. 9"),
+    Moment(57.85, "cw", "abc", "Fig. 9"),
+)
+
+
+@dataclass(frozen=True)
+class FaceMark:
+    """A mark in Fig. 13 (section 5): that many inner faces touch at once in that sense."""
+
+    number: int
+    sense: Sense
+    faces: int
+
+
+FACE_MARKS: Final = (FaceMark(1, "ccw", 1), FaceMark(2, "cw", 2), FaceMark(3, "cw", 3))
+
+#: A force agrees when it is within this share of the published one.
+FORCE_TOLERANCE: Final = 0.05
+#: A contact set occurs when it is held at least that long without a break [s].
+SHORTEST_HOLD_S: Final = 5e-3
+#: A step against a trend counts from this share of the curve's largest value on: what a printed curve shows.
+TREND_SLACK: Final = 0.005
+#: "rare" for what the paper does not mention: at most that share of the contact time.
+RARE_SHARE: Final = 0.05
