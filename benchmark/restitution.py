@@ -1,0 +1,183 @@
+"""Restitution asked of each contact law against the restitution it delivers in a free impact, by our own solver.
+
+`python benchmark/restitution.py` writes `benchmark/results/restitution.csv`, the picture `docs/images/restitution.png`
+and the measured part of `docs/restitution.md`.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene, simulate
+from plow_twin.model.contact_laws import LAWS
+
+ROOT = Path(__file__).resolve().parent.parent
+TABLE = ROOT / "benchmark" / "results" / "restitution.csv"
+PICTURE = ROOT / "docs" / "images" / "restitution.png"
+PAGE = ROOT / "docs" / "restitution.md"
+BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+
+#: Restitutions asked for: every hundredth in the CSV, these in the page.
+ASKED = tuple(round(0.01 * k, 2) for k in range(101))
+SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
+#: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
+RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
+#: A law is called valid where it delivers what it was asked for within this share.
+VALID = 0.05
+
+MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
+
+
+@dataclass(frozen=True)
+class Row:
+    """One free impact; `asked` is a restitution, or a damping ratio for Kelvin-Voigt."""
+
+    law: str
+    asked: float
+    delivered: float
+
+
+def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_S) -> float:
+    """Return speed after over speed before the impact of a point on a wall, free of any load."""
+    scene = Scene(
+        head=Head(mass, 1.0),
+        frame=Frame(0.2, 0.2),
+        clearance=Clearance(0.01, 0.01),
+        contact=contact,
+        gravity=Gravity(0.0),
+        initial=Initial((0.0, 0.0, 0.0), (0.0, -speed, 0.0)),
+        locked=("x", "theta"),
+        pairs=("top_left_top",),
+    )
+    # 5 ms to the wall; out of it the slowest (D at its cap) takes some 50 ms
+    result = simulate(scene, 0.2 / speed, output_dt=0.2 / speed, tol=1e-11)
+    if result.penetration[-1, 0] > 0.0 or result.statistics["top_left_top"]["makes"] != 1:
+        raise RuntimeError(f"{contact}: not one whole impact")
+    return float(result.v[-1, 1]) / speed
+
+
+def measure(law: str, asked: Iterable[float]) -> list[Row]:
+    """Measure one law: by restitution where it has that form, Kelvin-Voigt by damping ratio, Hertz as it is."""
+    rows = []
+    for value in asked:
+        if LAWS[law].takes_restitution:
+            contact = Contact(law, STIFFNESS, LAWS[law].exponent or EXPONENT, restitution=value)
+        elif LAWS[law].additive:
+            stiffness = 1e6
+            contact = Contact(law, stiffness, damping=2.0 * value * math.sqrt(stiffness * MASS_KG))
+        else:
+            contact = Contact(law, STIFFNESS, EXPONENT)
+        rows.append(Row(law, value, free_impact(contact)))
+    return rows
+
+
+def restitution_laws() -> list[str]:
+    """Return the laws that can be asked for a restitution, in the order of their definition."""
+    return [name for name, law in LAWS.items() if law.takes_restitution]
+
+
+def valid_ranges(rows: Sequence[Row]) -> str:
+    """Return in words where the restitution delivered is within 5 % of the one asked for (asked > 0)."""
+    inside = [row.asked > 0.0 and abs(row.delivered / row.asked - 1.0) <= VALID for row in rows]
+    edges = np.flatnonzero(np.diff([False, *inside, False])).reshape(-1, 2)
+    parts = [
+        f"{rows[first].asked:.2f}" + (f" .. {rows[last - 1].asked:.2f}" if last - first > 1 else "")
+        for first, last in edges.tolist()
+    ]
+    return ", ".join(parts)
+
+
+def page_table(rows: Sequence[Row]) -> list[str]:
+    """Return the Markdown table of delivered restitutions: a line for each law."""
+    lines = ["| law | " + " | ".join(f"{e:g}" for e in SHOWN) + " |", "|---|" + "---|" * len(SHOWN)]
+    for law in restitution_laws():
+        found = {row.asked: row.delivered for row in rows if row.law == law}
+        lines.append(f"| `{law}` | " + " | ".join(f"{found[e]:.4f}" for e in SHOWN) + " |")
+    return lines
+
+
+def laws_table(rows: Sequence[Row]) -> list[str]:
+    """Return the Markdown table of equations, sources and validity."""
+    lines = ["| law | equation; source | within 5 % for e | at e = 0 | at e = 1 |", "|---|---|---|---|---|"]
+    for law in restitution_laws():
+        own = [row for row in rows if row.law == law]
+        ends = f"{own[0].delivered:.4f} | {own[-1].delivered:.4f}"
+        lines.append(f"| {LAWS[law].title} | {LAWS[law].source} | {valid_ranges(own)} | {ends} |")
+    return lines
+
+
+def ratio_table(rows: Sequence[Row]) -> list[str]:
+    """Return the Markdown table of Kelvin-Voigt by damping ratio."""
+    own = [row for row in rows if row.law == "kelvin_voigt"]
+    return [
+        "| C / (2 sqrt(K m)) | " + " | ".join(f"{row.asked:g}" for row in own) + " |",
+        "|---|" + "---|" * len(own),
+        "| restitution | " + " | ".join(f"{row.delivered:.4f}" for row in own) + " |",
+    ]
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Draw asked against delivered with the line on which both are equal."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (panel, share) = plt.subplots(1, 2, figsize=(12.5, 5.4), layout="constrained")
+    styles = ["-", "--", "-.", (0, (5, 1)), (0, (3, 1, 1, 1)), "--", "-.", (0, (1, 1)), (0, (5, 1))]
+    for index, law in enumerate(restitution_laws()):
+        own = [row for row in rows if row.law == law]
+        asked, delivered = [row.asked for row in own], [row.delivered for row in own]
+        exact = law == "exact_restitution"
+        look = {"color": "#d62728" if exact else f"C{index if index < 3 else index + 1}", "lw": 2.6 if exact else 1.6}
+        panel.plot(asked, delivered, ls=styles[index % len(styles)], label=LAWS[law].title, **look)
+        percent = [100.0 * (d / a - 1.0) for a, d in zip(asked[1:], delivered[1:], strict=True)]
+        share.plot(asked[1:], percent, ls=styles[index % len(styles)], **look)
+    panel.plot([0.0, 1.0], [0.0, 1.0], color="#888888", lw=0.8, label="delivered = asked", zorder=0)
+    panel.set(xlabel="restitution asked for", ylabel="restitution delivered", xlim=(0, 1), ylim=(0, 1))
+    share.axhspan(-100.0 * VALID, 100.0 * VALID, color="#dddddd", zorder=0)
+    share.set(xlabel="restitution asked for", ylabel="delivered over asked, difference in % (band: 5 %)")
+    share.set(xlim=(0, 1), ylim=(-40, 100))
+    for axes in (panel, share):
+        axes.grid(alpha=0.3)
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize=9)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> None:
+    """Write one line for each impact."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["law", "asked", "delivered"])
+        # nine digits: what the solver holds on every machine
+        writer.writerows([row.law, f"{row.asked:g}", f"{row.delivered:.9f}"] for row in rows)
+
+
+def write_page(rows: Sequence[Row], path: Path) -> None:
+    """Replace what stands between the marks of the page."""
+    before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
+    _, _, after = rest.partition(END)
+    parts = ["## Delivered", "", *page_table(rows), "", "## Validity", "", *laws_table(rows), ""]
+    parts += ["## Kelvin-Voigt by damping ratio", "", *ratio_table(rows)]
+    path.write_text("\n".join([before + BEGIN, "", *parts, "", END + after]), encoding="utf-8")
+
+
+def main() -> None:
+    """Measure all, write all."""
+    rows = [row for law in restitution_laws() for row in measure(law, ASKED)]
+    rows += measure("kelvin_voigt", RATIOS) + measure("hertz", (1.0,))
+    write_csv(rows, TABLE)
+    draw(rows, PICTURE)
+    write_page(rows, PAGE)
+
+
+if __name__ == "__main__":
+    main()

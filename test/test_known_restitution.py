@@ -1,0 +1,113 @@
+"""Restitution of the contact laws: the identity of the exact law, the published tables, and the page made from them.
+
+The free impact of a point on a wall; cases 1 and 2 of docs/known_answers.md.
+"""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import math
+import sys
+from types import ModuleType
+
+import pytest
+from scenes import ROOT
+
+from plow_twin import Contact
+from plow_twin.model.contact_laws import LAWS, exact_damping_factor
+
+# delivered restitution at restitution asked for .1 .. .9, .95; published tables of the laws
+ASKED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+DELIVERED = {
+    "lankarani_nikravesh": (0.6653, 0.6723, 0.6842, 0.7016, 0.7252, 0.7561, 0.7960, 0.8471, 0.9132, 0.9535),
+    "flores": (0.0694, 0.1555, 0.2562, 0.3629, 0.4704, 0.5773, 0.6832, 0.7885, 0.8939, 0.9468),
+    "hunt_crossley": (0.5158, 0.5469, 0.5813, 0.6197, 0.6630, 0.7120, 0.7680, 0.8329, 0.9090, 0.9524),
+}
+
+
+def load_benchmark(name: str) -> ModuleType:
+    """Import a module of the benchmark folder, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmark" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+restitution = load_benchmark("restitution")
+
+
+@pytest.mark.parametrize("n", [1.0, 1.5, 2.2, 3.0])
+@pytest.mark.parametrize("e", [0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
+def test_exact_restitution_is_returned_whatever_the_law_s_numbers(n: float, e: float) -> None:
+    """D (1 + e) = ln((1 + D) / (1 - D e)) holds for every exponent, stiffness, mass and speed."""
+    for stiffness, mass, speed in ((1e7, 2.0, 1.0), (1e9, 300.0, 0.2)):
+        contact = Contact("exact_restitution", stiffness * 1e3 ** (n - 1.0), n, restitution=e)
+        assert restitution.free_impact(contact, mass, speed) == pytest.approx(e, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("e", "d"), [(0.1, 9.998159), (0.3, 3.087082), (0.5, 1.432751), (0.7, 0.634828), (0.9, 0.166482)]
+)
+@pytest.mark.parametrize("n", [1.0, 2.2])
+def test_a_constant_factor_of_the_published_d_returns_its_restitution(e: float, d: float, n: float) -> None:
+    """D = lambda v0, given as plain damping to a law that knows nothing of the identity."""
+    speed = 0.4
+    contact = Contact("hunt_crossley", 1e9, n, damping=d / speed)
+    # the table gives six decimals of D; de/dD is at most 0.35 there
+    assert restitution.free_impact(contact, speed=speed) == pytest.approx(e, abs=3e-7)
+
+
+@pytest.mark.parametrize("law", DELIVERED)
+def test_the_other_laws_deliver_what_is_known_of_them(law: str) -> None:
+    for asked, known in zip(ASKED, DELIVERED[law], strict=True):
+        assert restitution.measure(law, [asked])[0].delivered == pytest.approx(known, abs=6e-5)
+
+
+@pytest.mark.parametrize("law", restitution.restitution_laws())
+def test_every_law_delivers_what_the_identity_makes_of_its_damping(law: str) -> None:
+    for asked in (0.15, 0.55, 0.85):
+        delivered = restitution.measure(law, [asked])[0].delivered
+        assert exact_damping_factor(delivered) == pytest.approx(LAWS[law].damping_factor(asked), rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("z", "e"), [(0.01, 0.9693), (0.05, 0.8588), (0.1, 0.7441), (0.2, 0.5717), (0.3, 0.4510), (0.5, 0.2984)]
+)
+def test_kelvin_voigt_without_pull(z: float, e: float) -> None:
+    assert restitution.measure("kelvin_voigt", [z])[0].delivered == pytest.approx(e, abs=6e-5)
+
+
+def test_kelvin_voigt_is_the_closed_form() -> None:
+    """exp(-z / r (pi - atan(2 z r / (1 - 2 z^2)))), r = sqrt(1 - z^2), for z < 1 / sqrt(2).
+
+    Schwager and Poeschel, Granular Matter 9 (2007) 465; it follows from F = 0 on the damped sine.
+    """
+    for z in (0.02, 0.15, 0.4, 0.6):
+        root = math.sqrt(1.0 - z * z)
+        expected = math.exp(-z / root * (math.pi - math.atan2(2.0 * z * root, 1.0 - 2.0 * z * z)))
+        assert restitution.measure("kelvin_voigt", [z])[0].delivered == pytest.approx(expected, rel=1e-8)
+
+
+def test_the_page_is_what_the_solver_makes() -> None:
+    page = restitution.PAGE.read_text(encoding="utf-8")
+    with restitution.TABLE.open(newline="", encoding="utf-8") as file:
+        rows = [
+            restitution.Row(row["law"], float(row["asked"]), float(row["delivered"])) for row in csv.DictReader(file)
+        ]
+    assert {row.law for row in rows} >= set(restitution.restitution_laws()) | {"kelvin_voigt", "hertz"}
+    for line in (*restitution.page_table(rows), *restitution.laws_table(rows), *restitution.ratio_table(rows)):
+        assert f"{line}\n" in page, line
+    for law in ("zhiying_qishao", "kelvin_voigt", "hertz"):
+        stored = {row.asked: row.delivered for row in rows if row.law == law}
+        for again in restitution.measure(law, list(stored)[::10]):
+            assert stored[again.asked] == pytest.approx(again.delivered, abs=2e-9)
+
+
+def test_validity_is_where_asked_and_delivered_are_within_five_percent() -> None:
+    rows = [
+        restitution.Row("x", e, e * f)
+        for e, f in [(0.0, 1), (0.1, 1.2), (0.2, 1.04), (0.3, 0.96), (0.4, 0.9), (0.5, 1)]
+    ]
+    assert restitution.valid_ranges(rows) == "0.20 .. 0.30, 0.50"
