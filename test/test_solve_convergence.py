@@ -1,0 +1,99 @@
+"""Convergence orders, measured: with event location the method's own, with a fixed step that of the missed touch."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Literal
+
+import numpy as np
+import pytest
+from scenes import pose_error, preset, reference, wall_and_point
+
+from plow_twin import Contact, Scene, simulate
+from plow_twin.solve import compiled
+
+REFERENCES = {"bench_kv": "bench_kv", "bench_hc": "bench_hc", "paper": "paper_r1"}
+
+CONTACTS = {
+    "kelvin_voigt": Contact("kelvin_voigt", 1e6, damping=0.4 * math.sqrt(2e6)),
+    "n = 1": Contact("exact_restitution", 1e6, 1.0, restitution=0.5),
+    "n = 1.5": Contact("exact_restitution", 3e7, 1.5, restitution=0.5),
+    "n = 1.5, Hertz": Contact("hertz", 3e7, 1.5),
+    "n = 2": Contact("exact_restitution", 1e9, 2.0, restitution=0.5),
+}
+
+
+def local_orders(errors: list[float]) -> np.ndarray:
+    return -np.diff(np.log2(errors))
+
+
+def fixed_step_errors(
+    contact: Contact, method: Literal["rk4", "euler"], halvings: int, phases: int = 32
+) -> list[float]:
+    """Mean error of the pose after one impact, for steps of 80 us halved again and again.
+
+    The touch falls on every phase of the step alike, and so does the separation by a stiffness that varies a little:
+    the mean is smooth in dt where a single run is not.
+    """
+    t_end, errors = 0.016, []
+    for count in 200 * 2 ** np.arange(halvings + 1):
+        dt, found = t_end / int(count), []
+        for phase in range(phases):
+            stiffness = contact.stiffness * (1.0 + 0.2 * ((phase * 0.6180339887) % 1.0))
+            scene = wall_and_point(
+                dataclasses.replace(contact, stiffness=stiffness),
+                speed=1.0, gap=0.004 + 2.0 * dt * (phase + 0.5) / phases,
+            )  # fmt: skip
+            exact = simulate(scene, t_end, output_dt=t_end, tol=1e-13)
+            fixed = simulate(scene, t_end, output_dt=t_end, method=method, dt=dt)
+            found.append(abs(fixed.q[-1, 1] - exact.q[-1, 1]))
+        errors.append(float(np.mean(found)))
+    return errors
+
+
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [("kelvin_voigt", 1.0), ("n = 1", 2.0), ("n = 1.5", 2.5), ("n = 1.5, Hertz", 2.5), ("n = 2", 3.0)],
+)
+def test_rk4_without_event_location_has_order_n_plus_one(name: str, order: float) -> None:
+    """The force sets in as d^n, Kelvin-Voigt's jumps (Shampine and Thompson, Comput. Math. Appl. 39 (2000) 43)."""
+    errors = fixed_step_errors(CONTACTS[name], "rk4", 4)
+    assert np.polyfit(np.log2([1, 2, 4, 8, 16]), np.log2(errors), 1)[0] == pytest.approx(-order, abs=0.15)
+    assert local_orders(errors) == pytest.approx(order, abs=0.35)
+
+
+@pytest.mark.parametrize("name", ["kelvin_voigt", "n = 1", "n = 1.5"])
+def test_semi_implicit_euler_has_order_one(name: str) -> None:
+    errors = fixed_step_errors(CONTACTS[name], "euler", 3)
+    assert local_orders(errors) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("order", [6, 8])
+@pytest.mark.parametrize(("name", "slack"), [("bench_kv", 0.08), ("paper", 0.08), ("bench_hc", 0.12)])
+def test_event_location_keeps_the_order_of_the_series(
+    name: str, slack: float, order: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Error against number of steps over 4 s of impacts, the order of the series held at 6 and 8."""
+    scene, exact = preset(name), reference(REFERENCES[name])["q"][:401]
+    monkeypatch.setattr(compiled, "order_for", lambda tol: order)
+    steps, errors = zip(*[run(scene, 10.0**-k, exact) for k in range(6, 11)], strict=True)
+    slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(order, rel=slack)
+
+
+@pytest.mark.parametrize("name", REFERENCES)
+def test_the_error_falls_with_the_tolerance(name: str) -> None:
+    """Over nine decades: error = constant times tol^s with s near 1."""
+    scene, exact = preset(name), reference(REFERENCES[name])["q"][:501]
+    exponents = np.arange(3, 12)
+    errors = [run(scene, 10.0**-k, exact)[1] for k in exponents.tolist()]
+    slope, offset = np.polyfit(-exponents, np.log10(errors), 1)
+    assert slope == pytest.approx(1.0, abs=0.12)
+    # no decade falls out of line by more than half a decade
+    assert np.log10(errors) == pytest.approx(offset - slope * exponents, abs=0.6)
+
+
+def run(scene: Scene, tol: float, exact: np.ndarray) -> tuple[int, float]:
+    result = simulate(scene, 0.01 * (len(exact) - 1), output_dt=0.01, tol=tol)
+    return result.solver["steps"], pose_error(scene, result.q, exact)
