@@ -85,8 +85,10 @@ def _trend(group: str, source: str, what: str, values: Array, at: str, falls: bo
     )  # fmt: skip
 
 
-def longest_faces(runs: PaperRuns, mark: FaceMark) -> tuple[float, float] | None:
+def longest_faces(runs: PaperRuns, mark: FaceMark, since_s: float = 0.0) -> tuple[float, float] | None:
     """Return start and length in s of the longest time with that many faces in contact in that sense, if any.
+
+    Looked for from `since_s` to the end of the section's 20 s.
 
     A corner has one pair in each sense, each with another wall, so that points and faces count alike.
     """
@@ -98,7 +100,7 @@ def longest_faces(runs: PaperRuns, mark: FaceMark) -> tuple[float, float] | None
     found = [
         (hold.start_s, min(hold.end_s, end) - hold.start_s)
         for hold in timeline
-        if len(hold.corners) == mark.faces and hold.start_s < end
+        if len(hold.corners) == mark.faces and since_s <= hold.start_s < end
     ]
     return max(found, key=lambda hold: hold[1], default=None)
 
