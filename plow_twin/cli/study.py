@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import click
 
+from plow_twin.cli.study_paper import paper
+
 
 @click.group(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.")
 def study() -> None:
@@ -11,6 +13,6 @@ def study() -> None:
 
 
 # each verb lives in a module of its own, plow_twin/cli/study_<verb>.py, and is added here
-_VERBS: tuple[click.Command, ...] = ()
+_VERBS: tuple[click.Command, ...] = (paper,)
 for _verb in _VERBS:
     study.add_command(_verb)

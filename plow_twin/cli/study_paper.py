@@ -1,0 +1,85 @@
+"""`plow-twin study paper`: the paper's published figures and numbers, reproduced and compared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+from rich.markup import escape
+from rich.table import Table
+
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option
+from plow_twin.presets import scene_path
+
+if TYPE_CHECKING:
+    from plow_twin.study.paper import PaperStudy
+
+_STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
+
+
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but single runs failed.")
+@click.option(
+    "--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="New or empty folder for the report."
+)
+@click.option("--t-end", metavar="T", type=POSITIVE, default=60.0, show_default=True, help="Length of the runs [s].")
+@click.option("--workers", type=click.IntRange(min=1), help="Threads; all cores by default.")
+@click.option(
+    "--scene",
+    default="paper",
+    show_default=True,
+    help="Another scene to compare, at the clearances of the paper's Fig. 6.",
+)
+@click.option("--recording/--no-recording", default=True, show_default=True, help="Leave the run as MCAP and .rrd too.")
+@quiet_option
+def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: bool, quiet: bool) -> int:
+    """Reproduce the paper's figures and numbers with the preset `paper` and write a report into a folder.
+
+    The folder gets report.html (plots and the table published / reconstructed / difference / agrees?), the table as
+    JSON and CSV, the plots, and the run as MCAP recording and .rrd.
+    """
+    from plow_twin.scene_file import load_scene
+    from plow_twin.study.paper import study_paper
+    from plow_twin.study.paper_runs import SHORTEST_S
+
+    if t_end < SHORTEST_S:
+        message = f"got {t_end:g} s, expected at least two periods of the load, {SHORTEST_S:.4f} s"
+        raise click.BadParameter(message, param_hint="--t-end")
+    if out.exists() and any(out.iterdir()):
+        raise click.BadParameter(f"got {str(out)!r}, which is not empty, expected a new folder", param_hint="--out")
+    model = load_scene(scene_path(scene))
+    with progress("the paper's figures (the first run compiles)", quiet) as on_progress:
+        study = study_paper(model, scene, out, t_end, workers, recording, on_progress)
+    if study.runs.failed:
+        click.echo(f"plow-twin: {study.runs.failed} run(s) of Figs 10 and 11 failed; see the table", err=True)
+    if not quiet:
+        _print(study, out)
+    return DONE_WITH_LOSS if study.runs.failed else DONE
+
+
+def _print(study: PaperStudy, out: Path) -> None:
+    from plow_twin.study.report import percent
+
+    console = output_console()
+    table = Table(title=f"scene {study.name} beside the paper, {study.runs.t_end:g} s", title_justify="left")
+    for name in ("statement", "published", "reconstructed", "difference", "agrees?"):
+        width = 24 if name == "statement" else None
+        table.add_column(name, justify="right" if name == "difference" else "left", overflow="fold", min_width=width)
+    group = ""
+    for row in study.rows:
+        if row.group != group:
+            table.add_section()
+            table.add_row(f"[bold]{escape(row.group)}[/bold]")
+            group = row.group
+        unit = f" {row.unit}" if row.published_value is not None else ""
+        verdict = row.verdict.value
+        table.add_row(
+            escape(row.what), escape(row.published) + unit, escape(row.computed) + unit, percent(row.difference),
+            f"[{_STYLES[verdict]}]{verdict}[/]",
+        )  # fmt: skip
+    console.print(table)
+    counts = ", ".join(f"{verdict}: {number}" for verdict, number in study.verdicts.items() if number)
+    console.print(f"agrees? {counts}; took {study.wall_s:.1f} s", highlight=False)
+    console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True)
+    if study.recording is not None:
+        console.print(f"look at the run with: rerun {study.recording.rrd}", highlight=False, soft_wrap=True)

@@ -1,0 +1,67 @@
+"""A report on disk: one HTML file that needs no other, and its tables as JSON and CSV."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+
+def write_html(path: Path, template: str, context: Mapping[str, Any]) -> None:
+    """Fill the package's template `templates/<template>` and write it; `image` in it embeds a PNG file.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        jinja2 (extra `study`) is not installed.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("plow_twin.study"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["image"] = _embedded
+    environment.filters["percent"] = percent
+    path.write_text(environment.get_template(template).render(context), encoding="utf-8")
+
+
+def _embedded(picture: Path) -> str:
+    return "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode("ascii")
+
+
+def percent(share: float | None) -> str:
+    """Return a signed share as text, e.g. +3.5 %; nothing for None."""
+    return "" if share is None else f"{100.0 * share:+.1f} %"
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write plain values; numbers that are not finite become null."""
+    path.write_text(
+        json.dumps(_plain(document), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, Path):
+        return value.as_posix()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write rows with the same keys, the first row's as header."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
