@@ -1,0 +1,236 @@
+"""Numbers and words of a scene by path, as they stand in its messages: `contact.stiffness`, `head.com_offset_m[0]`.
+
+Loads are called by name: `loads.fx1.phase_rad`. Four paths are not fields but say what a study asks for:
+
+    loads.<name>.sign       sign of the load's force (its first component that is not zero); -1 turns the whole force
+    loads.<name>.arm_sign   the same for its point of action
+    loads.<name>.scale      factor of its force and free moment
+    clearance.scale         factor of both clearances: 1 total, 2 when a published clearance is meant per side
+
+`frame.labels` takes one of eight words, `bottom_right_ccw`: a at the bottom right, then b, c, d counter-clockwise. The
+four act on whatever the other paths have set. `contact.damping` takes the place of a restitution and the reverse.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields, replace
+from difflib import get_close_matches
+from types import MappingProxyType
+from typing import Any, Final
+
+from plow_twin.errors import PlowTwinError, Problem, SceneError
+from plow_twin.model.scene import Scene, Table
+
+#: Value of a parameter: numbers, or the words of `contact.law` and `head.rotation`.
+Value = float | str
+
+#: Paths whose values are words.
+WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
+_CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
+_PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear")
+_DERIVED: Final = ("sign", "arm_sign", "scale")
+_INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
+
+
+class StudyError(PlowTwinError, ValueError):
+    """A study cannot be made or continued as asked; the message says why."""
+
+
+def parameter_paths(scene: Scene) -> tuple[str, ...]:
+    """Return every path that a study can set in the scene."""
+    paths: list[str] = []
+    for name in _PARTS:
+        part = getattr(scene, name)
+        paths += [] if part is None else _paths_of(part, name)
+    paths += ["clearance.scale", "frame.labels"]
+    for load in scene.loads:
+        if not isinstance(load, Table):
+            paths += _paths_of(load, f"loads.{load.name}")
+        paths += [f"loads.{load.name}.{name}" for name in _DERIVED]
+    return tuple(paths)
+
+
+def _paths_of(part: Any, path: str) -> list[str]:
+    paths = []
+    for spec in fields(part):
+        value = getattr(part, spec.name)
+        if isinstance(value, tuple) and "unit" in spec.metadata:
+            paths += [f"{path}.{spec.name}[{index}]" for index in range(len(value))]
+        elif "unit" in spec.metadata or spec.name in ("law", "rotation"):
+            paths.append(f"{path}.{spec.name}")
+    return paths
+
+
+def check_path(scene: Scene, path: str) -> str:
+    """Return the path if the scene has it.
+
+    Raises
+    ------
+    StudyError
+        With the nearest paths and all that there are.
+    """
+    known = parameter_paths(scene)
+    if path not in known:
+        near = get_close_matches(path, known, n=3, cutoff=0.6)
+        hint = f"; nearest: {', '.join(near)}" if near else ""
+        raise StudyError(f"parameter: got {path!r}, expected one of {', '.join(known)}{hint}")
+    return path
+
+
+def parameter_of(scene: Scene, path: str) -> Value | None:
+    """Return what stands at a path; None for a damping or restitution that is not given."""
+    check_path(scene, path)
+    if path == "frame.labels":
+        return next((word for word, labels in label_words().items() if labels == dict(scene.frame.labels)), None)
+    part, field_name = path.rsplit(".", 1)
+    if path == "clearance.scale" or field_name == "scale":
+        return 1.0
+    owner = _load(scene, part) if part.startswith("loads.") else getattr(scene, part)
+    if field_name in ("sign", "arm_sign"):
+        vector = _vector(owner, field_name)
+        return -1.0 if next((x for x in vector if x != 0.0), 1.0) < 0.0 else 1.0
+    name, index = _split(field_name)
+    value = getattr(owner, name)
+    found = value if index is None else value[index]
+    return found if found is None or isinstance(found, str) else float(found)
+
+
+def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
+    """Return the scene with new values; marks of what is set are taken off.
+
+    Raises
+    ------
+    StudyError
+        For a path that the scene does not have, or a value of the wrong kind.
+    SceneError
+        When the scene is not usable with these values; lists every problem.
+    """
+    known = parameter_paths(scene)
+    for path, value in values.items():
+        if path not in known:
+            check_path(scene, path)
+        words = path in WORDS
+        if words != isinstance(value, str):
+            raise StudyError(f"{path}: got {value!r}, expected a {'word' if words else 'number'}")
+    parts: dict[str, Any] = {name: getattr(scene, name) for name in _PARTS}
+    loads = {load.name: load for load in scene.loads}
+    # fields first: sign and scale act on what they have become
+    for path, value in sorted(values.items(), key=lambda item: item[0].rsplit(".", 1)[1] in _DERIVED):
+        owner, field_name = path.rsplit(".", 1)
+        if path == "frame.labels":
+            parts["frame"] = _labelled(parts["frame"], str(value))
+        elif path == "clearance.scale":
+            parts["clearance"] = _scaled_clearance(parts["clearance"], float(value))
+        elif owner.startswith("loads."):
+            name = owner.removeprefix("loads.")
+            loads[name] = _load_with(loads[name], field_name, value)
+        else:
+            parts[owner] = _with(parts[owner], field_name, value)
+    marks = {key: mark for key, mark in scene.marks.items() if not _is_set(key, values, scene)}
+    return replace(scene, **parts, loads=tuple(loads.values()), marks=MappingProxyType(marks))
+
+
+def label_words() -> dict[str, dict[str, str]]:
+    """Return the eight ways to letter the corners in turn, by the word of each."""
+    words = {}
+    for turn, corners in (("ccw", _CORNERS_CCW), ("cw", _CORNERS_CCW[::-1])):
+        for first in range(4):
+            order = corners[first:] + corners[:first]
+            words[f"{order[0]}_{turn}"] = dict(zip("abcd", order, strict=True))
+    return words
+
+
+def is_usable(scene: Scene, values: Mapping[str, Value]) -> bool:
+    """Say whether the scene can be run with these values."""
+    try:
+        with_parameters(scene, values)
+    except SceneError:
+        return False
+    return True
+
+
+def _labelled(frame: Any, word: str) -> Any:
+    words = label_words()
+    if word not in words:
+        raise SceneError([Problem("frame.labels", word, f"one of {', '.join(words)}")])
+    return replace(frame, labels=words[word])
+
+
+def _with(part: Any, field_name: str, value: Value) -> Any:
+    name, index = _split(field_name)
+    if index is not None:
+        items = list(getattr(part, name))
+        items[index] = float(value)
+        return replace(part, **{name: tuple(items)})
+    new: dict[str, Any] = {name: value if isinstance(value, str) else float(value)}
+    if name in ("damping", "restitution"):
+        new["restitution" if name == "damping" else "damping"] = None
+    return replace(part, **new)
+
+
+def _load_with(load: Any, field_name: str, value: Value) -> Any:
+    if field_name not in _DERIVED:
+        return _with(load, field_name, value)
+    number = float(value)
+    if field_name == "scale":
+        if isinstance(load, Table):
+            return replace(load, wrench=number * load.wrench)
+        return replace(load, force_n=_times(load.force_n, number), moment_n_m=number * load.moment_n_m)
+    if number not in (-1.0, 1.0):
+        raise SceneError([Problem(f"loads.{load.name}.{field_name}", value, "1 or -1")])
+    first = next((x for x in _vector(load, field_name) if x != 0.0), 1.0)
+    if first * number > 0.0:
+        return load
+    if field_name == "arm_sign":
+        return replace(load, at_m=_times(load.at_m, -1.0))
+    if isinstance(load, Table):
+        return replace(load, wrench=-load.wrench)
+    return replace(load, force_n=_times(load.force_n, -1.0))
+
+
+def _vector(load: Any, field_name: str) -> tuple[float, ...]:
+    if field_name == "arm_sign":
+        return tuple(load.at_m)
+    if isinstance(load, Table):
+        # the sign of a sampled load: that of its largest force
+        return (float(load.wrench[:, :2].flat[abs(load.wrench[:, :2]).argmax()]),)
+    return tuple(load.force_n)
+
+
+def _scaled_clearance(clearance: Any, factor: float) -> Any:
+    return replace(clearance, horizontal_m=factor * clearance.horizontal_m, vertical_m=factor * clearance.vertical_m)
+
+
+def _times(vector: tuple[float, ...], factor: float) -> tuple[float, ...]:
+    # 0 stays +0: equal scenes have equal texts
+    return tuple(factor * x if x != 0.0 else 0.0 for x in vector)
+
+
+def _split(field_name: str) -> tuple[str, int | None]:
+    match = _INDEX.fullmatch(field_name)
+    return (match[1], int(match[2])) if match else (field_name, None)
+
+
+def _load(scene: Scene, owner: str) -> Any:
+    name = owner.removeprefix("loads.")
+    return next(load for load in scene.loads if load.name == name)
+
+
+def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
+    """Say whether the number at a key of `Scene.marks` (loads by index there) is changed by these values."""
+    match = re.match(r"loads\[(\d+)\]\.(.+)", key)
+    path = f"loads.{scene.loads[int(match[1])].name}.{match[2]}" if match else key
+    whole = path.partition("[")[0]
+    owner, field_name = whole.rsplit(".", 1)
+    derived = {
+        "sign": field_name == "force_n",
+        "arm_sign": field_name == "at_m",
+        "scale": field_name in ("force_n", "moment_n_m", "horizontal_m", "vertical_m"),
+    }
+    return any(
+        path == other or (whole == other.partition("[")[0] and "[" not in path)
+        or any(other == f"{owner}.{name}" and touched for name, touched in derived.items())
+        for other in values
+    )  # fmt: skip

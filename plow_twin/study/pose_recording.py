@@ -1,0 +1,121 @@
+"""A user's own recording of the head's pose, to fit a scene to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.study.members import Members
+from plow_twin.study.parameters import StudyError
+
+Array = NDArray[np.float64]
+
+COLUMNS: Final = ("t", "x", "y", "theta")
+#: Most rows of a simulated motion between which recorded times are interpolated.
+_MOST_ROWS: Final = 20_000
+
+
+@dataclass(frozen=True)
+class PoseRecording:
+    """Recorded motion: t, shape (n,), in s on the clock of the scene; q, shape (n, 3): x, y [m], theta [rad]."""
+
+    t: Array
+    q: Array
+    source: str = ""
+
+    @property
+    def output_dt(self) -> float:
+        """Distance of the simulated rows in s: that of the recorded ones, not below t_end / 20000."""
+        end = float(self.t[-1])
+        step = float(np.median(np.diff(self.t))) if len(self.t) > 1 else end
+        return max(min(step, 0.01), end / _MOST_ROWS)
+
+    def sampled(self, members: Members) -> Array:
+        """Return the simulated poses at the recorded times, shape (m, n, 3), by cubic Hermite interpolation."""
+        t = members.t
+        right = np.clip(np.searchsorted(t, self.t), 1, len(t) - 1)
+        left = right - 1
+        h = t[right] - t[left]
+        s = ((self.t - t[left]) / h)[:, None]
+        h = h[:, None]
+        q0, q1, v0, v1 = members.q[:, left], members.q[:, right], members.v[:, left], members.v[:, right]
+        return np.asarray(
+            (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q0
+            + s * (1.0 - s) ** 2 * h * v0
+            + s**2 * (3.0 - 2.0 * s) * q1
+            + s**2 * (s - 1.0) * h * v1
+        )
+
+
+def load_poses(path: Path) -> PoseRecording:
+    """Read a pose recording: .csv or .npz with t, x, y, theta (or q of shape (n, 3)), or .mcap of this package.
+
+    Raises
+    ------
+    StudyError
+        When it cannot be read or its rows cannot be used.
+    """
+    readers = {".csv": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}
+    if path.suffix not in readers:
+        raise StudyError(f"recording: got {path.name!r}, expected .csv, .npz or .mcap")
+    try:
+        t, q = readers[path.suffix](path)
+    except OSError as error:
+        raise StudyError(f"{path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise StudyError(f"{path}: {error}") from None
+    if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
+        raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")
+    bad = ~(np.isfinite(t) & np.isfinite(q).all(axis=1))
+    if bad.any():
+        raise StudyError(f"{path}: row {int(np.flatnonzero(bad)[0])}: expected finite numbers")
+    if t[0] < 0.0 or (np.diff(t) <= 0.0).any():
+        raise StudyError(f"{path}: t: got {t[0]:g} .. {t[-1]:g}, expected increasing times from 0 on [s]")
+    return PoseRecording(t, q, str(path))
+
+
+def _read_csv(path: Path) -> tuple[Array, Array]:
+    with path.open(encoding="utf-8") as file:
+        names = [name.strip() for name in file.readline().split(",")]
+    _require([name for name in COLUMNS if name not in names], names)
+    columns = [names.index(name) for name in COLUMNS]
+    table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns, ndmin=2)
+    return table[:, 0], table[:, 1:]
+
+
+def _read_npz(path: Path) -> tuple[Array, Array]:
+    with np.load(path) as archive:
+        names = list(archive.files)
+        if "q" in names and "t" in names:
+            return np.asarray(archive["t"], float), np.asarray(archive["q"], float)
+        _require([name for name in COLUMNS if name not in names], names)
+        return np.asarray(archive["t"], float), np.column_stack([archive[name] for name in COLUMNS[1:]])
+
+
+def _require(lacking: list[str], got: list[str]) -> None:
+    if lacking:
+        raise ValueError(f"got the columns {', '.join(got)}, expected {', '.join(COLUMNS)}")
+
+
+def _read_mcap(path: Path) -> tuple[Array, Array]:
+    """Read the poses that the node published (`head_state`)."""
+    from plow_twin.record.reader import OutputRecord, RunReader
+
+    reader = RunReader(path)
+    topic = reader.header.topic("head_state")
+    rows: list[tuple[float, ...]] = []
+    first: int | None = reader.header.origin_ns
+    for record in reader:
+        if isinstance(record, OutputRecord) and record.topic == topic:
+            message: Any = record.message()
+            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+            first = stamp if first is None else first
+            pose = message.pose.pose
+            theta = 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)
+            rows.append(((stamp - first) * 1e-9, pose.position.x, pose.position.y, theta))
+    table = np.array(rows, dtype=float).reshape(-1, 4)
+    return table[:, 0], table[:, 1:]

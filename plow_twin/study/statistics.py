@@ -1,0 +1,167 @@
+"""Statistics of a run by path.
+
+    max.top_left_top                    of one pair
+    max.ccw.a                           of the pair of corner a that stops a counter-clockwise swing; cw the other one
+    max.a   max.ccw   max               over the pairs of a corner, of a sense, over all
+    contact_sets.ccw.ad                 share of the contact time of that sense with force at exactly these corners
+    contact_set_time.ccw.ad             the same in s
+    contact_points.ccw.2                share of that contact time with force at exactly two corners
+    events   steps                      contact changes; steps of the solver
+
+In place of `max` [N]: `mean_in_contact` and `mean_over_time` [N], `impulse` [N s], `time_in_contact` [s], `makes`,
+`wear_depth` [m]. Over several pairs the largest force and the deepest wear count; impulses, times and touches add, and
+means follow from those sums. Corners by the scene's letters or by their names; sets of named corners joined by `+`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from difflib import get_close_matches
+from functools import partial
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES, STOPS_COUNTER_CLOCKWISE
+from plow_twin.model.scene import Scene
+from plow_twin.study.members import Members
+from plow_twin.study.parameters import StudyError
+
+Array = NDArray[np.float64]
+#: From m runs to the statistic of each, shape (m,).
+Statistic = Callable[[Members], Array]
+
+SENSES: Final = ("ccw", "cw")
+
+
+def _max(members: Members, pairs: list[int]) -> Array:
+    return np.asarray(members.peak[:, pairs].max(axis=1))
+
+
+def _mean_in_contact(members: Members, pairs: list[int]) -> Array:
+    impulse, time = (array[:, pairs].sum(axis=1) for array in (members.impulse, members.time_in_contact))
+    return np.asarray(np.divide(impulse, time, out=np.zeros_like(impulse), where=time > 0.0))
+
+
+def _mean_over_time(members: Members, pairs: list[int]) -> Array:
+    return np.asarray(_impulse(members, pairs) / members.duration_s)
+
+
+def _impulse(members: Members, pairs: list[int]) -> Array:
+    return np.asarray(members.impulse[:, pairs].sum(axis=1))
+
+
+def _time_in_contact(members: Members, pairs: list[int]) -> Array:
+    return np.asarray(members.time_in_contact[:, pairs].sum(axis=1))
+
+
+def _makes(members: Members, pairs: list[int]) -> Array:
+    return np.asarray(members.makes[:, pairs].sum(axis=1), dtype=np.float64)
+
+
+def _wear_depth(members: Members, pairs: list[int]) -> Array:
+    return np.asarray(members.wear_depth[:, pairs].max(axis=1))
+
+
+_OF_PAIRS: Final[Mapping[str, Callable[..., Array]]] = {
+    "max": _max,
+    "mean_in_contact": _mean_in_contact,
+    "mean_over_time": _mean_over_time,
+    "impulse": _impulse,
+    "time_in_contact": _time_in_contact,
+    "makes": _makes,
+    "wear_depth": _wear_depth,
+}
+UNITS: Final[Mapping[str, str]] = {
+    "max": "N", "mean_in_contact": "N", "mean_over_time": "N", "impulse": "N s", "time_in_contact": "s", "makes": "1",
+    "wear_depth": "m", "contact_sets": "1", "contact_set_time": "s", "contact_points": "1", "events": "1", "steps": "1",
+}  # fmt: skip
+
+
+def statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
+    """Return every statistic that a run of the scene has, by path."""
+    known: dict[str, Statistic] = {}
+    for kind, reduce in _OF_PAIRS.items():
+        for suffix, pairs in _groups(scene).items():
+            known[f"{kind}{suffix}"] = partial(reduce, pairs=pairs)
+    for sense, row in zip(SENSES, (0, 1), strict=True):
+        for name, mask in _sets(scene).items():
+            known[f"contact_sets.{sense}.{name}"] = partial(_share, row=row, masks=[mask])
+            known[f"contact_set_time.{sense}.{name}"] = partial(_set_time, row=row, mask=mask)
+        for count in (1, 2, 3, 4):
+            masks = [mask for mask in range(1, 16) if mask.bit_count() == count]
+            known[f"contact_points.{sense}.{count}"] = partial(_share, row=row, masks=masks)
+    known["events"] = lambda members: members.events.astype(np.float64)
+    known["steps"] = lambda members: members.steps.astype(np.float64)
+    return known
+
+
+def statistic(scene: Scene, path: str) -> Statistic:
+    """Return the statistic of a path.
+
+    Raises
+    ------
+    StudyError
+        With the nearest paths and the kinds there are.
+    """
+    known = statistics_of_scene(scene)
+    # letters of a set in any order
+    head, _, last = path.rpartition(".")
+    key = path if path in known else f"{head}.{''.join(sorted(last))}"
+    if key not in known:
+        near = get_close_matches(path, known, n=3, cutoff=0.6)
+        hint = f"; nearest: {', '.join(near)}" if near else ""
+        kinds = ", ".join(f"{name}.ccw.{_labels(scene)[0]}" for name in _OF_PAIRS)
+        raise StudyError(
+            f"statistic: got {path!r}, expected e.g. {kinds}, max.{PAIR_NAMES[0]}, contact_sets.ccw.<corners>, "
+            f"contact_set_time.ccw.<corners>, contact_points.ccw.2, events, steps{hint}"
+        )
+    return known[key]
+
+
+def unit_of(path: str) -> str:
+    """Return the unit of a statistic."""
+    return UNITS[path.partition(".")[0]]
+
+
+def _labels(scene: Scene) -> list[str]:
+    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
+    return [letters.get(corner, corner) for corner in CORNER_NAMES]
+
+
+def _groups(scene: Scene) -> dict[str, list[int]]:
+    """Return the groups of pairs by the end of a path."""
+    ccw = [pair for pair in range(8) if STOPS_COUNTER_CLOCKWISE[pair]]
+    cw = [pair for pair in range(8) if not STOPS_COUNTER_CLOCKWISE[pair]]
+    groups: dict[str, list[int]] = {"": list(range(8)), ".ccw": ccw, ".cw": cw}
+    groups |= {f".{name}": [pair] for pair, name in enumerate(PAIR_NAMES)}
+    for corner, label in enumerate(_labels(scene)):
+        both = [2 * corner, 2 * corner + 1]
+        for name in {label, CORNER_NAMES[corner]}:
+            groups[f".{name}"] = both
+            groups[f".ccw.{name}"] = [pair for pair in both if pair in ccw]
+            groups[f".cw.{name}"] = [pair for pair in both if pair in cw]
+    return groups
+
+
+def _sets(scene: Scene) -> dict[str, int]:
+    labels = _labels(scene)
+    joint = "" if scene.frame.labels else "+"
+    return {
+        joint.join(sorted(labels[i] for i in corners)): sum(1 << i for i in corners)
+        for size in (1, 2, 3, 4)
+        for corners in combinations(range(4), size)
+    }
+
+
+def _set_time(members: Members, row: int, mask: int) -> Array:
+    return np.asarray(members.set_time[:, row, mask])
+
+
+def _share(members: Members, row: int, masks: list[int]) -> Array:
+    times = members.set_time[:, row]
+    total = times.sum(axis=1)
+    part = times[:, masks].sum(axis=1)
+    return np.asarray(np.divide(part, total, out=np.zeros_like(part), where=total > 0.0))

@@ -1,0 +1,137 @@
+"""Unknowns of a calibration and their range: the map between the unit cube and the values of a scene's parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.scene import Scene
+from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, parameter_of
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """One parameter to find: between `low` and `high` (evenly in its logarithm if `log`), or one of `choices`."""
+
+    path: str
+    low: float = 0.0
+    high: float = 1.0
+    log: bool = False
+    choices: tuple[Value, ...] = ()
+
+    def value(self, place: float) -> Value:
+        """Return the value at a place 0..1 of the range."""
+        if self.choices:
+            return self.choices[min(int(place * len(self.choices)), len(self.choices) - 1)]
+        if self.log:
+            return float(self.low * (self.high / self.low) ** place)
+        return float(self.low + (self.high - self.low) * place)
+
+    def place(self, value: Value) -> float:
+        """Return the place 0..1 of a value; a choice lies in the middle of its share."""
+        if self.choices:
+            return (self.choices.index(value) + 0.5) / len(self.choices)
+        number = float(value)
+        share = (
+            math.log(number / self.low) / math.log(self.high / self.low)
+            if self.log
+            else (number - self.low) / (self.high - self.low)
+        )
+        return min(max(share, 0.0), 1.0)
+
+
+def parse_unknown(text: str, scene: Scene) -> Unknown:
+    """Read `PATH=LOW:HIGH[:log]`, `PATH=CHOICE,CHOICE..` or, for a sign, `PATH` alone.
+
+    Raises
+    ------
+    StudyError
+        Naming the unknown, what was got and what is expected.
+    """
+    path, equals, rest = text.partition("=")
+    check_path(scene, path)
+    if not equals:
+        if not path.endswith("sign"):
+            raise StudyError(f"unknown {path}: got no range, expected {path}=LOW:HIGH[:log] or {path}=CHOICE,CHOICE")
+        return Unknown(path, choices=(1.0, -1.0))
+    if ":" not in rest:
+        items = [item.strip() for item in rest.split(",") if item.strip()]
+        choices: tuple[Value, ...] = tuple(items) if path in WORDS else tuple(_number(item, path) for item in items)
+        if len(set(choices)) < 2:
+            raise StudyError(f"unknown {path}: got {rest!r}, expected at least two choices")
+        return Unknown(path, choices=choices)
+    low, high, *scale = rest.split(":")
+    bounds = _number(low, path), _number(high, path)
+    if not bounds[0] < bounds[1] or scale not in ([], ["log"], ["lin"]) or (scale == ["log"] and bounds[0] <= 0.0):
+        raise StudyError(
+            f"unknown {path}: got {rest!r}, expected LOW:HIGH or LOW:HIGH:log with LOW < HIGH (log: LOW > 0)"
+        )
+    return Unknown(path, *bounds, log=scale == ["log"])
+
+
+def _number(text: str, path: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise StudyError(f"{path}: got {text!r}, expected a finite number")
+    return number
+
+
+@dataclass(frozen=True)
+class Space:
+    """The unknowns together: a cube of places 0..1."""
+
+    unknowns: tuple[Unknown, ...]
+
+    def __post_init__(self) -> None:
+        paths = [unknown.path for unknown in self.unknowns]
+        if not paths or len(set(paths)) < len(paths):
+            raise StudyError(f"unknowns: got {paths}, expected at least one, each parameter once")
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.unknowns)
+
+    @property
+    def continuous(self) -> NDArray[np.int64]:
+        """Numbers of the unknowns that have a range."""
+        return np.array([i for i, unknown in enumerate(self.unknowns) if not unknown.choices], dtype=np.int64)
+
+    def values(self, point: Array) -> dict[str, Value]:
+        """Return the values of a point, shape (n,)."""
+        return {u.path: u.value(float(place)) for u, place in zip(self.unknowns, point, strict=True)}
+
+    def values_of(self, points: Array) -> list[dict[str, Value]]:
+        """Return the values of points, shape (m, n)."""
+        return [self.values(point) for point in points]
+
+    def point(self, scene: Scene) -> Array | None:
+        """Return the point of a scene, or None when one of its values is outside."""
+        places = []
+        for unknown in self.unknowns:
+            value = parameter_of(scene, unknown.path)
+            inside = value in unknown.choices if unknown.choices else _inside(unknown, value)
+            if value is None or not inside:
+                return None
+            places.append(unknown.place(value))
+        return np.array(places)
+
+    def settled(self, point: Array) -> Array:
+        """Return the point with each choice in the middle of its share, so that equal choices are equal places."""
+        choices: Sequence[Unknown] = self.unknowns
+        return np.array(
+            [u.place(u.value(float(x))) if u.choices else float(x) for u, x in zip(choices, point, strict=True)]
+        )
+
+
+def _inside(unknown: Unknown, value: Value | None) -> bool:
+    return isinstance(value, float) and unknown.low <= value <= unknown.high
