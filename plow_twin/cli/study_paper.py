@@ -62,9 +62,10 @@ def _print(study: PaperStudy, out: Path) -> None:
 
     console = output_console()
     table = Table(title=f"scene {study.name} beside the paper, {study.runs.t_end:g} s", title_justify="left")
-    for name in ("statement", "published", "reconstructed", "difference", "agrees?"):
-        width = 24 if name == "statement" else None
-        table.add_column(name, justify="right" if name == "difference" else "left", overflow="fold", min_width=width)
+    for name, width in (("statement", 20), ("published", 10), ("reconstructed", 16)):
+        table.add_column(name, overflow="fold", min_width=width)
+    table.add_column("difference", justify="right", no_wrap=True)
+    table.add_column("agrees?", no_wrap=True)
     group = ""
     for row in study.rows:
         if row.group != group:

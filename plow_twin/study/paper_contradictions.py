@@ -67,7 +67,8 @@ def _doubled(runs: PaperRuns) -> Contradiction:
     return Contradiction(
         "section 1, eqs (2) to (4)",
         "The test of contact, s > l_BC with s the sum of the distances to two opposite sides, is right, but s - l_BC "
-        "is twice the penetration: whoever puts it into the spring law doubles the force.",
+        "is twice the penetration: whoever puts it into the spring law has 2^n times the stiffness. A "
+        "fitted stiffness cannot tell the two apart.",
         f"deepest penetration of this run {1e3 * depth:.2f} mm, s - l_BC there {1e3 * excess:.2f} mm",
     )
 

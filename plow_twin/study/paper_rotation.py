@@ -87,9 +87,9 @@ def _forces(rotation: Rotation) -> Iterator[RotationRow]:
         chosen = paper_sets.of_sense(sense)
         for corner in CORNERS:
             (pair,) = (index for index, letter in enumerate(letters) if letter == corner and chosen[index])
-            for statistic, name in (("max", "largest"), ("mean_in_contact", "mean in contact")):
+            for statistic, name in (("max", "largest force"), ("mean_in_contact", "mean force in contact")):
                 values = [list(result.statistics.values())[pair][statistic] / 1e3 for result in rotation.results]
-                yield RotationRow(f"{sense_name}, {corner}: {name} force", "kN", *values)
+                yield RotationRow(f"{sense_name}, {corner}: {name}", "kN", *values)
 
 
 def _poses(rotation: Rotation) -> Iterator[RotationRow]:

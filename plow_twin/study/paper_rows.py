@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Final
+
+from plow_twin.model.scene import Mark
 
 if TYPE_CHECKING:
     from plow_twin.study.paper_runs import PaperRuns
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 FITTED: Final = "fitted to this"
 CHECK: Final = "not fitted to this"
 ASSUMED: Final = "not fitted to this; other clearance assumed 20 mm"
+UNKNOWN: Final = "the scene does not say"
 
 
 class Verdict(Enum):
@@ -71,11 +73,14 @@ def all_rows(runs: PaperRuns) -> list[Row]:
     """Return the whole comparison in the order of the paper."""
     from plow_twin.study import paper_rows_motion, paper_rows_sets, paper_rows_trends
 
-    return [
+    rows = [
         *paper_rows_motion.rows(runs.scene, runs.case),
         *paper_rows_sets.rows(runs.scene, runs.case),
         *paper_rows_trends.rows(runs),
     ]
+    if any(entry.mark is Mark.RECONSTRUCTED for entry in runs.scene.marks.values()):
+        return rows
+    return [replace(row, inputs=UNKNOWN) for row in rows]
 
 
 def one_run_rows(runs: PaperRuns, index: int) -> list[Row]:
@@ -85,11 +90,6 @@ def one_run_rows(runs: PaperRuns, index: int) -> list[Row]:
     assert runs.rotation is not None
     scene, result = runs.rotation.scenes[index], runs.rotation.results[index]
     return [*paper_rows_motion.rows(scene, result), *paper_rows_sets.rows(scene, result)]
-
-
-def count(rows: Sequence[Row], verdict: Verdict) -> int:
-    """Return how many rows have a verdict."""
-    return sum(row.verdict is verdict for row in rows)
 
 
 def braces(corners: str) -> str:

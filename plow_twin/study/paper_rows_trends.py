@@ -64,11 +64,12 @@ def rows(runs: PaperRuns) -> list[Row]:
 def _corners(sweep: Sweep, group: str, source: str, falls: bool) -> Iterator[Row]:
     at = ", ".join(f"{1e3 * value:g}" for value in GRID_M)
     for column, corner in enumerate(CORNERS):
-        yield _trend(group, source, f"{corner}: largest force", sweep.on_grid()[:, column], at, falls, FITTED)
-    forces = sweep.on_grid()
+        what = f"point {corner}: largest force against {group.partition(' (')[0].lower()}"
+        yield _trend(group, source, what, sweep.on_grid()[:, column], at, falls, FITTED)
+    forces, along = sweep.on_grid(), group.partition(" (")[0].lower()
     first = [CORNERS[int(row.argmax())] if np.isfinite(row).all() else "?" for row in forces]
     yield Row(
-        group, "section 4, Figs 10 and 11", "the largest of all is at a or b", "a or b",
+        group, "section 4, Figs 10 and 11", f"{along}: the largest of all is at a or b", "a or b",
         f"{', '.join(first)} at {at} mm",
         Verdict.NOT_COMPUTED if "?" in first else Verdict.of(set(first) <= {"a", "b"}),
         "at each of the five clearances", FITTED,
