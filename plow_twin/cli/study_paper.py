@@ -61,11 +61,12 @@ def _print(study: PaperStudy, out: Path) -> None:
     from plow_twin.study.report import percent
 
     console = output_console()
-    table = Table(title=f"scene {study.name} beside the paper, {study.runs.t_end:g} s", title_justify="left")
-    for name, width in (("statement", 20), ("published", 10), ("reconstructed", 16)):
-        table.add_column(name, overflow="fold", min_width=width)
-    table.add_column("difference", justify="right", no_wrap=True)
-    table.add_column("agrees?", no_wrap=True)
+    title = f"scene {study.name} beside the paper, {study.runs.t_end:g} s"
+    table = Table(title=title, title_justify="left", expand=True)
+    for name, ratio in (("statement", 5), ("published", 3), ("reconstructed", 5)):
+        table.add_column(name, ratio=ratio)
+    table.add_column("difference", justify="right", width=10)
+    table.add_column("agrees?", width=8)
     group = ""
     for row in study.rows:
         if row.group != group:
