@@ -14,19 +14,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import preset
+import yaml
+from scenes import ROOT, preset
 
+from plow_twin import Result, Scene, SolverError, simulate
 from plow_twin.cli.app import run
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.scene_file import dump_scene
-from plow_twin.study import paper_sets
+from plow_twin.study import paper_runs, paper_sets
 from plow_twin.study.paper import PaperStudy, compare
 from plow_twin.study.paper_contradictions import contradictions
-from plow_twin.study.paper_rows import Row, Verdict
+from plow_twin.study.paper_rows import FITTED, Row, Verdict
 from plow_twin.study.paper_rows_trends import rises, rises_then_falls, rows
 from plow_twin.study.paper_runs import Sweep
 from plow_twin.study.paper_sets import Hold
+from plow_twin.study.paper_values import FORCES
 
 FIGURES = [f"paper_fig{number:02}" for number in (6, 7, 8, 9, 10, 11, 13, 14, 15)] + ["paper_rotation"]
 
@@ -41,7 +44,7 @@ def row(study: PaperStudy, what: str) -> Row:
     return found
 
 
-def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path) -> None:
+def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "report"
     command = [
         sys.executable,
@@ -83,9 +86,8 @@ def test_the_command_leaves_a_report_its_table_and_the_run(tmp_path: Path) -> No
     assert document["recording_error_m"] < 1e-6
     assert replay(out / "run").divergences == 0
 
-    again = subprocess.run(command, capture_output=True, text=True, timeout=110, stdin=subprocess.DEVNULL, check=False)
-    assert again.returncode == 2
-    assert "expected a new folder" in " ".join(again.stderr.split())
+    assert run(["study", "paper", "--out", str(out)]) == 2  # nothing is overwritten
+    assert "expected a new folder" in " ".join(capsys.readouterr().err.split())
 
 
 def test_forces_are_those_of_the_reconstruction(study: PaperStudy) -> None:
@@ -131,14 +133,14 @@ def test_what_disagrees_is_said(study: PaperStudy) -> None:
 
 def test_another_stiffness_gives_other_verdicts(study: PaperStudy) -> None:
     scene = preset("paper")
-    other = compare(replace(scene, contact=replace(scene.contact, stiffness=8.0 * scene.contact.stiffness)), 60.0)
+    other = compare(replace(scene, contact=replace(scene.contact, stiffness=4.0 * scene.contact.stiffness)), 20.0)
     before, after = ({entry.what: entry for entry in each.rows} for each in (study, other))
     assert before.keys() == after.keys()
     assert {what: entry.published for what, entry in before.items()} == {w: e.published for w, e in after.items()}
     changed = [what for what, entry in before.items() if entry.verdict is not after[what].verdict]
     assert "clockwise: largest force, at b" in changed
     assert len(changed) >= 5
-    assert after["clockwise: largest force, at b"].difference > 0.3
+    assert after["clockwise: largest force, at b"].difference > 0.2
 
 
 def test_sets_from_the_events_are_the_solver_s_own(study: PaperStudy) -> None:
@@ -153,6 +155,12 @@ def test_sets_from_the_events_are_the_solver_s_own(study: PaperStudy) -> None:
     for index in range(0, len(forces), 997):
         seen = {letters[pair] for pair in range(8) if chosen[pair] and forces[index, pair] > 0.0}
         assert set(paper_sets.at(timeline, float(study.runs.case.t[index]))) == seen
+
+
+def test_published_forces_are_those_of_the_calibration_s_targets() -> None:
+    targets = yaml.safe_load((ROOT / "config" / "paper_targets.yaml").read_text())["targets"]
+    ours = {f"{force.statistic}.{force.sense}.{force.corner}": force.value_n for force in FORCES}
+    assert ours == {target["statistic"]: target["value"] for target in targets if "value" in target}
 
 
 def test_a_set_counts_from_five_milliseconds_on() -> None:
@@ -187,6 +195,37 @@ def test_a_failed_run_is_no_verdict(study: PaperStudy) -> None:
     found = [entry.verdict for entry in table if entry.group.startswith("Vertical")]
     assert found == [Verdict.NOT_COMPUTED] * 5
     assert all(entry.verdict is not Verdict.NOT_COMPUTED for entry in table if not entry.group.startswith("Vertical"))
+
+
+def test_a_run_that_fails_leaves_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(scene: Scene, t_end: float, output_dt: float) -> Result:
+        if (scene.clearance.horizontal_m, scene.clearance.vertical_m) == (0.020, 0.030):
+            raise SolverError("at t = 1 s: for this test")
+        return simulate(scene, t_end, output_dt)
+
+    monkeypatch.setattr(paper_runs, "simulate", failing)
+    study = compare(preset("paper"), 6.5)
+    assert study.runs.failed == 1
+    lost = [entry for entry in study.rows if entry.verdict is Verdict.NOT_COMPUTED]
+    assert [entry.source for entry in lost] == ["section 5, Fig. 14"] * 4
+
+
+def test_the_page_has_the_run_s_numbers(study: PaperStudy) -> None:
+    text = (ROOT / "docs" / "study.md").read_text()
+    yes = study.verdicts["yes"]
+    fitted = [entry for entry in study.rows if entry.inputs == FITTED]
+    agree = sum(entry.verdict is Verdict.AGREES for entry in fitted)
+    said = (
+        f"Of {len(study.rows)} statements {yes} agree: {agree} of the {len(fitted)} that R1 was fitted to, "
+        f"{yes - agree} of the {len(study.rows) - len(fitted)} that it was not."
+    )
+    assert said in text
+    for entry in study.rows:
+        if entry.difference is not None:
+            assert f"| {entry.published} kN | {entry.computed} kN, {100 * entry.difference:+.1f} % |" in text
+    values = {entry.what: entry for entry in study.rotation}
+    for what in ("counter-clockwise, a", "clockwise, b", "clockwise, d"):
+        assert f"{values[f'{what}: largest force'].consistent:.1f}" in text
 
 
 def test_the_exact_rigid_body_falls_without_turning(study: PaperStudy) -> None:

@@ -51,7 +51,7 @@ def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: b
     with progress("the paper's figures (the first run compiles)", quiet) as on_progress:
         study = study_paper(model, scene, out, t_end, workers, recording, on_progress)
     if study.runs.failed:
-        click.echo(f"plow-twin: {study.runs.failed} run(s) of Figs 10 and 11 failed; see the table", err=True)
+        click.echo(f"plow-twin: {study.runs.failed} run(s) failed; their rows are not computed", err=True)
     if not quiet:
         _print(study, out)
     return DONE_WITH_LOSS if study.runs.failed else DONE

@@ -40,14 +40,14 @@ def rows(scene: Scene, result: Result) -> list[Row]:
 
 def _occurs(moment: Moment, timeline: Sequence[Hold]) -> Iterator[Row]:
     figures = paper_sets.figures(timeline).get(moment.corners)
-    text = (
-        f"longest hold {1e3 * figures.longest_s:.2f} ms, {figures.share:.2%} of the contact time"
-        if figures
-        else "never"
-    )
+    text = "never"
+    if figures:
+        longest, total = 1e3 * figures.longest_s, 1e3 * figures.total_s
+        text = f"longest hold {longest:.2f} ms, {total:.3g} ms in all ({figures.share:.2%})"
     yield Row(
         _SETS, _FIGURES[moment.sense], f"{SENSE_NAMES[moment.sense]}: {braces(moment.corners)} occurs", "occurs", text,
-        Verdict.of(figures is not None and figures.count > 0), f"held for {1e3 * SHORTEST_HOLD_S:g} ms or more", FITTED,
+        Verdict.of(figures is not None and figures.count > 0),
+        f"held for {1e3 * SHORTEST_HOLD_S:g} ms or more without a break", FITTED,
     )  # fmt: skip
 
 

@@ -65,7 +65,7 @@ def _corners(sweep: Sweep, group: str, source: str, falls: bool) -> Iterator[Row
     at = ", ".join(f"{1e3 * value:g}" for value in GRID_M)
     for column, corner in enumerate(CORNERS):
         what = f"point {corner}: largest force against {group.partition(' (')[0].lower()}"
-        yield _trend(group, source, what, sweep.on_grid()[:, column], at, falls, FITTED)
+        yield _trend(group, source, what, sweep.on_grid()[:, column], at, falls, FITTED if corner in "ab" else CHECK)
     forces, along = sweep.on_grid(), group.partition(" (")[0].lower()
     first = [CORNERS[int(row.argmax())] if np.isfinite(row).all() else "?" for row in forces]
     yield Row(

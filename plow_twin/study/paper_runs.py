@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.ensemble import simulate_many
-from plow_twin.errors import Problem, SceneError
+from plow_twin.errors import Problem, SceneError, SolverError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Clearance, Harmonic, Scene
-from plow_twin.simulate import Result, simulate
+from plow_twin.simulate import Result, output_times, simulate
+from plow_twin.solve.layout import Status
 from plow_twin.study.paper_rotation import Rotation, rotation_scenes
 from plow_twin.study.paper_sets import letters_of_pairs
 from plow_twin.study.paper_values import (
@@ -52,16 +53,28 @@ class Sweep:
 
 @dataclass(frozen=True)
 class FaceRun:
-    """A run of 20 s at a clearance [m] and the force on each inner face [N] in time, shape (n, 4) as `FACES`."""
+    """A run of 20 s at a clearance [m] and the force on each inner face [N] in time, shape (n, 4) as `FACES`.
+
+    The forces of a run that failed are NaN.
+    """
 
     clearance_m: float
     t: Array
     face_n: Array
 
+    @property
+    def failed(self) -> bool:
+        """Whether the motion could not be continued to the end."""
+        return bool(np.isnan(self.face_n).any())
+
 
 @dataclass(frozen=True)
 class PaperRuns:
-    """Everything that is computed. `scale` is the scene's clearance over the published one: horizontal, vertical."""
+    """Everything that is computed.
+
+    `scale` is the scene's clearance over the published one: horizontal, vertical; `failed` counts the runs that could
+    not be brought to their end. The case itself always is.
+    """
 
     scene: Scene
     t_end: float
@@ -109,12 +122,14 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
     ------
     SceneError
         The scene cannot be compared: labels, loads or clearances.
+    SolverError
+        The run of Figs 6 to 9 could not be continued. The others may fail: their rows are then not computed.
     """
     check_scene(scene)
     scale = (scene.clearance.horizontal_m / CASE_M[0], scene.clearance.vertical_m / CASE_M[1])
     tell = on_progress or (lambda share: None)
     case = simulate(scene, t_end, OUTPUT_DT_S)
-    rotation = rotation_scenes(scene, t_end, OUTPUT_DT_S)
+    rotation, lost = _rotation(scene, t_end)
     tell(0.1)
     fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
     cells = [(FIXED_M, value) for value in fine] + [(value, FIXED_M) for value in fine]
@@ -124,7 +139,8 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
         tell(0.1 + 0.7 * done / len(scenes))
 
     many = simulate_many(scenes, t_end, t_end, workers=workers, on_progress=on_member)
-    peak = np.where((many.status == 0)[:, None], many.peak, np.nan)
+    good = many.status == Status.OK
+    peak = np.where(good[:, None], many.peak, np.nan)
     largest = _by_corner(scene, peak)
     end = min(FACE_T_END_S, t_end)
     vertical = [_face_run(_at(scene, scale, FIXED_M, value), value, end) for value in FACE_GRID_M]
@@ -132,11 +148,11 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
     horizontal = [_face_run(_at(scene, scale, value, FIXED_M), value, end) for value in FACE_GRID_M]
     rows = case.t <= end
     faces = FaceRun(CASE_M[1], case.t[rows], face_forces(case.force[rows]))
-    count = int((many.status != 0).sum())
+    lost += int((~good).sum()) + sum(run.failed for run in (*vertical, *horizontal))
     tell(1.0)
     return PaperRuns(
         scene, t_end, scale, case, Sweep(fine, largest[: len(fine)]), Sweep(fine, largest[len(fine) :]), faces,
-        tuple(vertical), tuple(horizontal), rotation, count,
+        tuple(vertical), tuple(horizontal), rotation, lost,
     )  # fmt: skip
 
 
@@ -156,8 +172,20 @@ def _by_corner(scene: Scene, peak: Array) -> Array:
 
 
 def _face_run(scene: Scene, clearance_m: float, t_end: float) -> FaceRun:
-    result = simulate(scene, t_end, OUTPUT_DT_S)
+    try:
+        result = simulate(scene, t_end, OUTPUT_DT_S)
+    except SolverError:
+        times = output_times(t_end, OUTPUT_DT_S)
+        return FaceRun(clearance_m, times, np.full((len(times), len(FACES)), np.nan))
     return FaceRun(clearance_m, result.t, face_forces(result.force))
+
+
+def _rotation(scene: Scene, t_end: float) -> tuple[Rotation | None, int]:
+    """Return the forms of the head's rotation and how many runs failed: one that fails leaves nothing to compare."""
+    try:
+        return rotation_scenes(scene, t_end, OUTPUT_DT_S), 0
+    except SolverError:
+        return None, 1
 
 
 def face_of_pair() -> list[str]:
@@ -172,8 +200,3 @@ def face_forces(force: Array) -> Array:
         force[:, [pair for pair, name in enumerate(faces) if name == face]].sum(axis=1) for face in FACES
     ]
     return np.stack(columns, axis=1)
-
-
-def deepest_m(runs: PaperRuns) -> float:
-    """Return the deepest penetration of the case's rows in m."""
-    return float(runs.case.penetration.max())

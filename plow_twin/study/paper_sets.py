@@ -33,9 +33,10 @@ class Hold:
 
 @dataclass(frozen=True)
 class SetFigures:
-    """One set over a run: share of the contact time of its sense, longest hold [s], holds long enough to count."""
+    """One set over a run: share of the contact time of its sense, all of it and longest hold [s], holds that count."""
 
     share: float
+    total_s: float
     longest_s: float
     count: int
 
@@ -79,7 +80,7 @@ def figures(timeline: Sequence[Hold]) -> dict[str, SetFigures]:
     for name in {hold.corners for hold in timeline} - {""}:
         durations = [hold.duration_s for hold in timeline if hold.corners == name]
         long_enough = sum(duration >= SHORTEST_HOLD_S for duration in durations)
-        table[name] = SetFigures(sum(durations) / total, max(durations), long_enough)
+        table[name] = SetFigures(sum(durations) / total, sum(durations), max(durations), long_enough)
     return dict(sorted(table.items(), key=lambda item: -item[1].share))
 
 

@@ -86,4 +86,4 @@ SHORTEST_HOLD_S: Final = 5e-3
 #: A step against a trend counts from this share of the curve's largest value on: what a printed curve shows.
 TREND_SLACK: Final = 0.005
 #: "rare" for what the paper does not mention: at most that share of the contact time.
-RARE_SHARE: Final = 0.05
+RARE_SHARE: Final = 0.10
