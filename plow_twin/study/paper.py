@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,18 +34,18 @@ class Change:
 
 @dataclass(frozen=True)
 class PaperStudy:
-    """All that was found."""
+    """All that was found; the files of it too when they were written."""
 
-    name: str
     runs: PaperRuns
     rows: list[Row]
     rotation: list[RotationRow]
     changes: list[Change]
     contradictions: list[Contradiction]
-    pictures: list[Picture]
-    rotation_picture: Picture | None
-    recording: Recording | None
     wall_s: float
+    name: str = ""
+    pictures: list[Picture] = field(default_factory=list)
+    rotation_picture: Picture | None = None
+    recording: Recording | None = None
 
     @property
     def verdicts(self) -> dict[str, int]:
@@ -81,10 +81,8 @@ def compare(
     begin = time.perf_counter()
     runs = run_all(scene, t_end, workers, on_progress)
     rotation = [] if runs.rotation is None else rotation_rows(runs.rotation)
-    return PaperStudy(
-        "", runs, all_rows(runs), rotation, _changes(runs), contradictions(runs), [], None, None,
-        time.perf_counter() - begin,
-    )  # fmt: skip
+    wall_s = time.perf_counter() - begin
+    return PaperStudy(runs, all_rows(runs), rotation, _changes(runs), contradictions(runs), wall_s)
 
 
 def study_paper(
@@ -115,10 +113,14 @@ def study_paper(
     pictures = draw_all(found.runs, figures, lambda share: on_progress(0.2 + 0.2 * share))
     rotation_picture = draw_rotation(found.runs, figures)
     recorded = record(scene, t_end, out / "run", lambda share: on_progress(0.4 + 0.6 * share)) if recording else None
-    study = PaperStudy(
-        name, found.runs, found.rows, found.rotation, found.changes, found.contradictions, pictures,
-        rotation_picture, recorded, time.perf_counter() - begin,
-    )  # fmt: skip
+    study = replace(
+        found,
+        name=name,
+        pictures=pictures,
+        rotation_picture=rotation_picture,
+        recording=recorded,
+        wall_s=time.perf_counter() - begin,
+    )
     _write(study, out)
     on_progress(1.0)
     return study

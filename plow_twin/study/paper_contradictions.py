@@ -125,7 +125,7 @@ _GAPS: Final = (
         "sections 2 and 3",
         "Stiffness, damping and exponent of the contact law are printed nowhere, nor the signs of loads and arms, the "
         "initial state, the step, or what a mean force is the mean over; equations (5) and (6) are lost in the text.",
-        "every number of this scene that stands for one of them is marked reconstructed or assumed",
+        "in the preset paper every number that stands for one of them is marked reconstructed or assumed",
     ),
     Contradiction(
         "section 3",

@@ -131,29 +131,35 @@ def run_all(scene: Scene, t_end: float, workers: int | None = None, on_progress:
     case = simulate(scene, t_end, OUTPUT_DT_S)
     rotation, lost = _rotation(scene, t_end)
     tell(0.1)
+    sweeps, failed = _sweeps(scene, scale, t_end, workers, tell)
+    end = min(FACE_T_END_S, t_end)
+    vertical = [_face_run(_at(scene, scale, FIXED_M, value), value, end) for value in FACE_GRID_M]
+    horizontal = [_face_run(_at(scene, scale, value, FIXED_M), value, end) for value in FACE_GRID_M]
+    rows = case.t <= end
+    faces = FaceRun(CASE_M[1], case.t[rows], face_forces(case.force[rows]))
+    failed += lost + sum(run.failed for run in (*vertical, *horizontal))
+    tell(1.0)
+    return PaperRuns(
+        scene, t_end, scale, case, *sweeps, faces, tuple(vertical), tuple(horizontal), rotation, failed,
+    )  # fmt: skip
+
+
+def _sweeps(
+    scene: Scene, scale: tuple[float, float], t_end: float, workers: int | None, tell: OnProgress
+) -> tuple[tuple[Sweep, Sweep], int]:
+    """Return the curves of Figs 10 and 11 and how many of their runs failed; the forces of those are NaN."""
     fine = np.linspace(GRID_M[0], GRID_M[-1], _FINE_STEPS * (len(GRID_M) - 1) + 1)
     cells = [(FIXED_M, value) for value in fine] + [(value, FIXED_M) for value in fine]
     scenes = [_at(scene, scale, *cell) for cell in cells]
 
     def on_member(done: int) -> None:
-        tell(0.1 + 0.7 * done / len(scenes))
+        tell(0.1 + 0.8 * done / len(scenes))
 
     many = simulate_many(scenes, t_end, t_end, workers=workers, on_progress=on_member)
     good = many.status == Status.OK
-    peak = np.where(good[:, None], many.peak, np.nan)
-    largest = _by_corner(scene, peak)
-    end = min(FACE_T_END_S, t_end)
-    vertical = [_face_run(_at(scene, scale, FIXED_M, value), value, end) for value in FACE_GRID_M]
-    tell(0.9)
-    horizontal = [_face_run(_at(scene, scale, value, FIXED_M), value, end) for value in FACE_GRID_M]
-    rows = case.t <= end
-    faces = FaceRun(CASE_M[1], case.t[rows], face_forces(case.force[rows]))
-    lost += int((~good).sum()) + sum(run.failed for run in (*vertical, *horizontal))
-    tell(1.0)
-    return PaperRuns(
-        scene, t_end, scale, case, Sweep(fine, largest[: len(fine)]), Sweep(fine, largest[len(fine) :]), faces,
-        tuple(vertical), tuple(horizontal), rotation, lost,
-    )  # fmt: skip
+    largest = _by_corner(scene, np.where(good[:, None], many.peak, np.nan))
+    vertical, horizontal = largest[: len(fine)], largest[len(fine) :]
+    return (Sweep(fine, vertical), Sweep(fine, horizontal)), int((~good).sum())
 
 
 def _clearances(scene: Scene) -> tuple[float, float]:
