@@ -40,10 +40,10 @@ def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: b
     """
     from plow_twin.scene_file import load_scene
     from plow_twin.study.paper import study_paper
-    from plow_twin.study.paper_runs import SHORTEST_S
+    from plow_twin.study.paper_runs import LONGEST_S, SHORTEST_S
 
-    if t_end < SHORTEST_S:
-        message = f"got {t_end:g} s, expected at least two periods of the load, {SHORTEST_S:.4f} s"
+    if not SHORTEST_S <= t_end <= LONGEST_S:
+        message = f"got {t_end:g} s, expected {SHORTEST_S:.4f} s (two periods of the load) to {LONGEST_S:g} s"
         raise click.BadParameter(message, param_hint="--t-end")
     if out.exists() and any(out.iterdir()):
         raise click.BadParameter(f"got {str(out)!r}, which is not empty, expected a new folder", param_hint="--out")

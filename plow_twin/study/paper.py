@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from plow_twin.model.scene import Scene
+from plow_twin.model.scene import Mark, Scene
 from plow_twin.study.paper_contradictions import Contradiction, contradictions
 from plow_twin.study.paper_figures import Picture, draw_all, draw_rotation
 from plow_twin.study.paper_recording import Recording, record
@@ -147,8 +147,12 @@ def _changes(runs: PaperRuns) -> list[Change]:
 
 
 def row_as_plain(row: Row) -> dict[str, Any]:
-    """Return a row as it stands in JSON and CSV; the difference is a share."""
-    return asdict(row) | {"difference": row.difference, "verdict": row.verdict.value}
+    """Return a row as it stands in JSON and CSV; the difference is a share, what is published is `given`."""
+    return asdict(row) | {
+        "difference": row.difference,
+        "verdict": row.verdict.value,
+        "published_mark": Mark.GIVEN.value,
+    }
 
 
 def _write(study: PaperStudy, out: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,11 +33,13 @@ Array = NDArray[np.float64]
 OnProgress = Callable[[float], object]
 
 #: Shortest run that has a settled period of the load to look at.
-SHORTEST_S = 2.0 * PERIOD_S
+SHORTEST_S: Final = 2.0 * PERIOD_S
+#: Longest run: its rows of all forms take some gigabyte.
+LONGEST_S: Final = 1000.0
 #: Rows of the figures [s]; forces change over tens of milliseconds.
-OUTPUT_DT_S = 1e-3
+OUTPUT_DT_S: Final = 1e-3
 #: Steps of the curves between the five places where the paper's are read.
-_FINE_STEPS = 10
+_FINE_STEPS: Final = 10
 
 
 @dataclass(frozen=True)
