@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from plow_twin.cli.study_paper import paper
+from plow_twin.cli.study_sweep import sweep
 
 
 @click.group(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.")
@@ -13,6 +14,6 @@ def study() -> None:
 
 
 # each verb lives in a module of its own, plow_twin/cli/study_<verb>.py, and is added here
-_VERBS: tuple[click.Command, ...] = (paper,)
+_VERBS: tuple[click.Command, ...] = (sweep, paper)
 for _verb in _VERBS:
     study.add_command(_verb)

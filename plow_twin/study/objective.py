@@ -51,11 +51,9 @@ class TargetObjective:
         table = np.full((len(candidates), len(settings), len(paths)), np.nan)
         everyone = np.arange(len(candidates))
         self._fill(table, candidates, everyone, [0], paths)
-        left = everyone
         if len(settings) > 1:
             first = np.nansum(self._rows(table, paths, missing=np.nan) ** 2, axis=1)
-            sound = np.isfinite(table[:, 0].sum(axis=1))
-            left = everyone[(first <= cut) & sound]
+            left = np.flatnonzero(np.where(np.isfinite(table[:, 0].sum(axis=1)), first <= cut, False))
             self._fill(table, candidates, left, list(range(1, len(settings))), paths)
         return self._rows(table, paths, missing=FAILED_RESIDUAL)
 
@@ -98,7 +96,7 @@ class TargetObjective:
         for index, target in enumerate(self.targets.targets):
             columns = [settings.index(setting) for setting in target.settings]
             part = table[:, columns][:, :, [paths.index(path) for path in target.paths]]
-            bad = np.isnan(part).any(axis=(1, 2))
+            bad = np.asarray(np.isnan(part).any(axis=(1, 2)))
             r = target.residual(np.where(bad[:, None, None], 1.0, part))
             rows[:, index] = np.sqrt(target.weight) * np.where(bad, missing, r)
         return rows

@@ -14,7 +14,7 @@ four act on whatever the other paths have set. `contact.damping` takes the place
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -234,3 +234,22 @@ def _is_set(key: str, values: Mapping[str, Value], scene: Scene) -> bool:
         or any(other == f"{owner}.{name}" and touched for name, touched in derived.items())
         for other in values
     )  # fmt: skip
+
+
+def parse_settings(scene: Scene, texts: Sequence[str]) -> dict[str, Value]:
+    """Read `PATH=VALUE` texts.
+
+    Raises
+    ------
+    StudyError
+        Naming the setting, what was got and what is expected.
+    """
+    values: dict[str, Value] = {}
+    for text in texts:
+        path, _, rest = text.partition("=")
+        check_path(scene, path)
+        try:
+            values[path] = rest if path in WORDS else float(rest)
+        except ValueError:
+            raise StudyError(f"{path}: got {rest!r}, expected a number") from None
+    return values

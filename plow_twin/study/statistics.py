@@ -36,12 +36,20 @@ Statistic = Callable[[Members], Array]
 SENSES: Final = ("ccw", "cw")
 
 
+def _sum(array: Array, columns: list[int]) -> Array:
+    """Add columns one after the other: numpy's order, and with it the last bit, would depend on the number of rows."""
+    total = np.zeros(len(array))
+    for column in columns:
+        total = total + array[:, column]
+    return total
+
+
 def _max(members: Members, pairs: list[int]) -> Array:
     return np.asarray(members.peak[:, pairs].max(axis=1))
 
 
 def _mean_in_contact(members: Members, pairs: list[int]) -> Array:
-    impulse, time = (array[:, pairs].sum(axis=1) for array in (members.impulse, members.time_in_contact))
+    impulse, time = _sum(members.impulse, pairs), _sum(members.time_in_contact, pairs)
     return np.asarray(np.divide(impulse, time, out=np.zeros_like(impulse), where=time > 0.0))
 
 
@@ -50,15 +58,15 @@ def _mean_over_time(members: Members, pairs: list[int]) -> Array:
 
 
 def _impulse(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(members.impulse[:, pairs].sum(axis=1))
+    return _sum(members.impulse, pairs)
 
 
 def _time_in_contact(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(members.time_in_contact[:, pairs].sum(axis=1))
+    return _sum(members.time_in_contact, pairs)
 
 
 def _makes(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(members.makes[:, pairs].sum(axis=1), dtype=np.float64)
+    return _sum(members.makes.astype(np.float64), pairs)
 
 
 def _wear_depth(members: Members, pairs: list[int]) -> Array:
@@ -162,6 +170,5 @@ def _set_time(members: Members, row: int, mask: int) -> Array:
 
 def _share(members: Members, row: int, masks: list[int]) -> Array:
     times = members.set_time[:, row]
-    total = times.sum(axis=1)
-    part = times[:, masks].sum(axis=1)
+    total, part = _sum(times, list(range(16))), _sum(times, masks)
     return np.asarray(np.divide(part, total, out=np.zeros_like(part), where=total > 0.0))

@@ -1,0 +1,48 @@
+"""What the verbs of `plow-twin study` share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import click
+
+from plow_twin.presets import scene_path
+
+if TYPE_CHECKING:
+    from plow_twin.model.scene import Scene
+
+set_option = click.option(
+    "--set",
+    "settings",
+    multiple=True,
+    metavar="PATH=VALUE",
+    help="Change a number or word of the scene first; repeat it.",
+)
+
+
+@contextmanager
+def usage_errors() -> Iterator[None]:
+    """Turn what is wrong with a question into a usage error, exit code 2."""
+    from plow_twin.study.parameters import StudyError
+
+    try:
+        yield
+    except StudyError as error:
+        raise click.UsageError(str(error)) from None
+
+
+def study_scene(name: str, settings: Sequence[str]) -> Scene:
+    """Load a scene and change what `--set` names.
+
+    Raises
+    ------
+    StudyError, SceneError
+        When the scene or a setting cannot be used.
+    """
+    from plow_twin.scene_file import load_scene
+    from plow_twin.study.parameters import parse_settings, with_parameters
+
+    scene = load_scene(scene_path(name))
+    return with_parameters(scene, parse_settings(scene, settings)) if settings else scene

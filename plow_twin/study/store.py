@@ -1,0 +1,144 @@
+"""The folder of a sweep: what was asked, and what is computed of it so far.
+
+    sweep.json          the arguments, and the number of members in a chunk
+    chunks/00007.npz    status and statistics of the members of one chunk, and the build that computed them
+
+A chunk is written beside its place, synced and moved there in one step: a killed run loses the chunk under way.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any, Final
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.study.parameters import StudyError
+from plow_twin.study.sweep import Sweep, Table, chunks_of
+
+Array = NDArray[np.float64]
+
+FORMAT: Final = 1
+
+
+class Store:
+    """Chunks of one sweep in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when it is not there.
+    sweep : Sweep
+    chunk : int
+        Members in a chunk; the stored number counts when the folder holds this sweep already.
+    fresh : bool
+        Discard what the folder holds of any sweep.
+
+    Raises
+    ------
+    StudyError
+        When the folder holds another sweep, or something that is none; says what differs.
+    """
+
+    def __init__(self, folder: Path, sweep: Sweep, chunk: int, fresh: bool = False) -> None:
+        self.folder, self.sweep, self.chunk = folder, sweep, chunk
+        self._chunks = folder / "chunks"
+        if fresh:
+            shutil.rmtree(self._chunks, ignore_errors=True)
+            (folder / "sweep.json").unlink(missing_ok=True)
+        if (folder / "sweep.json").exists():
+            self._take_up()
+        elif self._chunks.exists():
+            raise StudyError(
+                f"{folder}: got chunks without sweep.json, expected a sweep's folder (--fresh discards it)"
+            )
+        self._chunks.mkdir(parents=True, exist_ok=True)
+        facts = {"format": FORMAT, "chunk": self.chunk, "arguments": sweep.arguments()}
+        write_atomically(folder / "sweep.json", json.dumps(facts, indent=1).encode())
+
+    def _take_up(self) -> None:
+        path = self.folder / "sweep.json"
+        try:
+            facts: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            stored, self.chunk = facts["arguments"], int(facts["chunk"])
+        except (ValueError, KeyError, TypeError):
+            raise StudyError(f"{path}: got no readable sweep, expected one (--fresh discards it)") from None
+        asked = self.sweep.arguments()
+        differing = [key for key in asked if stored.get(key) != asked[key]]
+        if differing or facts.get("format") != FORMAT:
+            what = "; ".join(_difference(key, stored.get(key), asked[key]) for key in differing) or "its format"
+            raise StudyError(
+                f"{self.folder}: holds another sweep, which differs in {what}. Use another --out or --fresh"
+            )
+
+    @property
+    def chunks(self) -> list[range]:
+        """Members of every chunk."""
+        return list(chunks_of(self.sweep.size, self.chunk))
+
+    def missing(self) -> list[int]:
+        """Return the numbers of the chunks that are not stored, or are damaged."""
+        return [index for index in range(len(self.chunks)) if self.read(index) is None]
+
+    def read(self, index: int) -> tuple[Array, str] | None:
+        """Return a chunk's table and build, or None when it is not there or not whole."""
+        try:
+            with self._path(index).open("rb") as file, np.load(file, allow_pickle=False) as archive:
+                table, build = np.asarray(archive["table"], float), str(archive["build"])
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            return None
+        shape = (len(self.chunks[index]), 1 + len(self.sweep.statistics))
+        return (table, build) if table.shape == shape else None
+
+    def write(self, index: int, table: Array, build: str) -> None:
+        """Store a chunk, in one step."""
+        from io import BytesIO
+
+        buffer = BytesIO()
+        np.savez(buffer, table=table, build=np.array(build))
+        write_atomically(self._path(index), buffer.getvalue())
+
+    def table(self) -> Table:
+        """Return the whole table.
+
+        Raises
+        ------
+        StudyError
+            When a chunk is not there.
+        """
+        found = [self.read(index) for index in range(len(self.chunks))]
+        parts = [part for part in found if part is not None]
+        if len(parts) < len(found):
+            raise StudyError(f"{self.folder}: got {len(parts)} chunks, expected {len(found)}")
+        whole = np.concatenate([table for table, _ in parts])
+        builds = tuple(sorted({build for _, build in parts}))
+        return Table(self.sweep, whole[:, 0].astype(np.int64), whole[:, 1:], builds)
+
+    def _path(self, index: int) -> Path:
+        return self._chunks / f"{index:05d}.npz"
+
+
+def _difference(key: str, stored: Any, asked: Any) -> str:
+    if key == "scene_yaml":
+        return "the scene"
+    return f"{key} (stored {json.dumps(stored)}, asked {json.dumps(asked)})"
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file so that it is there whole or not at all, also after a kill or a power cut."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    with beside.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(beside, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

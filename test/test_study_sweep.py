@@ -1,0 +1,175 @@
+"""Sweeps: the same bits as single runs, whatever is killed on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scenes import preset
+
+from plow_twin import simulate
+from plow_twin.cli.app import run
+from plow_twin.errors import SceneError
+from plow_twin.scene_file import dump_scene
+from plow_twin.study.parameters import StudyError, parameter_of, parameter_paths, with_parameters
+from plow_twin.study.store import Store
+from plow_twin.study.sweep import Sweep, parse_axis
+from plow_twin.study.sweep_run import run_here, run_on_cluster
+
+GRID = ["--x", "clearance.horizontal_m=0.020:0.030:5", "--y", "contact.stiffness=6e6:6e7:3:log"]
+STATISTICS = (
+    "max.top_left_top",
+    "max.ccw.a",
+    "contact_sets.ccw.ad",
+    "contact_points.cw.4",
+    "impulse",
+    "makes",
+    "events",
+)
+
+
+def sweep_of(*axes: str, t_end: float = 6.0) -> Sweep:
+    scene = preset("paper")
+    return Sweep(dump_scene(scene), tuple(parse_axis(text, scene) for text in axes), STATISTICS, t_end, 1e-7)
+
+
+def test_every_member_has_the_numbers_of_its_single_run(tmp_path: Path) -> None:
+    sweep = sweep_of(GRID[1], GRID[3])
+    table = run_here(Store(tmp_path, sweep, chunk=4))
+    assert sweep.shape == (5, 3) and not table.failed
+    for member in (0, 7, 14):
+        values = sweep.values(member)
+        scene = with_parameters(preset("paper"), values)
+        assert (scene.clearance.horizontal_m, scene.contact.stiffness) == tuple(values.values())
+        single = simulate(scene, sweep.t_end_s, tol=sweep.tol)
+        four = single.contact_sets["cw"].get("abcd", 0.0)
+        expected = (
+            single.statistics["top_left_top"]["max"],
+            single.statistics["bottom_right_bottom"]["max"],
+            single.contact_sets["ccw"].get("ad", 0.0),
+            four,
+            sum(row["impulse"] for row in single.statistics.values()),
+            sum(row["makes"] for row in single.statistics.values()),
+            len(single.events),
+        )
+        assert table.numbers[member] == pytest.approx(expected, rel=1e-14, abs=0.0)
+    assert np.unique(table.numbers[:, 0]).size == 15
+
+
+def test_parameters_are_set_and_refused_by_path() -> None:
+    scene = preset("paper")
+    assert {"contact.stiffness", "loads.fx1.phase_rad", "head.com_offset_m[0]", "initial.q[2]"} <= set(
+        parameter_paths(scene)
+    )
+    changed = with_parameters(
+        scene, {"loads.fx3.sign": 1.0, "loads.fx1.arm_sign": -1.0, "clearance.scale": 2.0, "clearance.vertical_m": 0.02}
+    )
+    assert changed.loads[2].force_n == (96000.0, 0.0) and changed.loads[0].at_m == (0.0, -0.72)
+    assert (changed.clearance.horizontal_m, changed.clearance.vertical_m) == (0.05, 0.04)
+    assert "clearance.vertical_m" not in changed.marks and "head.mass_kg" in changed.marks
+    assert with_parameters(scene, {"contact.restitution": 0.5}).contact.damping is None
+    for path in parameter_paths(scene):
+        value = parameter_of(scene, path)
+        if value is not None:
+            assert dump_scene(with_parameters(scene, {path: value})).count("value") > 0
+            assert parameter_of(with_parameters(scene, {path: value}), path) == value
+    with pytest.raises(StudyError, match=r"contact\.stifness.*nearest: contact\.stiffness"):
+        with_parameters(scene, {"contact.stifness": 1.0})
+    with pytest.raises(SceneError, match=r"contact\.stiffness: got -1\.0"):
+        with_parameters(scene, {"contact.stiffness": -1.0})
+
+
+def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["study", "sweep", "paper", *GRID, "--statistic", "max.ccw.a", "--statistic", "events"]
+    arguments += ["--t-end", "80", "--chunk", "2", "--out"]
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    process = subprocess.Popen([sys.executable, "-m", "plow_twin", *arguments, str(killed)], stderr=subprocess.DEVNULL)
+    try:
+        while process.poll() is None and len(list(killed.glob("chunks/*.npz"))) < 2:
+            time.sleep(0.005)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    stored = len(list(killed.glob("chunks/*.npz")))
+    assert process.returncode == -signal.SIGKILL and 2 <= stored < 8
+    # what a kill in the middle of a write, or a broken disk, leaves behind
+    (killed / "chunks" / ".00007.npz.1").write_bytes(b"half")
+    first = killed / "chunks" / "00000.npz"
+    first.write_bytes(first.read_bytes()[:100])
+
+    assert run([*arguments, str(killed)]) == 0
+    before = 2 * (stored - 1)
+    assert f"15 members, {before} stored before, {15 - before} to compute" in capsys.readouterr().err
+    assert run([*arguments, str(whole), "--quiet"]) == 0
+    assert (killed / "sweep.parquet").read_bytes() == (whole / "sweep.parquet").read_bytes()
+    assert run([*arguments, str(killed)]) == 0
+    assert "15 stored before, 0 to compute" in capsys.readouterr().err
+
+
+def test_failed_members_are_listed_and_other_questions_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("plow_twin.study.sweep_run.CONNECT_TIMEOUT_S", 0.5)
+    arguments = ["study", "sweep", "paper", "--statistic", "max", "--t-end", "2", "--out", str(tmp_path)]
+    arguments += ["--x", "contact.stiffness=1e3,-1,1e7,1e8"]
+    assert run(arguments) == 3
+    said = capsys.readouterr()
+    assert "left the model's range" in said.err and "contact.stiffness: got -1.0" in said.err
+    stored = (tmp_path / "sweep.parquet").read_bytes()
+    table = pq.read_table(tmp_path / "sweep.parquet")
+    assert table["status"].to_pylist() == [1, -1, 0, 0]
+    assert table["contact.stiffness"].to_pylist() == [1e3, -1.0, 1e7, 1e8]
+    assert np.isnan(table["max"].to_numpy()).tolist() == [True, True, False, False]
+    facts = json.loads(table.schema.metadata[b"plow_twin"])
+    assert facts["arguments"]["tol"] == 1e-9 and "mass_kg" in facts["arguments"]["scene_yaml"]
+    assert facts["units"] == {"max": "N"} and facts["builds"][0]["numba"]
+    assert (tmp_path / "sweep.png").read_bytes()[:4] == b"\x89PNG"
+
+    assert run([*arguments, "--tol", "1e-8"]) == 2
+    assert "differs in tol (stored 1e-09, asked 1e-08)" in capsys.readouterr().err
+    assert run([*arguments, "--set", "head.mass_kg=2000"]) == 2
+    assert "differs in the scene" in capsys.readouterr().err
+    assert (tmp_path / "sweep.parquet").read_bytes() == stored
+    assert run([*arguments, "--set", "head.mass_kg=2000", "--fresh", "-q"]) == 3
+    for wrong, message in (
+        (["--x", "contact.stiffness=1:2"], "PATH=LOW:HIGH:COUNT".replace("PATH", "contact.stiffness")),
+        (["--statistic", "max.ccw.z"], "nearest: max.ccw"),
+        (["--y", "contact.stiffness=1:2:3"], "two different ones"),
+        (["--dask", "tcp://127.0.0.1:1"], "expected the address of a scheduler"),
+    ):
+        extra = ["--fresh", "--x", "contact.stiffness=1e7:2e7:2"] if "--dask" in wrong else []
+        assert run([*arguments, *extra, *wrong]) == (1 if "--dask" in wrong else 2)
+        assert message in capsys.readouterr().err
+
+
+def test_a_dask_worker_killed_in_the_middle_loses_nothing(tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    sweep = sweep_of(GRID[1], GRID[3], t_end=100.0)
+    store = Store(tmp_path / "cluster", sweep, chunk=1)
+    kill: list[int] = []
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
+    ) as cluster:
+        victim = cluster.workers[0].pid
+
+        def on_progress(done: int) -> None:
+            if not kill:
+                os.kill(victim, signal.SIGKILL)
+                kill.append(done)
+
+        table = run_on_cluster(store, cluster.scheduler_address, on_progress)
+        assert victim not in {worker.pid for worker in cluster.workers.values()}
+    assert kill == [1]
+    local = run_here(Store(tmp_path / "local", sweep, chunk=4))
+    assert np.array_equal(table.status, local.status) and not table.failed
+    assert table.numbers.tobytes() == local.numbers.tobytes()
+    assert len(set(table.builds) | set(local.builds)) == 1
