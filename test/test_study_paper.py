@@ -131,6 +131,30 @@ def test_what_disagrees_is_said(study: PaperStudy) -> None:
         assert word in statements
 
 
+def test_a_second_reconstruction_gets_its_own_verdicts(study: PaperStudy) -> None:
+    # other signs of loads and arms, other contact: fits the forces at a and b and one trend less
+    scene = preset("paper")
+    fx1, fx2, fx3, fy = scene.loads
+    loads = (
+        replace(fx1, force_n=(-92e3, 0.0), at_m=(0.0, -0.72)),
+        replace(fx2, force_n=(36e3, 0.0), at_m=(0.0, -0.415)),
+        replace(fx3, force_n=(96e3, 0.0), at_m=(0.0, -0.01)),
+        fy,
+    )
+    contact = replace(scene.contact, stiffness=1.3054e7, damping=0.92118)
+    second = compare(replace(scene, loads=loads, contact=contact), 60.0)
+    for what, value in (
+        ("counter-clockwise: largest force, at a", 162.0),
+        ("counter-clockwise: largest mean force, at a", 68.0),
+        ("clockwise: largest force, at b", 171.0),
+        ("clockwise: largest mean force, at b", 85.0),
+    ):
+        assert row(second, what).value == pytest.approx(value, abs=0.5)
+    np.testing.assert_array_equal(np.round(second.runs.vertical.on_grid()[:4, 1] / 1e3), [157, 155, 152, 146])
+    falls = "point b: largest force against vertical clearance"  # from the start
+    assert [row(each, falls).verdict for each in (study, second)] == [Verdict.AGREES, Verdict.DISAGREES]
+
+
 def test_another_stiffness_gives_other_verdicts(study: PaperStudy) -> None:
     scene = preset("paper")
     other = compare(replace(scene, contact=replace(scene.contact, stiffness=4.0 * scene.contact.stiffness)), 20.0)
