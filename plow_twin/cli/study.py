@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from plow_twin.cli.study_calibrate import calibrate
 from plow_twin.cli.study_paper import paper
 from plow_twin.cli.study_sweep import sweep
 
@@ -14,6 +15,6 @@ def study() -> None:
 
 
 # each verb lives in a module of its own, plow_twin/cli/study_<verb>.py, and is added here
-_VERBS: tuple[click.Command, ...] = (sweep, paper)
+_VERBS: tuple[click.Command, ...] = (sweep, calibrate, paper)
 for _verb in _VERBS:
     study.add_command(_verb)

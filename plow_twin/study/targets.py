@@ -106,6 +106,8 @@ class TargetSet:
     t_end_s: float
     tol: float = 1e-6
     source: str = ""
+    #: unknowns that the file proposes, as on the command line
+    unknowns: tuple[str, ...] = ()
     settings: tuple[Mapping[str, Value], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -135,8 +137,8 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
         problems.append("got no list `targets`, expected version, t_end, targets")
     targets: list[Target] = []
     if not problems:
-        extra = set(raw) - {"version", "t_end", "tol", "targets"}
-        problems += [f"{key}: expected version, t_end, tol, targets" for key in sorted(map(str, extra))]
+        extra = set(raw) - {"version", "t_end", "tol", "targets", "unknowns"}
+        problems += [f"{key}: expected version, t_end, tol, unknowns, targets" for key in sorted(map(str, extra))]
         if raw.get("version") != 1:
             problems.append(f"version: got {raw.get('version')!r}, expected 1")
         for key in ("t_end", "tol"):
@@ -150,7 +152,9 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
     if problems:
         lines = "\n".join(f"  {problem}" for problem in problems)
         raise StudyError(f"{path}: {len(problems)} problem(s)\n{lines}")
-    return TargetSet(tuple(targets), float(raw["t_end"]), float(raw.get("tol", 1e-6)), str(path))
+    return TargetSet(
+        tuple(targets), float(raw["t_end"]), float(raw.get("tol", 1e-6)), str(path), _texts(raw.get("unknowns"))
+    )
 
 
 def _target(item: Any, index: int, scene: Scene) -> Target:

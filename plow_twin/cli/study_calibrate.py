@@ -1,0 +1,184 @@
+"""`plow-twin study calibrate`: find unknown parameters of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import DONE, POSITIVE, output_console, progress, quiet_option, table
+from plow_twin.cli.study_options import set_option, study_scene, usage_errors
+from plow_twin.presets import config_folder
+
+if TYPE_CHECKING:
+    from plow_twin.model.scene import Scene
+    from plow_twin.study.calibrate import Calibration, Search
+    from plow_twin.study.fit import Fit
+    from plow_twin.study.objective import Objective
+    from plow_twin.study.unknowns import Space
+
+
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, scene or targets.")
+@click.argument("scene")
+@click.option(
+    "--unknown",
+    "unknowns",
+    multiple=True,
+    metavar="RANGE",
+    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; repeat it. Default: the target file's.",
+)
+@click.option("--target", metavar="FILE", help="Figures to fit to: a target file, or `paper` for the paper's.")
+@click.option(
+    "--recording",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="Motion to fit to: .csv or .npz with t, x, y, theta, or a recording of the node (.mcap).",
+)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
+@click.option("--starts", type=click.IntRange(1), default=8, show_default=True, help="Independent random starts.")
+@click.option("--screen", type=click.IntRange(1), default=200, show_default=True, help="Random points per start.")
+@click.option("--population", type=click.IntRange(5), default=30, show_default=True, help="Population of a start.")
+@click.option("--generations", type=click.IntRange(0), default=40, show_default=True, help="Generations of a start.")
+@click.option(
+    "--simplex", type=click.IntRange(0), help="Evaluations of the last polish; 200 with --target, 0 with --recording."
+)
+@click.option("--t-end", metavar="T", type=POSITIVE, help="Time to simulate, in place of the target file's [s].")
+@click.option("--tol", type=POSITIVE, help="Tolerance; the target file's, or 1e-8 with --recording.")
+@click.option("--excess", type=POSITIVE, help="Objective above the best that still counts as near optimal; 10 % of it.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="Folder of the results.")
+@set_option
+@click.option("--workers", type=click.IntRange(1), help="Threads; all cores by default.")
+@quiet_option
+def calibrate(
+    scene: str, out: Path, quiet: bool, settings: tuple[str, ...], unknowns: tuple[str, ...], **options: Any
+) -> int:
+    """Fit unknowns of SCENE to published figures or to a recorded motion; writes fit.yaml and calibration.json."""
+    from plow_twin.study.calibrate import Search
+    from plow_twin.study.fit import write_fit
+    from plow_twin.study.unknowns import Space, parse_unknown
+
+    with usage_errors():
+        model = study_scene(scene, settings)
+        objective, source, proposed = _objective(model, options)
+        texts = _merged(proposed, unknowns)
+        space = Space(tuple(parse_unknown(text, model) for text in texts))
+    simplex = options["simplex"]
+    if simplex is None:
+        simplex = 0 if options["target"] is None else 200
+    search = Search(options["screen"], options["population"], options["generations"], simplex)
+    fit = _run(model, space, objective, source, search, options, quiet)
+    arguments = {"scene": scene, "settings": settings, "unknowns": texts, **options, "simplex": simplex}
+    plain = {key: str(value) if isinstance(value, Path) else value for key, value in arguments.items()}
+    write_fit(fit, space, plain, out)
+    if not quiet:
+        _show(fit, space, out)
+    return DONE
+
+
+def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
+    """Return the unknowns of the target file and those given, which take the place of one of the same parameter.
+
+    `contact.damping` and `contact.restitution` exclude each other, and so does a range that is `PATH=fixed`.
+    """
+    paths = {text.partition("=")[0] for text in given}
+    if paths & {"contact.damping", "contact.restitution"}:
+        paths |= {"contact.damping", "contact.restitution"}
+    kept = [text for text in proposed if text.partition("=")[0] not in paths]
+    return (*kept, *(text for text in given if text.partition("=")[2] != "fixed"))
+
+
+def _objective(model: Scene, options: dict[str, Any]) -> tuple[Objective, str, tuple[str, ...]]:
+    """Return the objective, what it is called, and the unknowns that the target file proposes."""
+    from dataclasses import replace
+
+    from plow_twin.study.objective import RecordingObjective, TargetObjective
+    from plow_twin.study.pose_recording import load_poses
+    from plow_twin.study.targets import load_targets
+
+    target, recording, workers = options["target"], options["recording"], options["workers"]
+    if (target is None) == (recording is None):
+        raise click.UsageError("got both or none of --target and --recording, expected one of them")
+    if recording is not None:
+        poses = load_poses(recording)
+        return RecordingObjective(model, poses, options["tol"] or 1e-8, workers), f"the motion {recording.name}", ()
+    path = config_folder() / "paper_targets.yaml" if target == "paper" else Path(target)
+    targets = load_targets(path, model)
+    targets = replace(targets, t_end_s=options["t_end"] or targets.t_end_s, tol=options["tol"] or targets.tol)
+    source = "the paper's published figures" if target == "paper" else f"the figures of {path.name}"
+    return TargetObjective(model, targets, workers), source, targets.unknowns
+
+
+def _run(
+    model: Scene,
+    space: Space,
+    objective: Objective,
+    source: str,
+    search: Search,
+    options: dict[str, Any],
+    quiet: bool,
+) -> Fit:
+    from plow_twin.study.calibrate import calibrate as fit_to
+    from plow_twin.study.fit import Fit, fitted_scene, objective_of, target_rows
+    from plow_twin.study.objective import TargetObjective
+    from plow_twin.study.uniqueness import identifiability, near_optimal
+
+    first = space.point(model)
+    with progress("calibrating", quiet) as on_progress:
+        found: Calibration = fit_to(
+            space, objective, seed=options["seed"], starts=options["starts"], search=search, first=first,
+            on_progress=lambda share, best: on_progress(share),
+        )  # fmt: skip
+    values = found.best.values
+    excess = options["excess"] or max(0.1 * found.best.objective, 1e-12)
+    return Fit(
+        fitted_scene(model, values, source), found, search, source,
+        identifiability(space, objective, found.best.point), near_optimal(space, found, excess),
+        None if first is None else objective_of(objective, {}),
+        target_rows(objective, values) if isinstance(objective, TargetObjective) else [],
+    )  # fmt: skip
+
+
+def _show(fit: Fit, space: Space, out: Path) -> None:
+    console = output_console()
+    found = fit.calibration
+    before = "" if fit.before is None else f" (the scene as it stood: {fit.before:.4g})"
+    shown = table(
+        f"best of {len(found.starts)} starts, objective {found.best.objective:.4g}{before}", "unknown", "fitted"
+    )
+    shown.add_column("near-optimal", justify="right")
+    for unknown in space.unknowns:
+        value = found.best.values[unknown.path]
+        low_high = fit.clusters[0].spread.get(unknown.path)
+        spread = "" if low_high is None else f"{low_high[0]:.5g} .. {low_high[1]:.5g}"
+        shown.add_row(unknown.path, value if isinstance(value, str) else f"{value:.6g}", spread)
+    console.print(shown)
+    if fit.targets:
+        _show_targets(console, fit)
+    singular = ", ".join(f"{value:.3g}" for value in fit.identifiability.singular_values)
+    console.print(f"singular values of the Jacobian over the ranges: {singular}", highlight=False, soft_wrap=True)
+    objectives = ", ".join(f"{start.objective:.4g}" for start in found.starts)
+    console.print(f"objective of each start: {objectives}", highlight=False, soft_wrap=True)
+    sizes = ", ".join(f"{one.objective:.4g} ({one.members})" for one in fit.clusters[:8])
+    console.print(
+        f"{len(fit.clusters)} clusters of near-optimal points, objective (points): {sizes}\n"
+        f"{found.runs} runs; {out / 'fit.yaml'}, {out / 'calibration.json'}",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _show_targets(console: Any, fit: Fit) -> None:
+    from plow_twin.study.statistics import unit_of
+
+    met = sum(row.met for row in fit.targets)
+    shown = table(f"{met} of {len(fit.targets)} targets met", "target")
+    shown.columns[0].no_wrap = False
+    for name in ("got", "unit", "residual", "met"):
+        shown.add_column(name, justify="right", min_width=len(name))
+    for row in fit.targets:
+        unit = unit_of(row.statistic)
+        scale = 1e-3 if unit == "N" else 1.0
+        got = " ".join(f"{scale * value:.4g}" for value in row.got)
+        shown.add_row(row.name, got, "kN" if unit == "N" else unit, f"{row.residual:.2f}", "yes" if row.met else "no")
+    console.print(shown)

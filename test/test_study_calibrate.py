@@ -1,0 +1,208 @@
+"""Calibration: known parameters recovered from random starts, same seed same bits, targets judged as they say."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import ROOT, preset
+
+from plow_twin import simulate
+from plow_twin.cli.app import run
+from plow_twin.model.scene import Mark
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.study.calibrate import Calibration, Search, calibrate
+from plow_twin.study.members import run_members
+from plow_twin.study.objective import RecordingObjective, TargetObjective
+from plow_twin.study.parameters import StudyError, with_parameters
+from plow_twin.study.pose_recording import PoseRecording, load_poses
+from plow_twin.study.statistics import statistic
+from plow_twin.study.targets import Target, TargetSet, load_targets
+from plow_twin.study.uniqueness import identifiability, near_optimal
+from plow_twin.study.unknowns import Space, parse_unknown
+
+#: Of a scene that is not the preset: stiffness, damping, a phase, a clearance and a sign.
+TRUTH = {
+    "contact.stiffness": 2.3e7,
+    "contact.damping": 0.43,
+    "loads.fy.phase_rad": 0.6,
+    "clearance.horizontal_m": 0.0215,
+    "loads.fx2.sign": -1.0,
+}
+RANGES = (
+    "contact.stiffness=3e6:3e8:log",
+    "contact.damping=0.05:2:log",
+    "loads.fy.phase_rad=-1.5:1.5",
+    "clearance.horizontal_m=0.015:0.035",
+    "loads.fx2.sign",
+)
+#: Relative error with which each start recovers each parameter.
+RECOVERED = 1e-6
+
+
+def recording(seconds: float = 3.0) -> PoseRecording:
+    motion = simulate(with_parameters(preset("paper"), TRUTH), seconds, 0.01)
+    return PoseRecording(motion.t, motion.q)
+
+
+def space() -> Space:
+    return Space(tuple(parse_unknown(text, preset("paper")) for text in RANGES))
+
+
+#: Effort of a start that recovers the truth.
+SEARCH = Search(screen=150, population=24, generations=24)
+
+
+def from_recording(
+    starts: int, workers: int | None = None, search: Search = SEARCH
+) -> tuple[Calibration, RecordingObjective]:
+    objective = RecordingObjective(preset("paper"), recording(), workers=workers)
+    return calibrate(space(), objective, seed=7, starts=starts, search=search), objective
+
+
+def errors(found: Calibration) -> list[float]:
+    return [max(abs(start.values[path] / true - 1.0) for path, true in TRUTH.items()) for start in found.starts]
+
+
+def test_known_parameters_are_recovered_from_every_random_start() -> None:
+    found, objective = from_recording(4)
+    assert len(found.starts) == 4 and max(errors(found)) < RECOVERED
+    assert len({start.before_polish for start in found.starts}) == 4  # each start took its own way
+    known = identifiability(space(), objective, found.best.point)
+    assert len(known.singular_values) == 4 and known.singular_values[-1] > 1e-2
+    assert sum(value**2 for value in known.weakest.values()) == pytest.approx(1.0)
+    clusters = near_optimal(space(), found, excess=1e-6)
+    assert len(clusters) == 1 and clusters[0].members >= 4 and clusters[0].values["loads.fx2.sign"] == -1.0
+
+
+@pytest.mark.stress
+def test_known_parameters_are_recovered_from_20_random_starts() -> None:
+    found, _ = from_recording(20)
+    assert len(found.starts) == 20 and max(errors(found)) < RECOVERED
+
+
+def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads() -> None:
+    one, two = (from_recording(1, workers, Search(30, 10, 6))[0] for workers in (1, 3))
+    assert one.best.values == two.best.values and one.best.objective == two.best.objective
+    assert one.population.tobytes() == two.population.tobytes()
+
+
+def test_an_unseen_parameter_is_reported_as_such() -> None:
+    scene = with_parameters(preset("paper"), {"contact.impact_speed_floor_m_s": 2e-3})
+    # a constant damping does not use the floor: the recording cannot say anything about it
+    unknowns = Space(
+        tuple(parse_unknown(text, scene) for text in (RANGES[0], "contact.impact_speed_floor_m_s=1e-4:1e-2"))
+    )
+    objective = RecordingObjective(scene, recording(1.0))
+    known = identifiability(unknowns, objective, np.array([0.4, 0.5]))
+    assert known.singular_values[1] == 0.0 < known.singular_values[0]
+    assert known.weakest == {"contact.stiffness": 0.0, "contact.impact_speed_floor_m_s": 1.0}
+
+
+def figures(seconds: float) -> TargetSet:
+    """Return what a paper might publish of the true motion: forces, means, shares, impulses."""
+    true = with_parameters(preset("paper"), TRUTH)
+    members = run_members([true], seconds)
+    paths = [
+        f"{kind}.{sense}.{corner}"
+        for kind in ("max", "mean_in_contact", "impulse")
+        for sense in ("ccw", "cw")
+        for corner in "abcd"
+    ]
+    paths += ["contact_points.ccw.2", "contact_points.cw.2"]
+    numbers = {path: float(statistic(true, path)(members)[0]) for path in paths}
+    return TargetSet(
+        tuple(Target(path, "value", (path,), number, settings=({},)) for path, number in numbers.items() if number),
+        seconds,
+        1e-9,
+    )
+
+
+def test_known_parameters_are_recovered_from_published_figures() -> None:
+    objective = TargetObjective(preset("paper"), figures(3.0))
+    found = calibrate(space(), objective, seed=3, starts=1, search=Search(screen=200, population=24, generations=30))
+    assert min(errors(found)) < 1e-5
+    assert found.best.objective < 1e-6 and all(abs(r) < 1e-3 for r in objective.unweighted(found.best.values))
+
+
+def test_the_command_fits_a_recording_and_marks_what_it_fitted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rec = recording(2.0)
+    np.savetxt(tmp_path / "run.csv", np.column_stack([rec.t, rec.q]), delimiter=",", header="t,x,y,theta", comments="")
+    np.savez(tmp_path / "run.npz", t=rec.t, q=rec.q)
+    assert load_poses(tmp_path / "run.csv").q == pytest.approx(load_poses(tmp_path / "run.npz").q, abs=1e-15)
+    arguments = [
+        "study",
+        "calibrate",
+        "paper",
+        "--recording",
+        str(tmp_path / "run.csv"),
+        "--starts",
+        "1",
+        "--seed",
+        "2",
+    ]
+    for path in ("contact.damping", "loads.fy.phase_rad", "clearance.horizontal_m"):
+        arguments += ["--set", f"{path}={TRUTH[path]}"]
+    arguments += ["--unknown", RANGES[0], "--unknown", RANGES[4], "--screen", "40", "--population", "10"]
+    assert run([*arguments, "--out", str(tmp_path / "fit")]) == 0
+    assert "singular values" in capsys.readouterr().out
+    fit = load_scene(tmp_path / "fit" / "fit.yaml")
+    assert fit.contact.stiffness == pytest.approx(TRUTH["contact.stiffness"], rel=1e-6)
+    assert fit.loads[1].force_n[0] < 0.0 and fit.marks["contact.stiffness"].mark is Mark.RECONSTRUCTED
+    assert "run.csv" in fit.marks["contact.stiffness"].source and fit.marks["head.mass_kg"].mark is Mark.GIVEN
+    assert "36 kN is given" in fit.marks["loads[1].force_n[0]"].source
+    facts = json.loads((tmp_path / "fit" / "calibration.json").read_text())
+    assert facts["seed"] == 2 and facts["objective"] < 1e-10 and facts["runs"] > 40
+    for wrong, message in (
+        (["--unknown", "contact.stiffness=1:2:lag"], "LOW:HIGH"),
+        (["--unknown", "contact.stifness=1:2"], "nearest: contact.stiffness"),
+        (["--target", "paper"], "expected one of them"),
+    ):
+        assert run([*arguments, *wrong, "--out", str(tmp_path / "none")]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_targets_are_judged_as_they_say(tmp_path: Path) -> None:
+    def residual(target: Target, *rows: list[float]) -> float:
+        return float(target.residual(np.array([rows]))[0])
+
+    value = Target("v", "value", ("max",), 100.0, tolerance=0.05)
+    assert residual(value, [104.0]) == pytest.approx(0.8) and value.met(0.8) and not value.met(-1.01)
+    above = Target("a", "above", ("max.a", "max.b"), others=("max.c",), tolerance=0.1)
+    assert residual(above, [5.0, 8.0, 10.0]) == pytest.approx(5.0) and residual(above, [11.0, 12.0, 10.0]) == 0.0
+    rare = Target("r", "at_most", ("max",), 0.1, scale=0.2)
+    assert residual(rare, [0.5]) == pytest.approx(2.0) and residual(rare, [0.05]) == 0.0
+    rises = Target("t", "trend", ("max",), shape="rises", tolerance=0.1)
+    assert residual(rises, [1.0], [2.0], [1.5], [3.5]) == pytest.approx(0.5 / 0.2)
+    bump = replace(rises, shape="rises_then_falls")
+    assert residual(bump, [1.0], [2.0], [1.5], [1.0]) == 0.0 < residual(bump, [1.0], [2.0], [1.5], [1.7])
+    assert residual(bump, [1.0], [2.0], [3.0], [4.0]) > 0.0 and residual(bump, [4.0], [3.0], [2.0], [1.0]) > 0.0
+
+    paper = load_targets(ROOT / "config" / "paper_targets.yaml", preset("paper"))
+    assert all(target.mark == "given" and "Fig." in target.source for target in paper.targets)
+    assert len(paper.settings) == 10 and paper.settings[0] == {}
+    r1 = dict(zip((t.name for t in paper.targets), TargetObjective(preset("paper"), paper).unweighted({}), strict=True))
+    assert r1["ccw max at a"] == pytest.approx((147.6 / 153.0 - 1.0) / 0.05, abs=0.01)
+    assert r1["cw: b largest"] == 0.0 < r1["ccw: a largest"]
+    (tmp_path / "bad.yaml").write_text(
+        "version: 1\nt_end: -3\ntargets:\n- {statistic: max.z, value: 1}\n- {value: 2}\n"
+    )
+    with pytest.raises(StudyError, match=r"(?s)3 problem.*t_end: got -3.*max\.z.*targets\[1\]"):
+        load_targets(tmp_path / "bad.yaml", preset("paper"))
+
+
+def test_a_fitted_scene_survives_its_file(tmp_path: Path) -> None:
+    values = {
+        "frame.labels": "top_left_cw",
+        "contact.restitution": 0.5,
+        "loads.fx1.arm_sign": -1.0,
+        "clearance.scale": 2.0,
+    }
+    scene = with_parameters(preset("paper"), {**values, "contact.law": "exact_restitution"})
+    (tmp_path / "fit.yaml").write_text(dump_scene(scene))
+    assert load_scene(tmp_path / "fit.yaml") == scene
