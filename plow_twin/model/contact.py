@@ -9,10 +9,13 @@ contact and when its force would pull: there the force is zero.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import row, splat
 
 
 @kernel(inline=True)
@@ -50,30 +53,35 @@ def power_term(
     return total / (k * base[shift, lane])
 
 
-@kernel(fast=True)
-def power_terms(
-    base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float, inverse: NDArray[np.float64]
-) -> None:
-    """Write coefficient k >= 1 of the eight columns of base^exponent side by side: `power_term` without a shift.
+@kernel(fast=True, inline=True)
+def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float) -> Any:
+    """Return coefficient k >= 1 of the eight columns of base^exponent, times base[0]: `power_term` without a shift."""
+    # the newest orders come last: most of the sum need not wait for them
+    even, odd = splat(0.0), splat(0.0)
+    weight = (exponent + 1.0) * (k - 1) - k
+    for j in range(k - 1, 2, -2):
+        even = even + row(base, j) * row(power, k - j) * weight
+        odd = odd + row(base, j - 1) * row(power, k - j + 1) * (weight - exponent - 1.0)
+        weight -= 2.0 * (exponent + 1.0)
+    if k % 2 == 1 and k > 1:
+        even = even + row(base, 2) * row(power, k - 2) * (2.0 * (exponent + 1.0) - k)
+    odd = odd + row(base, k) * row(power, 0) * (exponent * k)
+    if k > 1:
+        even = even + row(base, 1) * row(power, k - 1) * (exponent + 1.0 - k)
+    return (even + odd) * (1.0 / k)
 
-    `inverse` (8,) is 1 / base[0], or zero for a column that is not wanted.
+
+@kernel(fast=True, inline=True)
+def root_terms(base: NDArray[np.float64], root: NDArray[np.float64], k: int) -> Any:
+    """Return coefficient k >= 1 of the square root of the eight columns of base, times 2 root[0].
+
+    Recurrence  2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j},  half of whose terms are equal in pairs.
     """
-    t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
-    for j in range(1, k + 1):
-        i = k - j
-        scale = exponent * j - i
-        t0 += scale * base[j, 0] * power[i, 0]
-        t1 += scale * base[j, 1] * power[i, 1]
-        t2 += scale * base[j, 2] * power[i, 2]
-        t3 += scale * base[j, 3] * power[i, 3]
-        t4 += scale * base[j, 4] * power[i, 4]
-        t5 += scale * base[j, 5] * power[i, 5]
-        t6 += scale * base[j, 6] * power[i, 6]
-        t7 += scale * base[j, 7] * power[i, 7]
-    scale = 1.0 / max(k, 1)
-    power[k, 0], power[k, 1], power[k, 2], power[k, 3] = (
-        t0 * scale * inverse[0], t1 * scale * inverse[1], t2 * scale * inverse[2], t3 * scale * inverse[3],
-    )  # fmt: skip
-    power[k, 4], power[k, 5], power[k, 6], power[k, 7] = (
-        t4 * scale * inverse[4], t5 * scale * inverse[5], t6 * scale * inverse[6], t7 * scale * inverse[7],
-    )  # fmt: skip
+    rest, products = row(base, k), splat(0.0)
+    half = k // 2
+    if k == 2 * half:
+        rest = rest - row(root, half) * row(root, half)
+        half -= 1
+    for j in range(half, 0, -1):
+        products = products + row(root, j) * row(root, k - j)
+    return rest - products * 2.0

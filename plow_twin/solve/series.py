@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import math
 
-from plow_twin.model.contact import power_term, power_terms
+from plow_twin.model.contact import power_term, power_terms, root_terms
 from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import lane, magnitude, pack, row, set_row, splat, total
 from plow_twin.solve.layout import (
     ACTS,
     ALPHA,
@@ -61,117 +62,86 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
             sine, cosine = new_sine, new_cosine
 
 
-# The eight columns of these arrays are SIMD lanes. The lanes are written out and stored last: a store between two loads
-# could touch what is loaded, and the compiler would not dare to put them side by side.
-
-
 @kernel(fast=True)
-def _multiply_older(a, b, k, out) -> None:
-    """Write order k of the eight products of the columns of a and b, without the two terms of order k itself, to `out`.
+def _multiply_older(a, b, k):
+    """Return order k of the eight products of the columns of a and b, without the two terms of order k itself.
 
-    These sums do not wait for the newest order, so that the processor can run them ahead.
+    The oldest orders come first: most of the sum need not wait for the newest one.
     """
-    t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = 0.0
-    for j in range(1, k):
-        i = k - j
-        t0 += a[j, 0] * b[i, 0]
-        t1 += a[j, 1] * b[i, 1]
-        t2 += a[j, 2] * b[i, 2]
-        t3 += a[j, 3] * b[i, 3]
-        t4 += a[j, 4] * b[i, 4]
-        t5 += a[j, 5] * b[i, 5]
-        t6 += a[j, 6] * b[i, 6]
-        t7 += a[j, 7] * b[i, 7]
-    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
-    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
+    low, high = splat(0.0), splat(0.0)
+    half = k // 2
+    if k == 2 * half and k > 0:
+        low = row(a, half) * row(b, half)
+        half -= 1
+    for j in range(half, 0, -1):
+        low = low + row(a, j) * row(b, k - j)
+        high = high + row(a, k - j) * row(b, j)
+    return low + high
 
 
 @kernel(fast=True)
-def _multiply(a, b, k, out) -> None:
-    """Write order k of the eight products of the columns of a and b to row k of `out`."""
-    _multiply_older(a, b, k, out)
-    both = 0.0 if k == 0 else 1.0
-    t0 = out[k, 0] + a[0, 0] * b[k, 0] + both * a[k, 0] * b[0, 0]
-    t1 = out[k, 1] + a[0, 1] * b[k, 1] + both * a[k, 1] * b[0, 1]
-    t2 = out[k, 2] + a[0, 2] * b[k, 2] + both * a[k, 2] * b[0, 2]
-    t3 = out[k, 3] + a[0, 3] * b[k, 3] + both * a[k, 3] * b[0, 3]
-    t4 = out[k, 4] + a[0, 4] * b[k, 4] + both * a[k, 4] * b[0, 4]
-    t5 = out[k, 5] + a[0, 5] * b[k, 5] + both * a[k, 5] * b[0, 5]
-    t6 = out[k, 6] + a[0, 6] * b[k, 6] + both * a[k, 6] * b[0, 6]
-    t7 = out[k, 7] + a[0, 7] * b[k, 7] + both * a[k, 7] * b[0, 7]
-    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
-    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
-
-
-@kernel(fast=True)
-def _combine(rows, c, s, x, y, k, out) -> None:
-    """Write rows . (c, s, x, y) to row k of `out`."""
-    t0 = rows[0, 0] * c + rows[1, 0] * s + rows[2, 0] * x + rows[3, 0] * y
-    t1 = rows[0, 1] * c + rows[1, 1] * s + rows[2, 1] * x + rows[3, 1] * y
-    t2 = rows[0, 2] * c + rows[1, 2] * s + rows[2, 2] * x + rows[3, 2] * y
-    t3 = rows[0, 3] * c + rows[1, 3] * s + rows[2, 3] * x + rows[3, 3] * y
-    t4 = rows[0, 4] * c + rows[1, 4] * s + rows[2, 4] * x + rows[3, 4] * y
-    t5 = rows[0, 5] * c + rows[1, 5] * s + rows[2, 5] * x + rows[3, 5] * y
-    t6 = rows[0, 6] * c + rows[1, 6] * s + rows[2, 6] * x + rows[3, 6] * y
-    t7 = rows[0, 7] * c + rows[1, 7] * s + rows[2, 7] * x + rows[3, 7] * y
-    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
-    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
-
-
-@kernel(fast=True)
-def _weigh(a, weight_a, b, weight_b, k, out) -> None:
-    """Write weight_a a + weight_b b, lane by lane, to row k of `out`."""
-    t0 = weight_a[0] * a[k, 0] + weight_b[0] * b[k, 0]
-    t1 = weight_a[1] * a[k, 1] + weight_b[1] * b[k, 1]
-    t2 = weight_a[2] * a[k, 2] + weight_b[2] * b[k, 2]
-    t3 = weight_a[3] * a[k, 3] + weight_b[3] * b[k, 3]
-    t4 = weight_a[4] * a[k, 4] + weight_b[4] * b[k, 4]
-    t5 = weight_a[5] * a[k, 5] + weight_b[5] * b[k, 5]
-    t6 = weight_a[6] * a[k, 6] + weight_b[6] * b[k, 6]
-    t7 = weight_a[7] * a[k, 7] + weight_b[7] * b[k, 7]
-    out[k, 0], out[k, 1], out[k, 2], out[k, 3] = t0, t1, t2, t3
-    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = t4, t5, t6, t7
-
-
-@kernel(fast=True)
-def _raise(w, k, touching, exponent) -> None:
-    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`."""
-    power_terms(w.gap, w.power[0], k, exponent, w.lanes[BASE])
+def _multiply(a, b, k):
+    """Return order k of the eight products of the columns of a and b."""
     if k == 0:
-        for lane in range(8):
-            w.power[0, 0, lane] = w.gap[0, lane] ** exponent if w.lanes[BASE, lane] != 0.0 else 0.0
+        return row(a, 0) * row(b, 0)
+    return _multiply_older(a, b, k) + (row(a, 0) * row(b, k) + row(a, k) * row(b, 0))
+
+
+@kernel(fast=True)
+def _combine(rows, c, s, x, y):
+    """Return rows . (c, s, x, y)."""
+    return (row(rows, 0) * c + row(rows, 1) * s) + (row(rows, 2) * x + row(rows, 3) * y)
+
+
+@kernel(fast=True, inline=True)
+def _raise(w, k, touching, exponent) -> None:
+    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`.
+
+    Row BASE of `w.lanes` is 1 / d, for the exponent 1.5 half its root; it is zero for the other pairs.
+    """
+    if exponent == 1.5:
+        # d^1.5 as d times its root: less work than the recurrence for any power
+        if k == 0:
+            for pair in range(8):
+                w.power[1, 0, pair] = math.sqrt(w.gap[0, pair]) if w.lanes[BASE, pair] != 0.0 else 0.0
+        else:
+            set_row(w.power[1], k, root_terms(w.gap, w.power[1], k) * row(w.lanes, BASE))
+        set_row(w.power[0], k, _multiply(w.gap, w.power[1], k))
+    elif k == 0:
+        for pair in range(8):
+            w.power[0, 0, pair] = w.gap[0, pair] ** exponent if w.lanes[BASE, pair] != 0.0 else 0.0
+    else:
+        set_row(w.power[0], k, power_terms(w.gap, w.power[0], k, exponent) * row(w.lanes, BASE))
     if touching != 0:
-        for lane in range(8):
-            if touching >> lane & 1:
-                w.power[0, k, lane] = power_term(w.gap, w.power[0], lane, k, exponent, 2)
+        for pair in range(8):
+            if touching >> pair & 1:
+                w.power[0, k, pair] = power_term(w.gap, w.power[0], pair, k, exponent, 2)
 
 
-@kernel(fast=True)
-def _damp(elastic, w, k, factor) -> None:
-    """Write order k of K elastic (1 + lambda d') to `w.force`."""
-    if factor is not None:
-        _multiply(elastic, w.rate, k, w.damped)
-    _weigh(elastic, w.lanes[ACTS], w.damped, w.lanes[DAMPS], k, w.force)
+@kernel(fast=True, inline=True)
+def _damp(elastic, w, k, factor):
+    """Return order k of K elastic (1 + lambda d')."""
+    force = row(w.lanes, ACTS) * row(elastic, k)
+    return force if factor is None else force + row(w.lanes, DAMPS) * _multiply(elastic, w.rate, k)
 
 
-@kernel(fast=True)
-def _push(state, w, k, viscous, factor, integer, fraction) -> None:
-    """Write order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
+@kernel(fast=True, inline=True)
+def _push(state, w, k, viscous, factor, integer, fraction):
+    """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
     Row ACTS of `w.lanes` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
     """
     if viscous is not None:
-        _weigh(w.gap, w.lanes[ACTS], w.rate, w.lanes[DAMPS], k, w.force)
-    elif integer is not None:
-        _multiply(w.gap, w.gap, k, w.power[0])
+        return row(w.lanes, ACTS) * row(w.gap, k) + row(w.lanes, DAMPS) * row(w.rate, k)
+    if integer is not None:
+        set_row(w.power[0], k, _multiply(w.gap, w.gap, k))
         for degree in range(1, integer - 1):
-            _multiply(w.power[degree - 1], w.gap, k, w.power[degree])
-        _damp(w.power[integer - 2], w, k, factor)
-    elif fraction is not None:
+            set_row(w.power[degree], k, _multiply(w.power[degree - 1], w.gap, k))
+        return _damp(w.power[integer - 2], w, k, factor)
+    if fraction is not None:
         _raise(w, k, state.step[TOUCHING], fraction)
-        _damp(w.power[0], w, k, factor)
-    else:
-        _damp(w.gap, w, k, factor)
+        return _damp(w.power[0], w, k, factor)
+    return _damp(w.gap, w, k, factor)
 
 
 @kernel(fast=True)
@@ -192,12 +162,12 @@ def _hold(w, k, free, fx, fy):
 
 
 @kernel(fast=True)
-def _loads(p, w, k, c, s, c1, s1, c2, s2, alpha, beta, harmonics, second, segments):
+def _loads(p, w, k, c, s, c1, s1, c2, s2, older, alpha, beta, harmonics, second, segments):
     """Return order k of the load per mass, turned into head axes, and of its moment per inertia.
 
-    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before.
+    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before; `older` has S1 c and S1 s.
     """
-    load, product, right, start, slope = w.load, w.product, w.right, w.wrench[0], w.wrench[1]
+    load, right, start, slope = w.load, w.right, w.wrench[0], w.wrench[1]
     fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
     moment = start[2] if k == 0 else 0.0
     if segments is not None:
@@ -209,8 +179,8 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, alpha, beta, harmonics, second, segmen
         elif k == 2:
             moment += 0.5 * beta * slope[2]
     if harmonics is not None:
-        along_c = product[k, 6] + load[0, 0] * c
-        along_s = product[k, 7] + load[0, 0] * s
+        along_c = lane(older, 6) + load[0, 0] * c
+        along_s = lane(older, 7) + load[0, 0] * s
         if k > 0:
             along_c += load[0, k] * right[0, 6]
             along_s += load[0, k] * right[0, 7]
@@ -227,27 +197,21 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, alpha, beta, harmonics, second, segmen
     return fx, fy, moment
 
 
-@kernel(fast=True)
-def _resultant(p, w, k):
+@kernel(fast=True, inline=True)
+def _resultant(p, w, k, force):
     """Return order k of the sum of the contact forces in head axes, and of their moment about the centre of mass."""
-    rows, force, torque = p.gap, w.force, w.torque
-    _multiply(w.arm, force, k, torque)
-    push_x = push_y = moment = 0.0
-    for lane in range(8):
-        # the rows for X and Y are the walls' inward normals
-        push_x -= rows[2, lane] * force[k, lane]
-        push_y -= rows[3, lane] * force[k, lane]
-        moment += torque[k, lane]
-    return push_x, push_y, moment
+    torque = row(w.arm, 0) * force if k == 0 else _multiply(w.arm, w.force, k)
+    # the rows for X and Y are the walls' inward normals
+    return -total(row(p.gap, 2) * force), -total(row(p.gap, 3) * force), total(torque)
 
 
 @kernel(fast=True)
 def _wear(w, k, wear, alpha, beta) -> None:
     """Write order k + 1 of the growth of each pad's depth:  dh/dt = k_s F v / A (Archard)."""
-    for lane in range(8):
-        before = w.force[k - 1, lane] if k > 0 else 0.0
-        growth = wear[lane] * (alpha * w.force[k, lane] + beta * before)
-        w.worn[k + 1, lane] = growth * w.inverse[k + 1]
+    growth = row(w.force, k) * alpha
+    if k > 0:
+        growth = growth + row(w.force, k - 1) * beta
+    set_row(w.worn, k + 1, growth * row(wear, 0) * w.inverse[k + 1])
 
 
 @kernel(fast=True)
@@ -260,8 +224,7 @@ def expand(
     sigma of interest: orders whose terms vanish there are not computed.
     """
     y, alpha, beta = state.y, state.clock[ALPHA], state.clock[BETA]
-    series, left, right, product, gap, worn = w.series, w.left, w.right, w.product, w.gap, w.worn
-    load, inverse, A = w.load, w.inverse, p.gap
+    left, right, load, inverse = w.left, w.right, w.load, w.inverse
     im, ii = p.inverse_mass, p.inverse_inertia
     x, yy, vx, vy, om, c, s, theta = y[X], y[Y], y[VX], y[VY], y[OMEGA], y[COS], y[SIN], y[THETA]
     x0, y0, vx0, vy0, om0, c0, s0 = x, yy, vx, vy, om, c, s
@@ -270,47 +233,43 @@ def expand(
     c1 = s1 = c2 = s2 = 0.0
     small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, p.order
     for k in range(order + 1):
-        series[k, X], series[k, Y], series[k, VX], series[k, VY] = x, yy, vx, vy
-        series[k, OMEGA], series[k, COS], series[k, SIN], series[k, THETA] = om, c, s, theta
-        _combine(A, c, s, x, yy, k, gap)
+        set_row(w.series, k, pack(x, yy, vx, vy, om, c, s, theta))
+        depth = _combine(p.gap, c, s, x, yy)
         if k == 0:
-            for lane in range(8):
-                gap[0, lane] += A[4, lane] - state.depth[lane]
+            depth = depth + row(p.gap, 4) - row(state.depth, 0)
         else:
             size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
             if wear is not None and penetrating:
-                for lane in range(8):
-                    gap[k, lane] -= worn[k, lane]
-                    size += p.weight / p.radius * abs(worn[k, lane])
+                depth = depth - row(w.worn, k)
+                size += p.weight / p.radius * total(magnitude(row(w.worn, k)))
             w.size[k] = size
             reach *= hard
             quiet = quiet + 1 if size * reach < small else 0
             if quiet == p.lacuna and k >= 4:
                 order = k
-                break
+        set_row(w.gap, k, depth)
         if k == order:
             break
-        right[k, 0], right[k, 1], right[k, 2], right[k, 3] = yy, x, vy, vx
-        right[k, 4], right[k, 5], right[k, 6], right[k, 7] = s, c, c, s
-        left[k, 0] = left[k, 1] = left[k, 2] = left[k, 3] = left[k, 4] = left[k, 5] = om
-        if harmonics is not None:
-            left[k, 6] = left[k, 7] = load[0, k]
-        _multiply_older(left, right, k, product)
+        s1_k = 0.0 if harmonics is None else load[0, k]
+        set_row(right, k, pack(yy, x, vy, vx, s, c, c, s))
+        set_row(left, k, pack(om, om, om, om, om, om, s1_k, s1_k))
+        older = _multiply_older(left, right, k)
         # omega times the others: the terms of order k itself, and those between
         om_k = 0.0 if k == 0 else om
-        dx = vx + (product[k, 0] + om0 * yy + om_k * y0)
-        dy = vy - (product[k, 1] + om0 * x + om_k * x0)
-        dc = -(product[k, 4] + om0 * s + om_k * s0)
-        ds = product[k, 5] + om0 * c + om_k * c0
-        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, alpha, beta, harmonics, second, segments)
+        dx = vx + (lane(older, 0) + om0 * yy + om_k * y0)
+        dy = vy - (lane(older, 1) + om0 * x + om_k * x0)
+        dc = -(lane(older, 4) + om0 * s + om_k * s0)
+        ds = lane(older, 5) + om0 * c + om_k * c0
+        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, older, alpha, beta, harmonics, second, segments)
         if offset is not None:
             # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
             moment -= (offset[0] * (fy + p.gravity * c) - offset[1] * (fx + p.gravity * s)) * ii / im
         if penetrating:
-            _combine(A, dc, ds, dx, dy, k, w.rate)
-            _combine(p.arm, c, s, x, yy, k, w.arm)
-            _push(state, w, k, viscous, factor, integer, fraction)
-            push_x, push_y, torque = _resultant(p, w, k)
+            set_row(w.rate, k, _combine(p.gap, dc, ds, dx, dy))
+            set_row(w.arm, k, _combine(p.arm, c, s, x, yy))
+            force = _push(state, w, k, viscous, factor, integer, fraction)
+            set_row(w.force, k, force)
+            push_x, push_y, torque = _resultant(p, w, k, force)
             fx += push_x * im
             fy += push_y * im
             moment += torque * ii
@@ -319,8 +278,8 @@ def expand(
         if free is not None:
             moment *= free[2]
             fx, fy = _hold(w, k, free, fx, fy)
-        dvx = fx + (product[k, 2] + om0 * vy + om_k * vy0)
-        dvy = fy - (product[k, 3] + om0 * vx + om_k * vx0)
+        dvx = fx + (lane(older, 2) + om0 * vy + om_k * vy0)
+        dvy = fy - (lane(older, 3) + om0 * vx + om_k * vx0)
         c2, s2, c1, s1 = c1, s1, c, s
         q = inverse[k + 1]
         x, px = (alpha * dx + beta * px) * q, dx

@@ -13,6 +13,7 @@ import numpy as np
 
 from plow_twin.model.contact import normal_force
 from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import below, magnitude, row, set_row, splat
 from plow_twin.solve.layout import (
     ACTS,
     ALPHA,
@@ -98,26 +99,25 @@ def _guards(p, state, w, order, penetrating, viscous) -> None:
     off: -d >= 0; on: F / K = d + (C / K) d' >= 0 where the law is viscous, else d >= 0 or a small depth;
     others: d >= 0.
     """
-    gap, rate, guard, lanes = w.gap, w.rate, w.guard, w.lanes
-    for lane in range(8):
-        mode = state.mode[lane]
-        lanes[SIGN, lane] = 0.0 if p.enabled[lane] == 0 else -1.0 if mode == OFF else 1.0
-        lanes[RATIO, lane] = 0.0
+    guard, weights = w.guard, w.lanes
+    for pair in range(8):
+        mode = state.mode[pair]
+        weights[SIGN, pair] = 0.0 if p.enabled[pair] == 0 else -1.0 if mode == OFF else 1.0
+        weights[RATIO, pair] = 0.0
         if viscous is not None and mode == ON:
-            lanes[RATIO, lane] = viscous / p.stiffness
+            weights[RATIO, pair] = viscous / p.stiffness
+    sign, ratio = row(weights, SIGN), row(weights, RATIO)
     for k in range(order + 1):
-        for lane in range(8):
-            guard[k, lane] = lanes[SIGN, lane] * gap[k, lane]
+        set_row(guard, k, row(w.gap, k) * sign)
     if viscous is not None and penetrating:
         for k in range(order):
-            for lane in range(8):
-                guard[k, lane] += lanes[RATIO, lane] * rate[k, lane]
-    for lane in range(8):
-        first = max(guard[0, lane], 0.0)
-        if state.mode[lane] == ON:
+            set_row(guard, k, row(guard, k) + row(w.rate, k) * ratio)
+    for pair in range(8):
+        first = max(guard[0, pair], 0.0)
+        if state.mode[pair] == ON:
             # released below a quarter of the depth at which it acts again, so that no pair hovers between
             first -= min(0.25 * p.release, 0.5 * first)
-        guard[0, lane] = first if p.enabled[lane] == 1 else 1.0
+        guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
 
 @kernel()
@@ -149,18 +149,30 @@ def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:
 
 
 @kernel(fast=True)
-def _unsafe_lanes(w, order, h):
-    """Return a bit for each guard that g_0 > sum |g_k| h^k does not prove to stay positive on [0, h]."""
-    guard, total = w.guard, w.lanes[SUM]
-    for lane in range(8):
-        total[lane] = abs(guard[order, lane]) * h
+def _unsafe_pairs(w, order, h):
+    """Return a bit for each guard that is not proved to stay positive on [0, h].
+
+    The first proof is g_0 > sum |g_k| h^k; where it fails, that no Bernstein coefficient is negative.
+    """
+    guard, b = w.guard, w.bernstein
+    reach = magnitude(row(guard, order)) * h
     for k in range(order - 1, 0, -1):
-        for lane in range(8):
-            total[lane] = (total[lane] + abs(guard[k, lane])) * h
-    bits = 0
-    for lane in range(8):
-        if guard[0, lane] < total[lane]:
-            bits |= 1 << lane
+        reach = (reach + magnitude(row(guard, k))) * h
+    if below(row(guard, 0), reach) == 0:
+        return 0
+    power = 1.0
+    for k in range(order + 1):
+        set_row(b, k, row(guard, k) * (power * w.binomial[order, k]))
+        power *= h
+    for r in range(1, order + 1):
+        before = row(b, r - 1)
+        for j in range(r, order + 1):
+            here = row(b, j)
+            set_row(b, j, here + before)
+            before = here
+    zero, bits = splat(0.0), 0
+    for k in range(order + 1):
+        bits |= below(row(b, k), zero)
     return bits
 
 
@@ -179,7 +191,7 @@ def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fracti
     """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
     _guards(p, state, w, order, penetrating, viscous)
     best, event, target = sigma, -1, 0
-    unsafe = _unsafe_lanes(w, order, sigma)
+    unsafe = _unsafe_pairs(w, order, sigma)
     column = w.column[0]
     for pair in range(8):
         if unsafe >> pair & 1:
@@ -253,7 +265,7 @@ def _weigh_pairs(p, state, w, viscous, fraction) -> bool:
         if fraction is not None and mode[pair] == ON and state.step[TOUCHING] >> pair & 1 == 0:
             depth = gap_and_rate(p, state, pair)[0]
             if depth > 1e-3 * p.release:
-                lanes[BASE, pair] = 1.0 / depth
+                lanes[BASE, pair] = 0.5 / math.sqrt(depth) if fraction == 1.5 else 1.0 / depth
             else:
                 # interrupted right after its touch: too shallow for a series of its power
                 mode[pair] = RELEASED
@@ -341,11 +353,10 @@ def sigma_at(state, used):
 def evaluate(state, w, sigma, out) -> None:
     """Write the body-coordinate state at sigma to `out`, shape (8,)."""
     order, series = state.step[ORDER], w.series
-    for i in range(8):
-        out[i] = series[order, i]
+    value = row(series, order)
     for k in range(order - 1, -1, -1):
-        for i in range(8):
-            out[i] = out[i] * sigma + series[k, i]
+        value = value * sigma + row(series, k)
+    set_row(out, 0, value)
 
 
 @kernel()
@@ -375,14 +386,15 @@ def pair_outputs(p, state, y, penetration, rate, force) -> None:
 @kernel(fast=True)
 def _sums(w, order, h) -> None:
     """Write bound and integrals of each force over [0, h]: sum |f_k| h^k, sum f_k h^k / (k+1), sum f_k h^k / (k+2)."""
-    force, bound, first, second, inverse = w.force, w.lanes[SUM], w.lanes[FIRST], w.lanes[SECOND], w.inverse
-    for lane in range(8):
-        bound[lane] = first[lane] = second[lane] = 0.0
+    bound = first = second = splat(0.0)
     for k in range(order, -1, -1):
-        for lane in range(8):
-            bound[lane] = bound[lane] * h + abs(force[k, lane])
-            first[lane] = first[lane] * h + force[k, lane] * inverse[k + 1]
-            second[lane] = second[lane] * h + force[k, lane] * inverse[k + 2]
+        force = row(w.force, k)
+        bound = bound * h + magnitude(force)
+        first = first * h + force * w.inverse[k + 1]
+        second = second * h + force * w.inverse[k + 2]
+    set_row(w.lanes, SUM, bound)
+    set_row(w.lanes, FIRST, first)
+    set_row(w.lanes, SECOND, second)
 
 
 @kernel()
@@ -432,19 +444,25 @@ def _swap_rows(a, b, order) -> None:
             a[k, lane], b[k, lane] = b[k, lane], a[k, lane]
 
 
+@kernel(inline=True)
+def _penetrating(state) -> bool:
+    inside = 0
+    for pair in range(8):
+        inside += 0 if state.mode[pair] == OFF else 1
+    return inside > 0
+
+
 @kernel()
 def finish(p, state, w, totals, log, wear, fraction) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
     clock, step, y = state.clock, state.step, state.y
     sigma, order = clock[SIGMA], step[ORDER]
-    if wear is not None:
-        for pair in range(8):
-            if state.mode[pair] == ON:
-                # coefficients 1..order of the depth; coefficient 0 is the depth itself
-                value = w.worn[order, pair]
-                for k in range(order - 1, 0, -1):
-                    value = value * sigma + w.worn[k, pair]
-                state.depth[pair] += value * sigma
+    if wear is not None and _penetrating(state):
+        # row 0 would be the depth itself; pairs without force have not worn
+        growth = row(w.worn, order)
+        for k in range(order - 1, 0, -1):
+            growth = growth * sigma + row(w.worn, k)
+        set_row(state.depth, 0, row(state.depth, 0) + growth * sigma)
     evaluate(state, w, sigma, y)
     y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
     before = clock[T0]

@@ -1,0 +1,170 @@
+"""Eight numbers side by side: one SIMD vector as a value inside kernels.
+
+A loop over eight columns leaves it to the compiler whether a vector comes of it. Here the vector is a type: `row`,
+`set_row`, `splat` and `total` are single operations, and + - * act on all eight. Where the processor's vectors are
+shorter, the compiler splits them.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, models, register_model
+
+_WIDTH = 8
+_VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
+#: Sums may be fused and reordered, as by `kernel(fast=True)`.
+_FLAGS = ("contract", "reassoc", "nsz", "arcp")
+
+
+class Lanes(types.Type):
+    """Numba's type of eight float64."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+lanes = Lanes()
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: Any) -> None:
+        super().__init__(dmm, fe_type, _VECTOR)
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    view = context.make_array(array_type)(context, builder, array)
+    data = builder.bitcast(view.data, ir.DoubleType().as_pointer())
+    first = builder.gep(data, [builder.mul(index, ir.Constant(index.type, _WIDTH))])
+    return builder.bitcast(first, _VECTOR.as_pointer())
+
+
+@intrinsic
+def row(typingctx: Any, array: Any, index: Any) -> Any:
+    """Return row `index` of a contiguous array of shape (n, 8), or row 0 of one of shape (8,)."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = context.cast(builder, arguments[1], signature.args[1], types.intp)
+        return builder.load(_pointer(context, builder, signature.args[0], arguments[0], place), align=8)
+
+    return lanes(array, index), codegen
+
+
+@intrinsic
+def set_row(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """Write eight numbers to row `index` of a contiguous array of shape (n, 8)."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        place = context.cast(builder, arguments[1], signature.args[1], types.intp)
+        builder.store(arguments[2], _pointer(context, builder, signature.args[0], arguments[0], place), align=8)
+        return context.get_dummy_value()
+
+    return types.void(array, index, lanes), codegen
+
+
+def _splatted(builder: Any, value: Any) -> Any:
+    single = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(ir.IntType(32), 0))
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), [0] * _WIDTH)
+    return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), zeros)
+
+
+@intrinsic
+def splat(typingctx: Any, value: Any) -> Any:
+    """Return eight times the same number."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _splatted(builder, context.cast(builder, arguments[0], signature.args[0], types.float64))
+
+    return lanes(value), codegen
+
+
+@intrinsic
+def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+    """Return eight numbers as one value."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        vector = ir.Constant(_VECTOR, ir.Undefined)
+        for lane, (kind, value) in enumerate(zip(signature.args, arguments, strict=True)):
+            number = context.cast(builder, value, kind, types.float64)
+            vector = builder.insert_element(vector, number, ir.Constant(ir.IntType(32), lane))
+        return vector
+
+    return lanes(a, b, c, d, e, f, g, h), codegen
+
+
+@intrinsic
+def lane(typingctx: Any, value: Any, index: Any) -> Any:
+    """Return one of the eight."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        position = context.cast(builder, arguments[1], signature.args[1], types.int32)
+        return builder.extract_element(arguments[0], position)
+
+    return types.float64(lanes, index), codegen
+
+
+@intrinsic
+def total(typingctx: Any, value: Any) -> Any:
+    """Return the sum of the eight."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(ir.DoubleType(), [ir.DoubleType(), _VECTOR])
+        reduce = cgutils.get_or_insert_function(builder.module, kind, "llvm.vector.reduce.fadd.v8f64")
+        return builder.call(reduce, [ir.Constant(ir.DoubleType(), 0.0), arguments[0]], fastmath=_FLAGS)
+
+    return types.float64(lanes), codegen
+
+
+@intrinsic
+def below(typingctx: Any, left: Any, right: Any) -> Any:
+    """Return a bit for each lane in which left < right; not for NaN."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        found = builder.fcmp_ordered("<", *arguments)
+        return builder.zext(builder.bitcast(found, ir.IntType(_WIDTH)), ir.IntType(64))
+
+    return types.int64(lanes, lanes), codegen
+
+
+@intrinsic
+def magnitude(typingctx: Any, value: Any) -> Any:
+    """Return the absolute value of each."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        fabs = cgutils.get_or_insert_function(builder.module, kind, "llvm.fabs.v8f64")
+        return builder.call(fabs, [arguments[0]])
+
+    return lanes(lanes), codegen
+
+
+def _elementwise(operation: Callable[..., Any], emit: str) -> None:
+    """Let an operator act on lanes, and on lanes and a number."""
+
+    @infer_global(operation)
+    class _Typing(AbstractTemplate):
+        def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
+            known = all(isinstance(kind, (Lanes, types.Float, types.Integer)) for kind in args)
+            if len(args) == 2 and known and any(isinstance(kind, Lanes) for kind in args):
+                return signature(lanes, *args)
+            return None
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        sides = [
+            value if kind == lanes else _splatted(builder, context.cast(builder, value, kind, types.float64))
+            for kind, value in zip(signature.args, arguments, strict=True)
+        ]
+        return getattr(builder, emit)(*sides, flags=_FLAGS)
+
+    for left, right in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
+        lower_builtin(operation, left, right)(codegen)
+
+
+for _operation, _emit in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    _elementwise(_operation, _emit)
