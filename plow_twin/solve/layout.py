@@ -37,7 +37,7 @@ RELEASED: Final = 3
 # indices into State.y
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
 # indices into State.clock
-T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END = range(7)
+T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED = range(9)
 # indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
 ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END = range(7)
 # indices into State.count
@@ -111,7 +111,7 @@ STATE: Final = np.dtype(
         ("factor", "f8", (PAIR_COUNT,)),  # lambda of each pair
         ("depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad
         ("mode", "i8", (PAIR_COUNT,)),
-        ("clock", "f8", (7,)),
+        ("clock", "f8", (9,)),
         ("step", "i8", (7,)),
         ("count", "i8", (5,)),
     ]

@@ -216,9 +216,24 @@ def _wear(w, k, wear, alpha, beta) -> None:
 
 @kernel(fast=True)
 def expand(
-    p, state, w, penetrating, hard, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+    p,
+    state,
+    w,
+    limit,
+    penetrating,
+    hard,
+    harmonics,
+    second,
+    segments,
+    viscous,
+    factor,
+    integer,
+    fraction,
+    wear,
+    offset,
+    free,
 ):
-    """Write the series of state, penetration, rate and force to `w`; return the order used.
+    """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
     Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. `hard` is the longest
     sigma of interest: orders whose terms vanish there are not computed.
@@ -231,7 +246,7 @@ def expand(
     # rates of the order before, for the sigma term of the time map
     px = py = pvx = pvy = pom = pc = ps = pth = 0.0
     c1 = s1 = c2 = s2 = 0.0
-    small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, p.order
+    small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, limit
     for k in range(order + 1):
         set_row(w.series, k, pack(x, yy, vx, vy, om, c, s, theta))
         depth = _combine(p.gap, c, s, x, yy)

@@ -30,6 +30,7 @@ from plow_twin.solve.layout import (
     FIRST,
     GUARD_ROOTS,
     HARD_END,
+    LAST_LENGTH,
     LENGTH,
     OFF,
     OMEGA,
@@ -48,6 +49,7 @@ from plow_twin.solve.layout import (
     SUM,
     T0,
     THETA,
+    TOUCHED,
     TOUCHING,
     USED,
     VX,
@@ -58,6 +60,10 @@ from plow_twin.solve.series import expand, expand_harmonics
 
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
+#: A pair that would part within so many steps like the last is looked at, by a series of this order.
+_PARTING_REACH, _PARTING_ORDER = 1.3, 6
+#: A touch no farther back than so many steps like the last still shapes the series.
+_TOUCH_REACH = 2.5
 
 
 @kernel(inline=True)
@@ -88,6 +94,8 @@ def settle_modes(p, state) -> None:
             state.mode[pair] = ON if gap_and_rate(p, state, pair)[0] >= p.release else RELEASED
     state.clock[USED] = 0.0
     state.clock[LENGTH] = -1.0
+    state.clock[LAST_LENGTH] = 0.0
+    state.clock[TOUCHED] = -np.inf
     state.step[TOUCHING] = 0
     state.step[STALL] = 0
 
@@ -279,6 +287,66 @@ def _weigh_pairs(p, state, w, viscous, fraction) -> bool:
 
 
 @kernel()
+def _time_to_part(
+    p, state, w, span, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+):
+    """Return the time until the first pair parts, where that is what shortens steps; else 0.
+
+    The root of a short series is enough: what it misses is left to the next step.
+    """
+    if fraction != 1.5:
+        return 0.0
+    near = False
+    for pair in range(8):
+        if state.mode[pair] == ON:
+            depth, rate = gap_and_rate(p, state, pair)
+            if rate < 0.0 and depth < -rate * _PARTING_REACH * state.clock[LAST_LENGTH]:
+                near = True
+    if not near:
+        return 0.0
+    if harmonics is not None:
+        expand_harmonics(harmonics, second, state.clock[T0], 1.0, 0.0, _PARTING_ORDER, w)
+    order = expand(
+        p,
+        state,
+        w,
+        _PARTING_ORDER,
+        True,
+        span,
+        harmonics,
+        second,
+        segments,
+        viscous,
+        factor,
+        integer,
+        fraction,
+        wear,
+        offset,
+        free,
+    )
+    first = np.inf
+    for pair in range(8):
+        if state.mode[pair] != ON or w.gap[1, pair] >= 0.0:
+            continue
+        t = -w.gap[0, pair] / w.gap[1, pair]
+        if t > _PARTING_REACH * state.clock[LAST_LENGTH]:
+            continue
+        for _ in range(6):
+            value, slope = w.gap[order, pair], 0.0
+            for k in range(order - 1, -1, -1):
+                slope = slope * t + value
+                value = value * t + w.gap[k, pair]
+            if not slope < 0.0:
+                break
+            change = value / slope
+            t -= change
+            if abs(change) < 1e-9 * t:
+                first = min(first, t)
+                break
+    return first if 0.0 < first < np.inf else 0.0
+
+
+@kernel()
 def begin(
     p, state, w, hard_time, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
 ) -> bool:
@@ -299,12 +367,28 @@ def begin(
         # a force that starts like d^1.5 is analytic in the square root of time
         clock[ALPHA], clock[BETA] = 0.0, 2.0
         hard = math.sqrt(span)
+    elif fraction is not None and penetrating:
+        parting = _time_to_part(
+            p, state, w, span, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+        )
+        if parting > 0.0:
+            # one that ends like d^1.5 is analytic in the root of the time left
+            root = math.sqrt(parting)
+            clock[ALPHA], clock[BETA] = 2.0 * root, -2.0
+            hard = root if parting <= span else root - math.sqrt(parting - span)
+            limited = limited and parting > span
+        elif fraction == 1.5 and 0.0 < t0 - clock[TOUCHED] < _TOUCH_REACH * clock[LAST_LENGTH]:
+            # and still in the root of the time since its start, some steps on
+            root = math.sqrt(t0 - clock[TOUCHED])
+            clock[ALPHA], clock[BETA] = 2.0 * root, 2.0
+            hard = math.sqrt(t0 - clock[TOUCHED] + span) - root
     if harmonics is not None:
         expand_harmonics(harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
     order = expand(
         p,
         state,
         w,
+        p.order,
         penetrating,
         hard,
         harmonics,
@@ -346,7 +430,10 @@ def sigma_at(state, used):
     clock = state.clock
     if used >= clock[LENGTH]:
         return clock[SIGMA]
-    return used if clock[BETA] == 0.0 else math.sqrt(2.0 * used / clock[BETA])
+    if clock[BETA] == 0.0:
+        return used
+    # the root of alpha sigma + beta sigma^2 / 2 = used that suffers no cancellation
+    return 2.0 * used / (clock[ALPHA] + math.sqrt(max(clock[ALPHA] ** 2 + 2.0 * clock[BETA] * used, 0.0)))
 
 
 @kernel(fast=True)
@@ -471,6 +558,7 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:
         clock[T0] = clock[HARD_END]
     clock[LENGTH] = -1.0
     clock[USED] = 0.0
+    clock[LAST_LENGTH] = clock[T0] - before
     at_once = clock[T0] - before <= 1e-15 * (1.0 + abs(before))
     touching = step[TOUCHING] if at_once else 0
     step[TOUCHING] = 0
@@ -490,6 +578,7 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:
         if fraction is not None and new == ON:
             if gap_and_rate(p, state, pair)[1] > 0.0:
                 step[TOUCHING] |= 1 << pair
+                clock[TOUCHED] = clock[T0]
             else:
                 state.mode[pair] = RELEASED
     # to the outside a released pair is on
