@@ -34,6 +34,10 @@ class Ensemble:
         Largest force [N], impulse [N s] and time with force [s] of each pair over the whole motion.
     makes : ndarray of int64, shape (m, 8)
         Touches.
+    set_time : ndarray, shape (m, 2, 16)
+        Time in s in each set of corners (bit i: corner i), for counter-clockwise and for clockwise contacts.
+    events : ndarray of int64, shape (m,)
+        Changes of contact.
     wear_depth : ndarray, shape (m, 8)
         Wear depth at the end in m.
     steps, status : ndarray of int64, shape (m,)
@@ -47,6 +51,8 @@ class Ensemble:
     impulse: Array
     time_in_contact: Array
     makes: NDArray[np.int64]
+    set_time: Array
+    events: NDArray[np.int64]
     wear_depth: Array
     steps: NDArray[np.int64]
     status: NDArray[np.int64]
@@ -109,6 +115,7 @@ def _run_member(scene: Scene, index: int, t_end: float, tol: float, work: Work, 
     totals = motion.totals
     ensemble.peak[index], ensemble.impulse[index] = totals.peak, totals.impulse
     ensemble.time_in_contact[index], ensemble.makes[index] = totals.time_in_contact, totals.makes
+    ensemble.set_time[index], ensemble.events[index] = totals.set_time, motion.log.length[0]
     ensemble.wear_depth[index] = motion.state.depth
     ensemble.steps[index], ensemble.status[index] = motion.state.count[STEPS], Status(status)
 
@@ -125,6 +132,8 @@ def _empty(times: Array, members: int) -> Ensemble:
         impulse=eight(),
         time_in_contact=eight(),
         makes=np.zeros((members, PAIR_COUNT), np.int64),
+        set_time=np.zeros((members, 2, 16)),
+        events=np.zeros(members, np.int64),
         wear_depth=eight(),
         steps=np.zeros(members, np.int64),
         status=np.zeros(members, np.int64),

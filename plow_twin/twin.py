@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive
 from plow_twin.solve.compiled import Compiled, compile_scene, per_mass
-from plow_twin.solve.layout import LENGTH, STATE, STEPS, T0, TOTALS, USED, Status, new_record, new_work
+from plow_twin.solve.layout import LENGTH, NOW, STATE, STEPS, TOTALS, Status, new_record, new_work
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
@@ -133,8 +133,7 @@ class Twin:
     @property
     def time(self) -> float:
         """Model time in s."""
-        clock = self._state.clock
-        return float(clock[T0] + clock[USED]) if clock[LENGTH] >= 0.0 else float(clock[T0])
+        return float(self._state.clock[NOW])
 
     def warm_up(self) -> float:
         """Compile every kernel that this scene uses, or load it from the cache on disk; return the seconds it took."""

@@ -31,6 +31,9 @@ def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
         assert ensemble.peak[index].tolist() == [row["max"] for row in rows]
         assert ensemble.impulse[index].tolist() == [row["impulse"] for row in rows]
         assert ensemble.makes[index].tolist() == [row["makes"] for row in rows]
+        assert ensemble.events[index] == len(single.events)
+        for sense, shares in zip(ensemble.set_time[index], single.contact_sets.values(), strict=True):
+            assert sorted(sense[sense > 0.0] / sense.sum()) == sorted(shares.values())
         assert ensemble.steps[index] == single.solver["steps"]
 
 

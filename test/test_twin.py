@@ -51,6 +51,13 @@ def test_samples_in_any_batches_give_the_same_bits(cuts: list[int]) -> None:
     assert np.array_equal([row.peak for row in one_by_one], expected.peak[:50])
 
 
+def test_the_same_time_can_be_asked_for_twice() -> None:
+    twin = Twin(preset("bench_kv"))
+    for t in np.random.default_rng(1).uniform(0.0, 2e-3, 500).cumsum():
+        assert twin.advance(t).q.tolist() == twin.advance(t).q.tolist()
+        assert twin.time == t
+
+
 @settings(max_examples=10)
 @given(st.lists(st.floats(0.0, 2.0), max_size=20))
 def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> None:

@@ -15,8 +15,10 @@ from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import DOF_NAMES, Contact, Scene
 from plow_twin.solve.layout import (
     MAX_ORDER,
+    NOW,
     PARAMS,
     STATE,
+    T0,
     Array,
     Harmonics,
     Law,
@@ -55,7 +57,7 @@ class Compiled:
             state.factor[:] = self.scene.contact.damping or 0.0
         if self.scene.wear is not None:
             state.depth[:] = self.scene.wear.initial_depth_m
-        state.clock[0] = time
+        state.clock[T0] = state.clock[NOW] = time
         settle_modes(self.params, state)
         return state
 

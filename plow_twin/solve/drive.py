@@ -9,6 +9,7 @@ from plow_twin.solve.layout import (
     AT_HARD_END,
     EVENT_PAIR,
     LENGTH,
+    NOW,
     PIECE,
     SIGMA,
     STALL,
@@ -67,7 +68,7 @@ def _proceed(p, parts, state, w, totals, target, hard_time, budget) -> int:
         low = sigma_at(state, state.clock[USED])
         if target < t0 + state.clock[LENGTH]:
             account(state, w, low, sigma_at(state, target - t0), totals)
-            state.clock[USED] = target - t0
+            state.clock[USED], state.clock[NOW] = target - t0, target
             _present(state, w, w.moved)
             return _OK if within_range(p, state, w.moved) else _RANGE
         account(state, w, low, sigma_at(state, state.clock[LENGTH]), totals)
@@ -87,7 +88,7 @@ def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:
         state.y[:], state.factor[:], state.depth[:] = saved[0], saved[1], saved[2]
         for pair in range(8):
             state.mode[pair] = w.modes[pair]
-        state.clock[T0], state.clock[LENGTH], state.clock[USED] = target, -1.0, 0.0
+        state.clock[T0], state.clock[LENGTH], state.clock[USED], state.clock[NOW] = target, -1.0, 0.0, target
         state.step[TOUCHING] = state.step[STALL] = 0
         totals.peak[:], totals.impulse[:], totals.makes[:] = 0.0, 0.0, 0
     return code
@@ -185,7 +186,9 @@ def end_step(p, parts, state, w, totals) -> None:
     clock[LENGTH] = clock[USED]
     state.step[EVENT_PAIR] = -1
     state.step[AT_HARD_END] = 0
+    now = clock[NOW]
     finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
+    clock[T0] = clock[NOW] = now
 
 
 @kernel()

@@ -36,8 +36,9 @@ RELEASED: Final = 3
 
 # indices into State.y
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
-# indices into State.clock
-T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED = range(9)
+# indices into State.clock: step's start, time into it and length; map of the series' variable to time; end of what is
+# linear; length of the step before; last touch; present time, bit for bit as it was asked for
+T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW = range(10)
 # indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
 ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END = range(7)
 # indices into State.count
@@ -111,7 +112,7 @@ STATE: Final = np.dtype(
         ("factor", "f8", (PAIR_COUNT,)),  # lambda of each pair
         ("depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad
         ("mode", "i8", (PAIR_COUNT,)),
-        ("clock", "f8", (9,)),
+        ("clock", "f8", (10,)),
         ("step", "i8", (7,)),
         ("count", "i8", (5,)),
     ]

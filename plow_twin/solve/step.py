@@ -32,6 +32,7 @@ from plow_twin.solve.layout import (
     HARD_END,
     LAST_LENGTH,
     LENGTH,
+    NOW,
     OFF,
     OMEGA,
     ON,
@@ -556,6 +557,7 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:
     clock[T0] = before + clock[LENGTH]
     if step[AT_HARD_END] == 1:
         clock[T0] = clock[HARD_END]
+    clock[NOW] = clock[T0]
     clock[LENGTH] = -1.0
     clock[USED] = 0.0
     clock[LAST_LENGTH] = clock[T0] - before
