@@ -89,7 +89,7 @@ def test_parameters_are_set_and_refused_by_path() -> None:
 
 def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = ["study", "sweep", "paper", *GRID, "--statistic", "max.ccw.a", "--statistic", "events"]
-    arguments += ["--t-end", "80", "--chunk", "2", "--out"]
+    arguments += ["--t-end", "40", "--chunk", "2", "--out"]
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     process = subprocess.Popen([sys.executable, "-m", "plow_twin", *arguments, str(killed)], stderr=subprocess.DEVNULL)
     try:
@@ -153,7 +153,7 @@ def test_failed_members_are_listed_and_other_questions_refused(
 def test_a_dask_worker_killed_in_the_middle_loses_nothing(tmp_path: Path) -> None:
     from distributed import LocalCluster
 
-    sweep = sweep_of(GRID[1], GRID[3], t_end=100.0)
+    sweep = sweep_of(GRID[1], GRID[3], t_end=40.0)
     store = Store(tmp_path / "cluster", sweep, chunk=1)
     kill: list[int] = []
     with LocalCluster(

@@ -36,13 +36,18 @@ class PoseRecording:
 
     def sampled(self, members: Members) -> Array:
         """Return the simulated poses at the recorded times, shape (m, n, 3), by cubic Hermite interpolation."""
-        t = members.t
+        t = members.motions.t
         right = np.clip(np.searchsorted(t, self.t), 1, len(t) - 1)
         left = right - 1
         h = t[right] - t[left]
         s = ((self.t - t[left]) / h)[:, None]
         h = h[:, None]
-        q0, q1, v0, v1 = members.q[:, left], members.q[:, right], members.v[:, left], members.v[:, right]
+        q0, q1, v0, v1 = (
+            members.motions.q[:, left],
+            members.motions.q[:, right],
+            members.motions.v[:, left],
+            members.motions.v[:, right],
+        )
         return np.asarray(
             (1.0 + 2.0 * s) * (1.0 - s) ** 2 * q0
             + s * (1.0 - s) ** 2 * h * v0

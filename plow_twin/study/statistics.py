@@ -45,11 +45,11 @@ def _sum(array: Array, columns: list[int]) -> Array:
 
 
 def _max(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(members.peak[:, pairs].max(axis=1))
+    return np.asarray(members.motions.peak[:, pairs].max(axis=1))
 
 
 def _mean_in_contact(members: Members, pairs: list[int]) -> Array:
-    impulse, time = _sum(members.impulse, pairs), _sum(members.time_in_contact, pairs)
+    impulse, time = _sum(members.motions.impulse, pairs), _sum(members.motions.time_in_contact, pairs)
     return np.asarray(np.divide(impulse, time, out=np.zeros_like(impulse), where=time > 0.0))
 
 
@@ -58,19 +58,19 @@ def _mean_over_time(members: Members, pairs: list[int]) -> Array:
 
 
 def _impulse(members: Members, pairs: list[int]) -> Array:
-    return _sum(members.impulse, pairs)
+    return _sum(members.motions.impulse, pairs)
 
 
 def _time_in_contact(members: Members, pairs: list[int]) -> Array:
-    return _sum(members.time_in_contact, pairs)
+    return _sum(members.motions.time_in_contact, pairs)
 
 
 def _makes(members: Members, pairs: list[int]) -> Array:
-    return _sum(members.makes.astype(np.float64), pairs)
+    return _sum(members.motions.makes.astype(np.float64), pairs)
 
 
 def _wear_depth(members: Members, pairs: list[int]) -> Array:
-    return np.asarray(members.wear_depth[:, pairs].max(axis=1))
+    return np.asarray(members.motions.wear_depth[:, pairs].max(axis=1))
 
 
 _OF_PAIRS: Final[Mapping[str, Callable[..., Array]]] = {
@@ -101,8 +101,8 @@ def statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:
         for count in (1, 2, 3, 4):
             masks = [mask for mask in range(1, 16) if mask.bit_count() == count]
             known[f"contact_points.{sense}.{count}"] = partial(_share, row=row, masks=masks)
-    known["events"] = lambda members: members.events.astype(np.float64)
-    known["steps"] = lambda members: members.steps.astype(np.float64)
+    known["events"] = lambda members: members.motions.events.astype(np.float64)
+    known["steps"] = lambda members: members.motions.steps.astype(np.float64)
     return known
 
 
@@ -165,10 +165,10 @@ def _sets(scene: Scene) -> dict[str, int]:
 
 
 def _set_time(members: Members, row: int, mask: int) -> Array:
-    return np.asarray(members.set_time[:, row, mask])
+    return np.asarray(members.motions.set_time[:, row, mask])
 
 
 def _share(members: Members, row: int, masks: list[int]) -> Array:
-    times = members.set_time[:, row]
+    times = members.motions.set_time[:, row]
     total, part = _sum(times, list(range(16))), _sum(times, masks)
     return np.asarray(np.divide(part, total, out=np.zeros_like(part), where=total > 0.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -157,7 +157,7 @@ def run_members_of(
 
     Every member has the bits of its single run, whichever chunk, thread or machine of the same build computes it.
     """
-    scene = sweep.scene()
+    scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)
     table[:, 0] = UNUSABLE
     scenes, rows = [], []
@@ -170,7 +170,7 @@ def run_members_of(
     if not scenes:
         return table
     result = run_members(scenes, sweep.t_end_s, sweep.tol, workers=workers, on_done=on_done)
-    table[rows, 0] = result.status
+    table[rows, 0] = result.motions.status
     sound = ~result.failed
     labels = [tuple(sorted(one.frame.labels.items())) for one in scenes]
     for labelling in set(labels):
