@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 )
 @click.option("--target", metavar="FILE", help="Figures to fit to: a target file, or `paper` for the paper's.")
 @click.option(
+    "--without", multiple=True, metavar="PATTERN", help="Leave out targets by name, e.g. 'max at*'; repeat it."
+)
+@click.option(
     "--recording",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="Motion to fit to: .csv or .npz with t, x, y, theta, or a recording of the node (.mcap).",
@@ -103,7 +106,7 @@ def _objective(model: Scene, options: dict[str, Any]) -> tuple[Objective, str, t
         poses = load_poses(recording)
         return RecordingObjective(model, poses, options["tol"] or 1e-8, workers), f"the motion {recording.name}", ()
     path = config_folder() / "paper_targets.yaml" if target == "paper" else Path(target)
-    targets = load_targets(path, model)
+    targets = load_targets(path, model).without(options["without"])
     targets = replace(targets, t_end_s=options["t_end"] or targets.t_end_s, tol=options["tol"] or targets.tol)
     source = "the paper's published figures" if target == "paper" else f"the figures of {path.name}"
     return TargetObjective(model, targets, workers), source, targets.unknowns

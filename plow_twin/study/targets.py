@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Final
 
@@ -118,6 +119,25 @@ class TargetSet:
         uses = [sum(setting in target.settings for target in self.targets) for setting in unique]
         order = sorted(range(len(unique)), key=lambda index: -uses[index])
         object.__setattr__(self, "settings", tuple(unique[index] for index in order))
+
+    def without(self, patterns: Sequence[str]) -> TargetSet:
+        """Return the set without the targets whose names match a pattern such as `max at*`.
+
+        Raises
+        ------
+        StudyError
+            When a pattern matches none, or nothing is left.
+        """
+        names = [target.name for target in self.targets]
+        for pattern in patterns:
+            if not any(fnmatchcase(name, pattern) for name in names):
+                raise StudyError(f"without: got {pattern!r}, expected a pattern of {', '.join(map(repr, names))}")
+        left = tuple(
+            target for target in self.targets if not any(fnmatchcase(target.name, pattern) for pattern in patterns)
+        )
+        if not left:
+            raise StudyError(f"without: got {', '.join(map(repr, patterns))}, expected to leave a target")
+        return TargetSet(left, self.t_end_s, self.tol, self.source, self.unknowns)
 
 
 def load_targets(path: Path, scene: Scene) -> TargetSet:
