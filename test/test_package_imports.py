@@ -35,7 +35,7 @@ ROOMS = {
 MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std")}
 #: Libraries beside numpy, by room.
 LIBRARIES = {
-    "model": {"scipy", "numba"},
+    "model": {"scipy", "numba", "llvmlite"},
     "solve": {"scipy", "numba"},
     "twin": {"scipy", "numba"},
     "simulate": {"scipy", "numba"},
