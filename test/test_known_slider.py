@@ -1,0 +1,59 @@
+"""The slider with clearance in its guide of Flores, Leine and Glocker, Multibody Syst. Dyn. 23 (2010) 165.
+
+Same topology as ours, four corners in a guide. Their gap functions against our penetrations; their mechanism with rigid
+impacts, integrated here with its events, against our solver. Siconos' own data: docs/known_answers.md.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from test_known_restitution import load_benchmark
+
+from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene, simulate
+
+siconos = load_benchmark("siconos")
+
+
+def penetrations(y: float, theta: float) -> np.ndarray:
+    """Our penetrations where the head is the guide, seen from the slider: the inverse of the slider's pose."""
+    scene = Scene(
+        Head(1.0, 1.0), Frame(2.0 * siconos.HALF_LENGTH, 2.0 * siconos.HALF_HEIGHT), Clearance(1.0, 2.0 * siconos.GAP),
+        Contact("hertz", 1e3), Gravity(0.0), initial=Initial((-np.sin(theta) * y, -np.cos(theta) * y, -theta)),
+    )  # fmt: skip
+    return simulate(scene, 0.0).penetration[0]
+
+
+def test_gap_functions_are_our_penetrations() -> None:
+    """g1, g2: the upper corners left and right at the upper wall; g3, g4: the lower ones at the lower wall."""
+    random = np.random.default_rng(2010)
+    for y, theta in zip(random.uniform(-2e-3, 2e-3, 200), random.uniform(-0.05, 0.05, 200), strict=True):
+        depth = penetrations(y, theta)
+        assert -siconos.gaps(y, theta) == pytest.approx(depth[[0, 2, 6, 4]], abs=1e-15)
+
+
+def test_touches_are_those_of_the_rigid_mechanism() -> None:
+    """Times of the first five touches, hence the speeds after them; late by the contact's duration, K^-1/2."""
+    t, states, impacts = siconos.rigid_motion(0.009, 5)
+    assert len(impacts) >= 5 and impacts[0] == pytest.approx(2.69e-3, abs=2e-5)
+    late = []
+    for stiffness in (1e10, 1e11, 1e12):
+        ours = siconos.our_slider(t, states[:, :2], states[:, 2:], stiffness, 1e-5)
+        events = ours.events[ours.events["mode_from"] == 0]
+        touches = events["time"][events["pair"] == events["pair"][0]]
+        late.append(touches[:5] - impacts[:5])
+    # the load is joined by straight lines over 10 us: 2e-8 s
+    assert late[2] == pytest.approx(0.0, abs=7e-6) and late[2][0] == pytest.approx(0.0, abs=3e-8)
+    for softer, stiffer in itertools.pairwise(late):
+        assert softer[1:] / stiffer[1:] == pytest.approx(np.sqrt(10.0), rel=0.02)
+
+
+def test_both_corners_of_a_side_touch_together_and_share_the_force() -> None:
+    t, states, _ = siconos.rigid_motion(0.004, 1)
+    ours = siconos.our_slider(t, states[:, :2], states[:, 2:], 1e8, 1e-5)
+    assert set(ours.events["pair"][:2].tolist()) in ({0, 2}, {4, 6})
+    assert ours.events["time"][0] == pytest.approx(ours.events["time"][1], abs=1e-12)
+    impulse = sorted(row["impulse"] for row in ours.statistics.values())
+    assert impulse[-1] == pytest.approx(impulse[-2], rel=1e-9) and impulse[-3] == 0.0
