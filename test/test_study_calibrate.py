@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from record_support import paper_sample, record_run
 from scenes import ROOT, preset
 
 from plow_twin import simulate
@@ -165,6 +166,17 @@ def test_the_command_fits_a_recording_and_marks_what_it_fitted(
     ):
         assert run([*arguments, *wrong, "--out", str(tmp_path / "none")]) == 2
         assert message in capsys.readouterr().err
+
+
+def test_a_recording_of_the_node_brings_its_load(tmp_path: Path) -> None:
+    record_run(tmp_path / "run", map(paper_sample, range(1500)), frame_every=5)
+    poses = load_poses(tmp_path / "run" / "run_0.mcap")
+    assert poses.load is not None and len(poses.load.t) > 1000 and poses.t[-1] > 1.0
+    scene = replace(preset("paper"), loads=(poses.load,))
+    objective = RecordingObjective(scene, poses)
+    unknowns = Space((parse_unknown("contact.stiffness=3e6:3e7:log", scene),))
+    found = calibrate(unknowns, objective, seed=1, starts=1, search=Search(screen=20, population=6, generations=4))
+    assert found.best.values["contact.stiffness"] == pytest.approx(preset("paper").contact.stiffness, rel=1e-4)
 
 
 def test_targets_are_judged_as_they_say(tmp_path: Path) -> None:

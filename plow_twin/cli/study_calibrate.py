@@ -62,8 +62,7 @@ def calibrate(
     from plow_twin.study.unknowns import Space, parse_unknown
 
     with usage_errors():
-        model = study_scene(scene, settings)
-        objective, source, proposed = _objective(model, options)
+        model, objective, source, proposed = _objective(scene, settings, options)
         texts = _merged(proposed, unknowns)
         space = Space(tuple(parse_unknown(text, model) for text in texts))
     simplex = options["simplex"]
@@ -91,8 +90,10 @@ def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
     return (*kept, *(text for text in given if text.partition("=")[2] != "fixed"))
 
 
-def _objective(model: Scene, options: dict[str, Any]) -> tuple[Objective, str, tuple[str, ...]]:
-    """Return the objective, what it is called, and the unknowns that the target file proposes."""
+def _objective(
+    scene: str, settings: Sequence[str], options: dict[str, Any]
+) -> tuple[Scene, Objective, str, tuple[str, ...]]:
+    """Return the scene, the objective, what it is called, and the unknowns that the target file proposes."""
     from dataclasses import replace
 
     from plow_twin.study.objective import RecordingObjective, TargetObjective
@@ -102,14 +103,22 @@ def _objective(model: Scene, options: dict[str, Any]) -> tuple[Objective, str, t
     target, recording, workers = options["target"], options["recording"], options["workers"]
     if (target is None) == (recording is None):
         raise click.UsageError("got both or none of --target and --recording, expected one of them")
+    model = study_scene(scene, settings)
     if recording is not None:
         poses = load_poses(recording)
-        return RecordingObjective(model, poses, options["tol"] or 1e-8, workers), f"the motion {recording.name}", ()
+        if poses.load is not None:
+            model = replace(model, loads=(poses.load,))
+        return (
+            model,
+            RecordingObjective(model, poses, options["tol"] or 1e-8, workers),
+            f"the motion {recording.name}",
+            (),
+        )
     path = config_folder() / "paper_targets.yaml" if target == "paper" else Path(target)
     targets = load_targets(path, model).without(options["without"])
     targets = replace(targets, t_end_s=options["t_end"] or targets.t_end_s, tol=options["tol"] or targets.tol)
     source = "the paper's published figures" if target == "paper" else f"the figures of {path.name}"
-    return TargetObjective(model, targets, workers), source, targets.unknowns
+    return model, TargetObjective(model, targets, workers), source, targets.unknowns
 
 
 def _run(

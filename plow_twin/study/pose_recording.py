@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.model.scene import Table
 from plow_twin.study.members import Members
 from plow_twin.study.parameters import StudyError
 
@@ -26,6 +28,8 @@ class PoseRecording:
     t: Array
     q: Array
     source: str = ""
+    #: the load that the recording holds, in place of the scene's
+    load: Table | None = None
 
     @property
     def output_dt(self) -> float:
@@ -64,11 +68,12 @@ def load_poses(path: Path) -> PoseRecording:
     StudyError
         When it cannot be read or its rows cannot be used.
     """
+    readers: dict[str, Callable[[Path], tuple[Array, Array, Table | None]]]
     readers = {".csv": _read_csv, ".npz": _read_npz, ".mcap": _read_mcap}
     if path.suffix not in readers:
         raise StudyError(f"recording: got {path.name!r}, expected .csv, .npz or .mcap")
     try:
-        t, q = readers[path.suffix](path)
+        t, q, load = readers[path.suffix](path)
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror or error}") from None
     except ValueError as error:
@@ -80,25 +85,25 @@ def load_poses(path: Path) -> PoseRecording:
         raise StudyError(f"{path}: row {int(np.flatnonzero(bad)[0])}: expected finite numbers")
     if t[0] < 0.0 or (np.diff(t) <= 0.0).any():
         raise StudyError(f"{path}: t: got {t[0]:g} .. {t[-1]:g}, expected increasing times from 0 on [s]")
-    return PoseRecording(t, q, str(path))
+    return PoseRecording(t, q, str(path), load)
 
 
-def _read_csv(path: Path) -> tuple[Array, Array]:
+def _read_csv(path: Path) -> tuple[Array, Array, None]:
     with path.open(encoding="utf-8") as file:
         names = [name.strip() for name in file.readline().split(",")]
     _require([name for name in COLUMNS if name not in names], names)
     columns = [names.index(name) for name in COLUMNS]
     table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns, ndmin=2)
-    return table[:, 0], table[:, 1:]
+    return table[:, 0], table[:, 1:], None
 
 
-def _read_npz(path: Path) -> tuple[Array, Array]:
+def _read_npz(path: Path) -> tuple[Array, Array, None]:
     with np.load(path) as archive:
         names = list(archive.files)
         if "q" in names and "t" in names:
-            return np.asarray(archive["t"], float), np.asarray(archive["q"], float)
+            return np.asarray(archive["t"], float), np.asarray(archive["q"], float), None
         _require([name for name in COLUMNS if name not in names], names)
-        return np.asarray(archive["t"], float), np.column_stack([archive[name] for name in COLUMNS[1:]])
+        return np.asarray(archive["t"], float), np.column_stack([archive[name] for name in COLUMNS[1:]]), None
 
 
 def _require(lacking: list[str], got: list[str]) -> None:
@@ -106,21 +111,28 @@ def _require(lacking: list[str], got: list[str]) -> None:
         raise ValueError(f"got the columns {', '.join(got)}, expected {', '.join(COLUMNS)}")
 
 
-def _read_mcap(path: Path) -> tuple[Array, Array]:
-    """Read the poses that the node published (`head_state`)."""
-    from plow_twin.record.reader import OutputRecord, RunReader
+def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:
+    """Read the poses that the node published (`head_state`) and the load samples that it took in."""
+    from plow_twin.record.messages import Odometry
+    from plow_twin.record.reader import EntryRecord, OutputRecord, RunReader
+    from plow_twin.stream.journal import Sample
 
     reader = RunReader(path)
     topic = reader.header.topic("head_state")
-    rows: list[tuple[float, ...]] = []
-    first: int | None = reader.header.origin_ns
+    poses: list[tuple[float, ...]] = []
+    samples: list[tuple[float, ...]] = []
+    origin = reader.header.origin_ns
     for record in reader:
-        if isinstance(record, OutputRecord) and record.topic == topic:
-            message: Any = record.message()
-            stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-            first = stamp if first is None else first
-            pose = message.pose.pose
-            theta = 2.0 * np.arctan2(pose.orientation.z, pose.orientation.w)
-            rows.append(((stamp - first) * 1e-9, pose.position.x, pose.position.y, theta))
-    table = np.array(rows, dtype=float).reshape(-1, 4)
-    return table[:, 0], table[:, 1:]
+        if isinstance(record, EntryRecord) and isinstance(record.entry, Sample):
+            origin = record.entry.stamp_ns if origin is None else origin
+            samples.append(((record.entry.stamp_ns - origin) * 1e-9, *record.entry.wrench))
+        elif isinstance(record, OutputRecord) and record.topic == topic:
+            message = record.message()
+            if isinstance(message, Odometry):
+                origin = message.stamp_ns if origin is None else origin
+                theta = 2.0 * np.arctan2(message.orientation[2], message.orientation[3])
+                poses.append(((message.stamp_ns - origin) * 1e-9, *message.position[:2], theta))
+    table = np.array(poses, dtype=float).reshape(-1, 4)
+    wrench = np.array(samples, dtype=float).reshape(-1, 4)
+    load = Table("recorded", wrench[:, 0], wrench[:, 1:]) if len(wrench) else None
+    return table[:, 0], table[:, 1:], load
