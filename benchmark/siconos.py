@@ -16,7 +16,6 @@ import argparse
 import csv
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,7 +47,7 @@ def gaps(y: Array, theta: Array) -> Array:
     return np.stack([half - (y - s + c), half - (y + s + c), half + (y - s - c), half + (y + s - c)], axis=-1)
 
 
-def inertia_and_force(angles: Sequence[float], rates: Sequence[float]) -> tuple[Array, Array]:
+def inertia_and_force(angles: Array, rates: Array) -> tuple[Array, Array]:
     """Return the mass matrix (2, 2) and the generalised forces (2,) of crank and rod, the slider not turning."""
     first, second = angles
     (m1, m2, m3), (j1, j2, _) = MASSES, INERTIAS
@@ -63,12 +62,12 @@ def inertia_and_force(angles: Sequence[float], rates: Sequence[float]) -> tuple[
     return np.array(mass), np.array(force)
 
 
-def across(angles: Sequence[float]) -> Array:
+def across(angles: Array) -> Array:
     """Return d(height of the slider)/d(angles), shape (2,)."""
     return np.array([CRANK * math.cos(angles[0]), ROD * math.cos(angles[1])])
 
 
-def free_acceleration(angles: Sequence[float], rates: Sequence[float]) -> tuple[float, float]:
+def free_acceleration(angles: Array, rates: Array) -> tuple[float, float]:
     """Return the acceleration across the guide without contact in m/s^2, and the mass that a contact feels in kg."""
     mass, force = inertia_and_force(angles, rates)
     row = across(angles)
@@ -92,11 +91,13 @@ def rigid_motion(t_end: float, impacts: int) -> tuple[Array, Array, list[float]]
 
     height.terminal, height.direction = True, -1.0  # type: ignore[attr-defined]
     time, state = 0.0, np.array([0.0, 0.0, *START])
-    times, states, found = [0.0], [state], []
+    times: list[float] = [0.0]
+    states: list[Array] = [state]
+    found: list[float] = []
     while time < t_end and len(found) <= impacts:
         part = solve_ivp(rate, (time, t_end), state, "DOP853", events=height, rtol=1e-12, atol=1e-14, max_step=1e-5)
         times += part.t[1:].tolist()
-        states += part.y.T[1:].tolist()
+        states += list(part.y.T[1:])
         time, state = float(part.t[-1]), part.y[:, -1].copy()
         if part.status == 1:
             found.append(time)
@@ -137,7 +138,7 @@ class Comparison:
     unit: str
 
 
-def phases(touching: Array, t: Array, shortest: float = 1e-3) -> list[tuple[float, float]]:
+def phases(touching: NDArray[np.bool_], t: Array, shortest: float = 1e-3) -> list[tuple[float, float]]:
     """Return the begin and end of each rest: contact without a break for `shortest` s or more."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touching.astype(int), [0]]))).reshape(-1, 2)
     whole = [(float(t[first]), float(t[last - 1])) for first, last in edges.tolist()]
@@ -149,7 +150,8 @@ def compare(name: str, data: Array) -> list[Comparison]:
     t, angles, rates = data[:, _TIME], np.c_[2.0 * np.pi * data[:, _TURNS], data[:, _ROD]], data[:, _RATES]
     ours = our_slider(t, angles, rates, 1e9, 1e-4)
     theirs = GAP * data[:, _HEIGHT]
-    touching, touched = (data[:, _IMPULSES] > 0.0).any(axis=1), (ours.force > 0.0).any(axis=1)
+    touching: NDArray[np.bool_] = np.any(data[:, _IMPULSES] > 0.0, axis=1)
+    touched: NDArray[np.bool_] = np.any(ours.force > 0.0, axis=1)
     first = float(ours.events["time"][0])
     rows = [
         Comparison(

@@ -1,0 +1,84 @@
+"""More of the numerical stress list: stiffness, restitution, clearance and mass over their range, hours of motion."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scenes import preset, wall_and_point
+
+from plow_twin import Clearance, Contact, Head, Scene, SceneError, Status, Table, Twin, simulate
+
+
+def bouncing(contact: Contact, mass: float, gap: float = 0.01) -> Scene:
+    pairs = ("top_left_top", "top_right_top")
+    return wall_and_point(contact, speed=0.1, mass=mass, gravity=9.81, gap=gap, pairs=pairs)
+
+
+@pytest.mark.parametrize("n", [1.0, 1.5])
+@pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7, 1e9, 1e11, 1e13])
+def test_stiffness_over_ten_decades(stiffness: float, n: float) -> None:
+    """A head that sinks in by 0.5 mm into the softest wall, and by 1 nm or more into the others, comes to rest."""
+    mass = max(0.1, 2e-10 * stiffness)
+    contact = Contact("exact_restitution", stiffness, n, restitution=0.3, impact_speed_floor_m_s=1e-2)
+    scene = bouncing(contact, mass, gap=0.1)
+    if n == 1.5 and stiffness < 1e5:
+        scene = dataclasses.replace(scene, head=Head(1e-3, 1.0))
+    weight = scene.head.mass_kg * 9.81
+    depth = (weight / 2 / stiffness) ** (1.0 / n)
+    result = simulate(scene, 1.0, output_dt=0.01, tol=1e-10)
+    assert result.force[-1, [0, 2]] == pytest.approx([weight / 2] * 2, rel=2e-2)
+    assert result.penetration[-1, 0] == pytest.approx(depth, rel=2e-2)
+    assert result.solver["steps"] < 200_000
+
+
+@pytest.mark.parametrize("mass", [10.0**k for k in range(-1, 6)])
+@pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
+def test_mass_and_restitution_over_their_range(mass: float, e: float) -> None:
+    """The rebound is e of the impact for every mass; at e = 0 the damping's cap leaves 1/1000."""
+    contact = Contact("exact_restitution", 1e8, 1.5, restitution=e)
+    result = simulate(wall_and_point(contact, speed=0.5, mass=mass), 1.0, tol=1e-10)
+    assert result.v[-1, 1] / 0.5 == pytest.approx(max(e, 1e-3), rel=1e-3)
+
+
+@pytest.mark.parametrize("n", [1.0, 1.5])
+@pytest.mark.parametrize("gap", [1.0, 1e-9])
+def test_clearance_from_nothing_to_a_metre(gap: float, n: float) -> None:
+    contact = Contact("exact_restitution", 1e8, n, restitution=0.3, impact_speed_floor_m_s=1e-2)
+    scene = dataclasses.replace(preset("paper"), clearance=Clearance(gap, gap), contact=contact)
+    scene = dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, width_m=3.3, height_m=2.7))
+    result = simulate(scene, 5.0, tol=1e-8)
+    assert np.isfinite(result.q).all() and result.force.max() > 1e3
+    # the pose stays within the clearance and what the walls give way
+    give = result.penetration.max()
+    assert abs(result.q[:, :2]).max() <= 0.5 * gap + 2.0 * give and give < 0.05
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_loads_that_are_no_numbers_are_refused(bad: float) -> None:
+    twin = Twin(preset("paper"), excitation="sampled")
+    before = twin.digest()
+    for wrench in ((bad, 0.0, 0.0), (0.0, 0.0, bad)):
+        with pytest.raises(ValueError, match="wrench: got"):
+            twin.advance(0.1, wrench)
+    assert twin.digest() == before and twin.advance(0.1, (0.0, 0.0, 0.0)).status is Status.OK
+    with pytest.raises(SceneError, match=r"loads\[0\] row 1: got"):
+        table = Table("t", np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [0.0, bad, 0]]))
+        dataclasses.replace(preset("paper"), loads=(table,))
+
+
+def hourly(hours: int) -> np.ndarray:
+    """Impulse in N s of each pair in each hour of the paper's scene, shape (hours, 8)."""
+    twin = Twin(preset("paper"))
+    rows = [twin.advance(3600.0 * (hour + 1)) for hour in range(hours)]
+    assert all(row.status is Status.OK for row in rows)
+    return np.array([row.impulse for row in rows])
+
+
+@pytest.mark.stress
+def test_ten_hours_of_driven_motion_do_not_drift() -> None:
+    impulse = hourly(10)
+    # the motion is periodic but for its first seconds, and so are its impulses
+    assert abs(impulse[1:] / impulse[1] - 1.0).max() < 1e-3
