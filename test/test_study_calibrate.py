@@ -201,6 +201,14 @@ def test_targets_are_judged_as_they_say(tmp_path: Path) -> None:
     r1 = dict(zip((t.name for t in paper.targets), TargetObjective(preset("paper"), paper).unweighted({}), strict=True))
     assert r1["ccw max at a"] == pytest.approx((147.6 / 153.0 - 1.0) / 0.05, abs=0.01)
     assert r1["cw: b largest"] == 0.0 < r1["ccw: a largest"]
+    fit = load_scene(ROOT / "config" / "paper_best_fit.yaml")
+    best = TargetObjective(fit, paper)
+    assert float((best.residuals([{}]) ** 2).sum()) == pytest.approx(7.90, abs=0.01)
+    missed = [target.name for target, r in zip(paper.targets, best.unweighted({}), strict=True) if not target.met(r)]
+    assert len(missed) == 9 and not any(
+        name.startswith(("ccw m", "cw m", "ccw: a largest", "cw: b l")) for name in missed
+    )
+    assert fit.marks["contact.stiffness"].mark is Mark.RECONSTRUCTED and fit.marks["head.mass_kg"].mark is Mark.GIVEN
     (tmp_path / "bad.yaml").write_text(
         "version: 1\nt_end: -3\ntargets:\n- {statistic: max.z, value: 1}\n- {value: 2}\n"
     )

@@ -41,25 +41,38 @@ class TargetRow:
 def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
     """Return the scene with the fitted values; every number that they change is marked as reconstructed.
 
-    A number whose sign alone was fitted keeps the source of its size.
+    A number that is as it was keeps its mark, one whose sign alone has changed the source of its size.
     """
     fit = with_parameters(scene, values)
     marks = dict(fit.marks)
-    for key in set(scene.marks) - set(fit.marks):
-        marks[key] = _sign_mark(scene.marks[key], source)
     index = {load.name: number for number, load in enumerate(scene.loads)}
+    keys = set(scene.marks) - set(fit.marks)
     for path in values:
         match = re.fullmatch(r"loads\.(.+)\.(\w+(?:\[\d+\])?)", path)
         key = f"loads[{index[match[1]]}].{match[2]}" if match else path
         if not key.endswith(_NOT_NUMBERS):
-            marks[key] = Provenance(Mark.RECONSTRUCTED, f"fitted to {source}")
+            keys.add(key)
+    for key in sorted(keys):
+        marks[key] = _mark(_number_at(scene, key), _number_at(fit, key), scene.marks.get(key), source)
     return replace(fit, marks=MappingProxyType(marks))
 
 
-def _sign_mark(old: Provenance, source: str) -> Provenance:
-    if old.mark is Mark.RECONSTRUCTED:
+def _mark(before: Any, after: Any, old: Provenance | None, source: str) -> Provenance:
+    if old is not None and before == after:
         return old
-    return Provenance(Mark.RECONSTRUCTED, f"size {old.mark.value}: {old.source}; sign fitted to {source}")
+    same_size = isinstance(before, float) and isinstance(after, float) and abs(before) == abs(after)
+    if old is not None and same_size:
+        size = old.source if old.mark is Mark.RECONSTRUCTED else f"size {old.mark.value}: {old.source}"
+        return Provenance(Mark.RECONSTRUCTED, size)
+    return Provenance(Mark.RECONSTRUCTED, f"fitted to {source}")
+
+
+def _number_at(scene: Scene, key: str) -> Any:
+    """Return what stands at a key of `Scene.marks`, such as `loads[0].force_n[1]`."""
+    value: Any = scene
+    for name, place in re.findall(r"(\w+)|\[(\d+)\]", key):
+        value = getattr(value, name) if name else value[int(place)]
+    return value
 
 
 def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list[TargetRow]:
