@@ -70,23 +70,26 @@ def test_semi_implicit_euler_has_order_one(name: str) -> None:
 
 
 @pytest.mark.parametrize("order", [6, 8])
-@pytest.mark.parametrize(("name", "slack"), [("bench_kv", 0.08), ("paper", 0.08), ("bench_hc", 0.12)])
+@pytest.mark.parametrize(("name", "first"), [("bench_kv", 4), ("paper", 4), ("bench_hc", 2)])
 def test_event_location_keeps_the_order_of_the_series(
-    name: str, slack: float, order: int, monkeypatch: pytest.MonkeyPatch
+    name: str, first: int, order: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Error against number of steps over 4 s of impacts, the order of the series held at 6 and 8."""
+    """Error against number of steps over 4 s of impacts, the order of the series held at 6 and 8.
+
+    Six decades of the tolerance, above what rounding leaves (1e-13 of the clearance).
+    """
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:401]
     monkeypatch.setattr(compiled, "order_for", lambda tol: order)
-    steps, errors = zip(*[run(scene, 10.0**-k, exact) for k in range(6, 11)], strict=True)
+    steps, errors = zip(*[run(scene, 10.0**-k, exact) for k in range(first, first + 6)], strict=True)
     slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
-    assert slope == pytest.approx(order, rel=slack)
+    assert slope == pytest.approx(order, rel=0.1)
 
 
 @pytest.mark.parametrize("name", REFERENCES)
 def test_the_error_falls_with_the_tolerance(name: str) -> None:
-    """Over nine decades: error = constant times tol^s with s near 1."""
+    """From 1e-3 to 1e-8, above what rounding leaves: error = constant times tol^s with s near 1."""
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:501]
-    exponents = np.arange(3, 12)
+    exponents = np.arange(3, 9)
     errors = [run(scene, 10.0**-k, exact)[1] for k in exponents.tolist()]
     slope, offset = np.polyfit(-exponents, np.log10(errors), 1)
     assert slope == pytest.approx(1.0, abs=0.12)
