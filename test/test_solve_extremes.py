@@ -9,7 +9,22 @@ import numpy as np
 import pytest
 from scenes import preset, wall_and_point
 
-from plow_twin import Clearance, Contact, Head, Scene, SceneError, Status, Table, Twin, simulate
+from plow_twin import (
+    Clearance,
+    Constant,
+    Contact,
+    Frame,
+    Gravity,
+    Head,
+    Initial,
+    Scene,
+    SceneError,
+    Status,
+    Table,
+    Twin,
+    Wear,
+    simulate,
+)
 
 
 def bouncing(contact: Contact, mass: float, gap: float = 0.01) -> Scene:
@@ -82,3 +97,49 @@ def test_ten_hours_of_driven_motion_do_not_drift() -> None:
     impulse = hourly(10)
     # the motion is periodic but for its first seconds, and so are its impulses
     assert abs(impulse[1:] / impulse[1] - 1.0).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("contact", "clearance"),
+    [
+        (Contact("kelvin_voigt", 4e7, damping=2.5e4), -1e-5),
+        (Contact("exact_restitution", 4e7, 1.0, restitution=0.2), -1e-5),
+        (Contact("exact_restitution", 4e9, 1.5, restitution=0.2), -1e-5),
+    ],
+    ids=["viscous", "n = 1", "n = 1.5"],
+)
+@pytest.mark.xfail(strict=True, reason="a pair that starts inside and moves out fast is pulled")
+def test_a_start_inside_the_wall_is_never_pulled(contact: Contact, clearance: float) -> None:
+    scene = Scene(
+        Head(45.0, 0.3), Frame(0.15, 1.0), Clearance(clearance, clearance), contact, Gravity(0.0),
+        initial=Initial((0.0, 0.0, 0.0), (-0.09, -0.13, 0.0)),
+    )  # fmt: skip
+    events = simulate(scene, 4e-4, output_dt=1e-4, tol=1e-11)
+    fixed = simulate(scene, 4e-4, output_dt=1e-4, method="rk4", dt=1e-7)
+    assert events.v == pytest.approx(fixed.v, abs=1e-6)
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-160])
+@pytest.mark.xfail(strict=True, reason="d = 0 with no rate at the start, n = 1.5: 0 / 0 in the root of time")
+def test_a_start_exactly_on_the_wall_is_solved(speed: float) -> None:
+    contact = Contact("exact_restitution", 1e9, 1.5, restitution=0.5)
+    scene = Scene(
+        Head(10.0, 0.1), Frame(1.0, 0.4), Clearance(0.0, 0.0), contact, loads=(Constant("f", (3.0, 1.0)),),
+        initial=Initial(v=(0.0, -speed, 0.0)),
+    )  # fmt: skip
+    result = simulate(scene, 0.1)
+    assert np.isfinite(result.q).all() and result.force[-1].max() > 0.0
+
+
+@pytest.mark.xfail(strict=True, reason="rows inside a step show the wear of the step's start")
+def test_rows_within_a_step_show_the_wear_of_their_time() -> None:
+    """A clamped head relaxes as its pads wear: F = K d0 exp(-K k_s v t / A)."""
+    stiffness, depth, k_s, area, speed = 1e7, 1e-4, 2e-9, 0.015, 2.0
+    scene = Scene(
+        Head(2000.0, 1000.0), Frame(0.3, 0.3), Clearance(0.02, -2.0 * depth),
+        Contact("kelvin_voigt", stiffness, damping=1e5), Gravity(0.0), locked=("x", "theta"),
+        wear=Wear(k_s, area, speed),
+    )  # fmt: skip
+    result = simulate(scene, 0.2, output_dt=0.01, tol=1e-10)
+    expected = stiffness * depth * np.exp(-stiffness * k_s * speed / area * result.t)
+    assert result.force[:, 0] == pytest.approx(expected, rel=1e-5)
