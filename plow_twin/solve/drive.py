@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import row, set_row, splat
 from plow_twin.solve.layout import (
     AT_HARD_END,
+    COEFFICIENTS,
     EVENT_PAIR,
+    GUARD_ROOTS,
     LENGTH,
     NOW,
     PIECE,
+    RECOVERIES,
     SIGMA,
     STALL,
     STEPS,
@@ -52,7 +56,7 @@ def _present(state, w, y) -> None:
     if state.clock[LENGTH] >= 0.0:
         evaluate(state, w, sigma_at(state, state.clock[USED]), y)
     else:
-        y[:] = state.y
+        set_row(y, 0, row(state.y, 0))
 
 
 @kernel()
@@ -76,21 +80,33 @@ def _proceed(p, parts, state, w, totals, target, hard_time, budget) -> int:
 
 
 @kernel()
+def _clear(totals) -> None:
+    """Begin to count anew what an advance reports."""
+    set_row(totals.peak, 0, splat(0.0))
+    set_row(totals.impulse, 0, splat(0.0))
+    for pair in range(8):
+        totals.makes[pair] = 0
+
+
+@kernel()
 def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:
     """Proceed to `target`; when that fails, time goes on but the head stays as it was, and nothing is counted."""
     saved = w.saved
     _present(state, w, saved[0])
-    saved[1, :], saved[2, :] = state.factor, state.depth
+    set_row(saved, 1, row(state.factor, 0))
+    set_row(saved, 2, row(state.depth, 0))
     for pair in range(8):
         w.modes[pair] = state.mode[pair]
     code = _proceed(p, parts, state, w, totals, target, hard_time, budget)
     if code != _OK:
-        state.y[:], state.factor[:], state.depth[:] = saved[0], saved[1], saved[2]
+        set_row(state.y, 0, row(saved, 0))
+        set_row(state.factor, 0, row(saved, 1))
+        set_row(state.depth, 0, row(saved, 2))
         for pair in range(8):
             state.mode[pair] = w.modes[pair]
         state.clock[T0], state.clock[LENGTH], state.clock[USED], state.clock[NOW] = target, -1.0, 0.0, target
         state.step[TOUCHING] = state.step[STALL] = 0
-        totals.peak[:], totals.impulse[:], totals.makes[:] = 0.0, 0.0, 0
+        _clear(totals)
     return code
 
 
@@ -105,9 +121,7 @@ def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, pea
         peak[i, pair] = max(totals.peak[pair], force[i, pair])
         impulse[i, pair], makes[i, pair] = totals.impulse[pair], totals.makes[pair]
         depth[i, pair] = state.depth[pair]
-    totals.peak[:] = 0.0
-    totals.impulse[:] = 0.0
-    totals.makes[:] = 0
+    _clear(totals)
 
 
 @kernel()
@@ -197,9 +211,11 @@ def lay_out_again(p, parts, state, w) -> None:
 
     Only the scene's own loads leave a step under way, and there it has no hard end.
     """
-    used, count = state.clock[USED], state.count.copy()
+    used, steps, coefficients = state.clock[USED], state.count[STEPS], state.count[COEFFICIENTS]
+    roots, recoveries = state.count[GUARD_ROOTS], state.count[RECOVERIES]
     _lay_out(p, parts, state, w, np.inf)
-    state.count[:] = count
+    state.count[STEPS], state.count[COEFFICIENTS] = steps, coefficients
+    state.count[GUARD_ROOTS], state.count[RECOVERIES] = roots, recoveries
     state.clock[USED] = used
 
 

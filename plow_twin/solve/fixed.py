@@ -22,7 +22,8 @@ _LOG_FULL = int(Status.LOG_FULL)
 @kernel()
 def _load(p, harmonics, second, segments, t, out) -> None:
     """Write force per mass and moment per inertia at t, world axes."""
-    out[:] = p.constant
+    for j in range(3):
+        out[j] = p.constant[j]
     if harmonics is not None:
         _add_harmonics(p, harmonics, second, t, out)
     if segments is not None:

@@ -43,7 +43,8 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
     sin and cos along t(sigma) follow from one another:  (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}).
     """
     load = w.load
-    load[:, : order + 1] = 0.0
+    for k in range(order + 1):
+        load[0, k] = load[1, k] = load[2, k] = 0.0
     for i in range(harmonics.omega.size):
         omega = harmonics.omega[i]
         sine, cosine = math.sin(omega * t), math.cos(omega * t)
