@@ -7,11 +7,14 @@ from plow_twin.errors import Problem as Problem
 from plow_twin.errors import RecordingError as RecordingError
 from plow_twin.errors import SceneError as SceneError
 from plow_twin.errors import SolverError as SolverError
+from plow_twin.model.contact_laws import ContactLaw as ContactLaw
+from plow_twin.model.contact_laws import add_law as add_law
 from plow_twin.model.pairs import PAIR_NAMES as PAIR_NAMES
 from plow_twin.model.scene import Clearance as Clearance
 from plow_twin.model.scene import Constant as Constant
 from plow_twin.model.scene import Contact as Contact
 from plow_twin.model.scene import Frame as Frame
+from plow_twin.model.scene import Friction as Friction
 from plow_twin.model.scene import Gravity as Gravity
 from plow_twin.model.scene import Harmonic as Harmonic
 from plow_twin.model.scene import Head as Head

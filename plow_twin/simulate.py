@@ -10,10 +10,12 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.books import Books, books_of
 from plow_twin.errors import SolverError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive, fixed
+from plow_twin.solve.audit import Audit, new_audit
 from plow_twin.solve.compiled import Compiled, compile_scene
 from plow_twin.solve.layout import (
     COEFFICIENTS,
@@ -68,6 +70,8 @@ class Result:
         Wear depth of each pad at the end in m.
     wall_s, compile_s : float
         Time taken by the run, and by compiling before it, in s.
+    audit : Books or None
+        Energy and momentum, when asked for.
     """
 
     t: Array
@@ -82,6 +86,7 @@ class Result:
     wear_depth: Array
     wall_s: float
     compile_s: float
+    audit: Books | None = None
 
 
 def simulate(
@@ -91,6 +96,7 @@ def simulate(
     tol: float = 1e-9,
     method: Method = "events",
     dt: float | None = None,
+    audit: bool = False,
 ) -> Result:
     """Simulate a scene from t = 0 to `t_end`.
 
@@ -108,6 +114,8 @@ def simulate(
         Event-located Taylor series, or a fixed step without event location.
     dt : float, optional
         The fixed step in s.
+    audit : bool
+        Keep the books of energy and momentum (`Result.audit`); off, its code does not run.
 
     Raises
     ------
@@ -122,12 +130,12 @@ def simulate(
         output_dt = dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
     times = output_times(t_end, output_dt)
     begin = _time.perf_counter()
-    _run(compiled, np.zeros(1), 0.0, method, dt)
+    _run(compiled, np.zeros(1), 0.0, method, dt, audit)
     compile_s = _time.perf_counter() - begin
     begin = _time.perf_counter()
-    motion = _run(compiled, times, t_end, method, dt)
+    motion = _run(compiled, times, t_end, method, dt, audit)
     wall_s = _time.perf_counter() - begin
-    return _result(scene, times, t_end, tol, method, dt, motion, wall_s, compile_s)
+    return _result(compiled, times, t_end, tol, method, dt, motion, wall_s, compile_s)
 
 
 @dataclass
@@ -141,6 +149,7 @@ class Motion:
     v: Array
     penetration: Array | None = None
     force: Array | None = None
+    audit: Audit | None = None
 
     @staticmethod
     def start(compiled: Compiled, q: Array, v: Array, outputs: bool = False) -> Motion:
@@ -180,8 +189,11 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-def _run(compiled: Compiled, times: Array, t_end: float, method: Method, dt: float | None) -> Motion:
+def _run(
+    compiled: Compiled, times: Array, t_end: float, method: Method, dt: float | None, audit: bool = False
+) -> Motion:
     motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)), outputs=True)
+    motion.audit = new_audit() if audit else None
     if dt is None:
         code, _ = run_events(compiled, motion, times, t_end, new_work(), BUDGET)
         time = float(motion.state.clock[T0])
@@ -201,7 +213,7 @@ def run_events(
     while True:
         code = drive.record(
             compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, budget, first,
-            times, motion.q, motion.v, motion.penetration, motion.force,
+            times, motion.q, motion.v, motion.penetration, motion.force, motion.audit,
         )  # fmt: skip
         if code != Status.LOG_FULL:
             return code, int(first[0])
@@ -216,7 +228,7 @@ def _run_fixed(
     while True:
         code = fixed.march(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, euler, stride,
-            motion.q, motion.v, motion.penetration, motion.force,
+            motion.q, motion.v, motion.penetration, motion.force, motion.audit,
         )  # fmt: skip
         if code != Status.LOG_FULL:
             return code, float(done[0]) * dt
@@ -232,7 +244,7 @@ def _grown(log: Log) -> Log:
 
 
 def _result(
-    scene: Scene,
+    compiled: Compiled,
     times: Array,
     t_end: float,
     tol: float,
@@ -242,7 +254,7 @@ def _result(
     wall_s: float,
     compile_s: float,
 ) -> Result:
-    log, count = motion.log, motion.state.count
+    scene, log, count = compiled.scene, motion.log, motion.state.count
     assert motion.force is not None and motion.penetration is not None
     size = int(log.length[0])
     events = np.zeros(size, EVENT_DTYPE)
@@ -257,6 +269,7 @@ def _result(
         t=times, q=motion.q, v=motion.v, force=motion.force, penetration=motion.penetration, events=events,
         statistics=statistics_of(motion.totals, t_end), contact_sets=contact_sets_of(scene, motion.totals),
         solver=solver, wear_depth=motion.state.depth.copy(), wall_s=wall_s, compile_s=compile_s,
+        audit=None if motion.audit is None else books_of(compiled, motion.state, motion.audit),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from dataclasses import fields
 from typing import Any
 
 from plow_twin.model.contact_laws import LAWS
-from plow_twin.model.scene import Harmonic, Scene, Table
+from plow_twin.model.scene import OPTIONAL_PARTS, Harmonic, Scene, Table
 from plow_twin.scene_file.schema import SECTIONS
 
 Fact = dict[str, Any]
@@ -19,8 +19,9 @@ def numbers(scene: Scene) -> list[Fact]:
     rows = [row for key in SECTIONS for row in _numbers_of(getattr(scene, key), key, scene)]
     for index, load in enumerate(scene.loads):
         rows += _numbers_of(load, f"loads[{index}]", scene)
-    if scene.wear is not None:
-        rows += _numbers_of(scene.wear, "wear", scene)
+    for key in OPTIONAL_PARTS:
+        if getattr(scene, key) is not None:
+            rows += _numbers_of(getattr(scene, key), key, scene)
     return rows
 
 

@@ -12,6 +12,9 @@ from plow_twin.cli.console import DONE, POSITIVE, busy, json_option, kilonewton,
 from plow_twin.presets import scene_path
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
+    from plow_twin.books import Books
     from plow_twin.simulate import Result
 
 #: A row takes some 200 B.
@@ -35,6 +38,7 @@ MOST_ROWS: Final = 10_000_000
     help="events: every touch located; rk4, euler: fixed steps for comparison.",
 )
 @click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
+@click.option("--audit", is_flag=True, help="Keep the books of energy and momentum; costs about as much as the run.")
 @quiet_option
 def simulate(
     scene: str,
@@ -45,12 +49,13 @@ def simulate(
     as_json: bool,
     method: str,
     dt: float | None,
+    audit: bool,
     quiet: bool,
 ) -> int:
     """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc."""
     _check_usage(out, method, dt)
     _check_rows(t_end, output_dt)
-    result = _run(scene, quiet, t_end, output_dt, tol, method, dt)
+    result = _run(scene, quiet, t_end, output_dt, tol, method, dt, audit)
     if out is not None:
         try:
             write_samples(result, out)
@@ -133,13 +138,44 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
         "solver": _plain(result.solver),
         "wall_s": float(result.wall_s),
         "compile_s": float(result.compile_s),
+        **({} if result.audit is None else {"audit": _plain(books_of(result.audit))}),
     }
+
+
+def books_of(books: Books) -> dict[str, Any]:
+    """Return the books as plain numbers and lists, with the imbalance over the turnover."""
+    from dataclasses import asdict
+
+    import numpy as np
+
+    plain = {key: np.asarray(value).tolist() for key, value in asdict(books).items()}
+    return {**plain, "relative_imbalance": books.relative_imbalance}
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
     return value.item() if hasattr(value, "item") else value
+
+
+def _audit_table(books: Books) -> Table:
+    rows = table("books of energy", "what", "J")
+    kinetic, stored = (end - start for start, end in (books.kinetic_j, books.stored_j))
+    for name, value in (
+        ("work of the loads", books.load_work_j),
+        ("work of gravity", books.gravity_work_j),
+        ("- dissipated in contacts", -books.dissipated_j),
+        ("- dissipated by friction", -books.friction_work_j),
+        ("- stored in contacts at the end, more than at the start", -stored),
+        ("= kinetic energy gained", kinetic),
+    ):
+        rows.add_row(name, f"{value:.6g}")
+    rows.add_row("largest imbalance on the way", f"{books.imbalance_j:.3g}")
+    rows.add_row("the same over the turnover", f"{books.relative_imbalance:.1e}")
+    rows.add_row(
+        "largest imbalance of momentum [N s, N s, N m s]", " ".join(f"{v:.1e}" for v in books.momentum_imbalance)
+    )
+    return rows
 
 
 def _print_statistics(result: Result, scene: str, t_end: float) -> None:
@@ -162,5 +198,7 @@ def _print_statistics(result: Result, scene: str, t_end: float) -> None:
     for name in sorted({*ccw, *cw}, key=lambda name: (len(name), name)):
         sets.add_row(name, f"{ccw.get(name, 0.0):.1%}", f"{cw.get(name, 0.0):.1%}")
     console.print(sets)
+    if result.audit is not None:
+        console.print(_audit_table(result.audit))
     solver = ", ".join(f"{key} {value}" for key, value in result.solver.items())
     console.print(f"{solver}; {result.wall_s * 1e3:.1f} ms, compiled in {result.compile_s:.1f} s", highlight=False)

@@ -1,6 +1,6 @@
 """The normal force of a pair, compiled: once as a number, once as a power series in time.
 
-    Kelvin-Voigt      F = K d + C d'
+    additive laws     F = K d^n + C psi(d) d',  psi = 1 (Kelvin-Voigt) or u^2 (3 - 2 u), u = min(d / ramp, 1)
     all other laws    F = K d^n (1 + lambda d')
 
 (model of the paper's lost eq. 6; the laws' lambda comes from `contact_laws`). A solver decides when a pair is in
@@ -20,16 +20,25 @@ from plow_twin.model.lanes import row, splat
 
 @kernel(inline=True)
 def normal_force(
-    penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float
+    penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float, ramp: float
 ) -> float:
     """Return F >= 0 in N for penetration d in m and rate d' in m/s; zero for d <= 0.
 
-    `factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero.
+    `factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero. `ramp` in m is zero without a ramp.
     """
     if penetration <= 0.0:
         return 0.0
     elastic = stiffness * (penetration if exponent == 1.0 else penetration**exponent)
+    if penetration < ramp:
+        share = penetration / ramp
+        viscous *= share * share * (3.0 - 2.0 * share)
     return max(0.0, elastic * (1.0 + factor * rate) + viscous * rate)
+
+
+@kernel(fast=True, inline=True)
+def ramp_terms(square: NDArray[np.float64], cube: NDArray[np.float64], k: int, ramp: float) -> Any:
+    """Return coefficient k of u^2 (3 - 2 u), u = d / ramp, of the eight columns, from those of d^2 and d^3."""
+    return row(square, k) * (3.0 / (ramp * ramp)) - row(cube, k) * (2.0 / (ramp * ramp * ramp))
 
 
 @kernel(fast=True)

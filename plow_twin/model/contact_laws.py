@@ -1,8 +1,9 @@
 """Contact laws: each is one definition with its equation and its source.
 
-All laws but Kelvin-Voigt have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive
-inward. They differ in the damping factor  D = lambda v0  that they derive from the restitution e; v0 is the speed of
-the touch. A law is added by one entry in `LAWS`: every solver reads nothing but these numbers.
+Most laws have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive inward. They differ
+in the damping factor  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch. The others
+add C d' to K d^n, at once (Kelvin-Voigt) or ramped in. A law is added by one entry in `LAWS`, by `add_law` from
+outside: every solver reads nothing but these numbers.
 """
 
 from __future__ import annotations
@@ -56,6 +57,8 @@ class ContactLaw:
     exponent: float | None = None
     #: the damping is C d' beside K d^n (Kelvin-Voigt), not a factor of K d^n
     additive: bool = False
+    #: C grows from nothing over the penetration `ramp_m`
+    ramped: bool = False
 
     @property
     def takes_restitution(self) -> bool:
@@ -72,42 +75,61 @@ class ContactLaw:
             return DAMPING_FACTOR_CAP
 
 
-LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(
-    {
-        "exact_restitution": ContactLaw(
-            "exact restitution", "D (1 + e) = ln((1 + D) / (1 - D e))", exact_damping_factor, takes_damping=False
-        ),
-        "kelvin_voigt": ContactLaw(
-            "Kelvin-Voigt", "F = max(0, K d + C d'); Goldsmith, Impact, 1960", exponent=1.0, additive=True
-        ),
-        "hertz": ContactLaw("Hertz", "F = K d^n; Hertz, J. reine angew. Math. 92 (1881) 156", takes_damping=False),
-        "hunt_crossley": ContactLaw(
-            "Hunt-Crossley", "D = 3 (1 - e) / 2; J. Appl. Mech. 42 (1975) 440", lambda e: 1.5 * (1.0 - e)
-        ),
-        "herbert_mcwhannell": ContactLaw(
-            "Herbert-McWhannell",
-            "D = 6 (1 - e) / ((2 e - 1)^2 + 3); J. Eng. Ind. 99 (1977) 513",
-            lambda e: 6.0 * (1.0 - e) / ((2.0 * e - 1.0) ** 2 + 3.0),
-        ),
-        "lee_wang": ContactLaw(
-            "Lee-Wang", "D = 3 (1 - e) / 4; J. Mech. Transm. Autom. 105 (1983) 534", lambda e: 0.75 * (1.0 - e)
-        ),
-        "lankarani_nikravesh": ContactLaw(
-            "Lankarani-Nikravesh", "D = 3 (1 - e^2) / 4; J. Mech. Des. 112 (1990) 369", lambda e: 0.75 * (1.0 - e * e)
-        ),
-        "gonthier": ContactLaw(
-            "Gonthier et al.", "D = (1 - e^2) / e; Multibody Syst. Dyn. 11 (2004) 209", lambda e: (1.0 - e * e) / e
-        ),
-        "zhiying_qishao": ContactLaw(
-            "Zhiying-Qishao",
-            "D = 3 (1 - e^2) exp(2 (1 - e)) / 4; J. Mech. Strength 28 (2006)",
-            lambda e: 0.75 * (1.0 - e * e) * math.exp(2.0 * (1.0 - e)),
-        ),
-        "flores": ContactLaw(
-            "Flores et al.", "D = 8 (1 - e) / (5 e); Multibody Syst. Dyn. 25 (2011) 357", lambda e: 1.6 * (1.0 - e) / e
-        ),
-        "hu_guo": ContactLaw(
-            "Hu-Guo", "D = 3 (1 - e) / (2 e); Multibody Syst. Dyn. 35 (2015) 303", lambda e: 1.5 * (1.0 - e) / e
-        ),
-    }
-)
+_LAWS: Final[dict[str, ContactLaw]] = {
+    "exact_restitution": ContactLaw(
+        "exact restitution", "D (1 + e) = ln((1 + D) / (1 - D e))", exact_damping_factor, takes_damping=False
+    ),
+    "kelvin_voigt": ContactLaw(
+        "Kelvin-Voigt", "F = max(0, K d + C d'); Goldsmith, Impact, 1960", exponent=1.0, additive=True
+    ),
+    "hertz": ContactLaw("Hertz", "F = K d^n; Hertz, J. reine angew. Math. 92 (1881) 156", takes_damping=False),
+    "hunt_crossley": ContactLaw(
+        "Hunt-Crossley", "D = 3 (1 - e) / 2; J. Appl. Mech. 42 (1975) 440", lambda e: 1.5 * (1.0 - e)
+    ),
+    "herbert_mcwhannell": ContactLaw(
+        "Herbert-McWhannell",
+        "D = 6 (1 - e) / ((2 e - 1)^2 + 3); J. Eng. Ind. 99 (1977) 513",
+        lambda e: 6.0 * (1.0 - e) / ((2.0 * e - 1.0) ** 2 + 3.0),
+    ),
+    "lee_wang": ContactLaw(
+        "Lee-Wang", "D = 3 (1 - e) / 4; J. Mech. Transm. Autom. 105 (1983) 534", lambda e: 0.75 * (1.0 - e)
+    ),
+    "lankarani_nikravesh": ContactLaw(
+        "Lankarani-Nikravesh", "D = 3 (1 - e^2) / 4; J. Mech. Des. 112 (1990) 369", lambda e: 0.75 * (1.0 - e * e)
+    ),
+    "gonthier": ContactLaw(
+        "Gonthier et al.", "D = (1 - e^2) / e; Multibody Syst. Dyn. 11 (2004) 209", lambda e: (1.0 - e * e) / e
+    ),
+    "zhiying_qishao": ContactLaw(
+        "Zhiying-Qishao",
+        "D = 3 (1 - e^2) exp(2 (1 - e)) / 4; J. Mech. Strength 28 (2006)",
+        lambda e: 0.75 * (1.0 - e * e) * math.exp(2.0 * (1.0 - e)),
+    ),
+    "flores": ContactLaw(
+        "Flores et al.", "D = 8 (1 - e) / (5 e); Multibody Syst. Dyn. 25 (2011) 357", lambda e: 1.6 * (1.0 - e) / e
+    ),
+    "hu_guo": ContactLaw(
+        "Hu-Guo", "D = 3 (1 - e) / (2 e); Multibody Syst. Dyn. 35 (2015) 303", lambda e: 1.5 * (1.0 - e) / e
+    ),
+    "ramped_damping": ContactLaw(
+        "ramped damping",
+        "F = max(0, K d^n + C u^2 (3 - 2 u) d'), u = min(d / ramp, 1); IMPACT of MSC Adams (STEP), RecurDyn alike",
+        additive=True,
+        ramped=True,
+    ),
+}
+#: Every law by its name in scenes; `add_law` adds to it.
+LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
+
+
+def add_law(name: str, law: ContactLaw) -> None:
+    """Add a law of your own: from now on scenes can name it, and every solver and study takes it at full speed.
+
+    Raises
+    ------
+    ValueError
+        The name is taken, or not one that a scene file can hold.
+    """
+    if name in LAWS or not name.isidentifier():
+        raise ValueError(f"contact law: got {name!r}, expected a new name of letters, digits and _")
+    _LAWS[name] = law

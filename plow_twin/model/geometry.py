@@ -77,6 +77,38 @@ def arm_rows(scene: Scene) -> NDArray[np.float64]:
     )
 
 
+def slip_rows(scene: Scene) -> NDArray[np.float64]:
+    """Return the coefficients of each corner's place along its wall, shape (4, 8): rows for c, s, X, Y.
+
+    t . p without its constant, t the wall's outward normal turned by +90 degrees.
+    """
+    corner_x, corner_y = corner_positions(scene)
+    return np.array(
+        [
+            -NORMAL_Y * corner_x + NORMAL_X * corner_y,
+            -NORMAL_Y * corner_y - NORMAL_X * corner_x,
+            NORMAL_Y,
+            -NORMAL_X,
+        ]
+    )
+
+
+def slip_arm_rows(scene: Scene) -> NDArray[np.float64]:
+    """Return the coefficients of the arm about G of a force along t at each corner, shape (4, 8): c, s, X, Y.
+
+    (p - r) x t per newton.
+    """
+    corner_x, corner_y = corner_positions(scene)
+    return np.array(
+        [
+            NORMAL_X * corner_x + NORMAL_Y * corner_y,
+            NORMAL_X * corner_y - NORMAL_Y * corner_x,
+            -NORMAL_X,
+            -NORMAL_Y,
+        ]
+    )
+
+
 def body_state(
     q: tuple[float, float, float] | NDArray[np.float64],
     v: tuple[float, float, float] | NDArray[np.float64],

@@ -22,6 +22,12 @@ _VECTOR = ir.VectorType(ir.DoubleType(), _WIDTH)
 _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 
 
+def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a function that emits code an operation of kernels; its first parameter is not one of the caller's."""
+    operation: Callable[..., Any] = intrinsic(function)
+    return operation
+
+
 class Lanes(types.Type):
     """Numba's type of eight float64."""
 
@@ -45,7 +51,7 @@ def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any
     return builder.bitcast(first, _VECTOR.as_pointer())
 
 
-@intrinsic
+@_operation
 def row(typingctx: Any, array: Any, index: Any) -> Any:
     """Return row `index` of a contiguous array of shape (n, 8), or row 0 of one of shape (8,)."""
 
@@ -56,7 +62,7 @@ def row(typingctx: Any, array: Any, index: Any) -> Any:
     return lanes(array, index), codegen
 
 
-@intrinsic
+@_operation
 def set_row(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     """Write eight numbers to row `index` of a contiguous array of shape (n, 8)."""
 
@@ -74,7 +80,7 @@ def _splatted(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), zeros)
 
 
-@intrinsic
+@_operation
 def splat(typingctx: Any, value: Any) -> Any:
     """Return eight times the same number."""
 
@@ -84,7 +90,7 @@ def splat(typingctx: Any, value: Any) -> Any:
     return lanes(value), codegen
 
 
-@intrinsic
+@_operation
 def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     """Return eight numbers as one value."""
 
@@ -98,7 +104,7 @@ def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any,
     return lanes(a, b, c, d, e, f, g, h), codegen
 
 
-@intrinsic
+@_operation
 def lane(typingctx: Any, value: Any, index: Any) -> Any:
     """Return one of the eight."""
 
@@ -109,7 +115,7 @@ def lane(typingctx: Any, value: Any, index: Any) -> Any:
     return types.float64(lanes, index), codegen
 
 
-@intrinsic
+@_operation
 def total(typingctx: Any, value: Any) -> Any:
     """Return the sum of the eight."""
 
@@ -121,7 +127,7 @@ def total(typingctx: Any, value: Any) -> Any:
     return types.float64(lanes), codegen
 
 
-@intrinsic
+@_operation
 def below(typingctx: Any, left: Any, right: Any) -> Any:
     """Return a bit for each lane in which left < right; not for NaN."""
 
@@ -132,7 +138,7 @@ def below(typingctx: Any, left: Any, right: Any) -> Any:
     return types.int64(lanes, lanes), codegen
 
 
-@intrinsic
+@_operation
 def magnitude(typingctx: Any, value: Any) -> Any:
     """Return the absolute value of each."""
 
@@ -166,5 +172,5 @@ def _elementwise(operation: Callable[..., Any], emit: str) -> None:
         lower_builtin(operation, left, right)(codegen)
 
 
-for _operation, _emit in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
-    _elementwise(_operation, _emit)
+for _sign, _emit in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+    _elementwise(_sign, _emit)

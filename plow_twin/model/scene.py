@@ -7,7 +7,7 @@ range; the checks here, the file's schema and the documentation all come from it
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
@@ -47,7 +47,7 @@ def _quantity(unit: str, doc: str, default: Any = ..., **bounds: float) -> Any:
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
 
-def _choice(doc: str, choices: tuple[str, ...], default: Any = ...) -> Any:
+def _choice(doc: str, choices: Collection[str], default: Any = ...) -> Any:
     metadata = {"doc": doc, "choices": choices}
     return field(metadata=metadata) if default is ... else field(default=default, metadata=metadata)
 
@@ -95,12 +95,12 @@ class Contact:
     Exactly one of `damping` and `restitution` is given, or neither for a law without damping.
     """
 
-    law: str = _choice("contact law", tuple(LAWS))
+    law: str = _choice("contact law", LAWS)
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
         "N s/m or s/m",
-        "kelvin_voigt: C in N s/m; others: constant factor lambda of (1 + lambda d') in s/m",
+        "kelvin_voigt, ramped_damping: C in N s/m; others: constant factor lambda of (1 + lambda d') in s/m",
         None,
         ge=0.0,
     )
@@ -108,6 +108,15 @@ class Contact:
     impact_speed_floor_m_s: float = _quantity(
         "m/s", "smallest impact speed v0 used in lambda = D(e)/v0, bounds the damping of a touch at rest", 1e-3, gt=0.0
     )
+    ramp_m: float | None = _quantity("m", "ramped_damping: penetration over which C grows to its value", None, gt=0.0)
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Tangential friction of every pair, regularised Coulomb: T = mu N tanh(slip rate / regularisation speed)."""
+
+    coefficient: float = _quantity("1", "mu", ge=0.0)
+    regularisation_speed_m_s: float = _quantity("m/s", "below it friction is viscous", 0.01, gt=0.0)
 
 
 @dataclass(frozen=True)
@@ -195,6 +204,7 @@ class Scene:
         default=PAIR_NAMES, metadata={"doc": "the pairs that can touch", "choices": PAIR_NAMES}
     )
     wear: Wear | None = None
+    friction: Friction | None = None
     marks: Mapping[str, Provenance] = field(default_factory=lambda: MappingProxyType({}), compare=False)
 
     def __post_init__(self) -> None:
@@ -211,7 +221,12 @@ _PARTS: Final[Mapping[str, type]] = {
     "gravity": Gravity,
     "initial": Initial,
     "wear": Wear,
+    "friction": Friction,
 }
+
+
+#: Parts that a scene may lack.
+OPTIONAL_PARTS: Final[Mapping[str, type]] = {"wear": Wear, "friction": Friction}
 
 
 def check(scene: Scene) -> Iterator[Problem]:
@@ -244,7 +259,7 @@ def _check_fields(part: Any, path: str) -> Iterator[Problem]:
         if kind is not None:
             if isinstance(value, kind):
                 yield from _check_fields(value, f"{key}.")
-            elif value is not None or spec.name != "wear":
+            elif value is not None or spec.name not in OPTIONAL_PARTS:
                 yield Problem(key, value, f"a {kind.__name__}")
         elif spec.name in ("loads", "locked", "pairs") and not isinstance(value, (tuple, list)):
             yield Problem(key, value, "a tuple")
@@ -324,6 +339,9 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
         yield Problem("contact", given, f"{' or '.join(allowed)} for {contact.law}")
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
+    if law.ramped != (contact.ramp_m is not None):
+        expected = "a penetration > 0 [m]" if law.ramped else "nothing"
+        yield Problem("contact.ramp_m", contact.ramp_m, f"{expected} for {contact.law}")
 
 
 def _check_rotation(scene: Scene) -> Iterator[Problem]:

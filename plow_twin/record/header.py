@@ -31,7 +31,7 @@ _NUMERIC_SOURCES: Final = ("model", "solve", "twin.py", "stream/session.py", "st
 @cache
 def build_fingerprint() -> Mapping[str, str]:
     """Return what the exact bits of a run depend on: versions, processor, platform, a hash of the numeric sources."""
-    import llvmlite.binding  # type: ignore[import-untyped]
+    import llvmlite.binding
     import numba
 
     return {

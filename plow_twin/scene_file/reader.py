@@ -11,6 +11,7 @@ from typing import Any, Final
 from plow_twin.errors import Problem, SceneError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import (
+    OPTIONAL_PARTS,
     Clearance,
     Contact,
     Frame,
@@ -20,7 +21,6 @@ from plow_twin.model.scene import (
     Provenance,
     Scene,
     Table,
-    Wear,
 )
 from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS
 from plow_twin.scene_file.table import read_table, sample_table
@@ -106,8 +106,9 @@ def _read_parts(
         parts["locked"] = tuple(raw["locked"])
     if "pairs" in raw and not any(key.startswith("pairs") for key in bad):
         parts["pairs"] = PAIR_NAMES if raw["pairs"] == "all" else tuple(raw["pairs"])
-    if isinstance(raw.get("wear"), dict) and "wear" not in bad:
-        parts["wear"] = Wear(**_arguments(Wear, raw["wear"], "wear", marks))
+    for key, part in OPTIONAL_PARTS.items():
+        if isinstance(raw.get(key), dict) and key not in bad:
+            parts[key] = part(**_arguments(part, raw[key], key, marks))
     return parts
 
 

@@ -9,6 +9,7 @@ from dataclasses import MISSING, Field, fields
 from typing import Any, Final
 
 from plow_twin.model.scene import (
+    OPTIONAL_PARTS,
     SCENE_VERSION,
     Clearance,
     Constant,
@@ -22,7 +23,6 @@ from plow_twin.model.scene import (
     Mark,
     Scene,
     Table,
-    Wear,
     describe,
 )
 
@@ -57,7 +57,10 @@ def scene_schema() -> Schema:
         "loads": {"type": "array", "items": _load(), "description": "a list of loads"},
         "locked": names["locked"],
         "pairs": _either(names["pairs"], {"const": "all"}, "all, or " + names["pairs"]["description"]),
-        "wear": _either(_object(Wear), {"enum": ["none", None]}, "none, or the parameters of wear"),
+        **{
+            key: _either(_object(part), {"enum": ["none", None]}, f"none, or the parameters of {key}")
+            for key, part in OPTIONAL_PARTS.items()
+        },
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.model.scene import SCENE_VERSION, Load, Provenance, Scene, Table
+from plow_twin.model.scene import OPTIONAL_PARTS, SCENE_VERSION, Load, Provenance, Scene, Table
 from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS
 from plow_twin.scene_file.yaml_text import dump_yaml
 
@@ -26,6 +26,7 @@ _ORDER: Final = (
     "locked",
     "pairs",
     "wear",
+    "friction",
 )
 
 
@@ -37,7 +38,9 @@ def dump_scene(scene: Scene) -> str:
     raw["loads"] = [_plain_load(load, f"loads[{index}]", scene.marks) for index, load in enumerate(scene.loads)]
     raw["locked"] = list(scene.locked)
     raw["pairs"] = "all" if scene.pairs == PAIR_NAMES else list(scene.pairs)
-    raw["wear"] = "none" if scene.wear is None else _plain(scene.wear, "wear", scene.marks)
+    for key in OPTIONAL_PARTS:
+        part = getattr(scene, key)
+        raw[key] = "none" if part is None else _plain(part, key, scene.marks)
     return dump_yaml({key: raw[key] for key in _ORDER})
 
 

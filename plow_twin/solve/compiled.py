@@ -25,6 +25,7 @@ from plow_twin.solve.layout import (
     Params,
     Parts,
     Segments,
+    Slip,
     State,
     new_record,
 )
@@ -105,6 +106,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         viscous=law.viscous or 0.0,
         damping_factor=factor,
         speed_floor=float(scene.contact.impact_speed_floor_m_s),
+        ramp=law.ramp or 0.0,
         gravity=float(gravity),
         constant=constant,
         direction=direction,
@@ -126,7 +128,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     segments = segments_of(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
         segments = Segments(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
-    parts = Parts(harmonics, second, segments, law, _wear_rate(scene), offset, free)
+    parts = Parts(harmonics, second, segments, law, _wear_rate(scene), offset, free, _slip(scene))
     return Compiled(scene, params, parts, loads)
 
 
@@ -170,6 +172,7 @@ def law_of(contact: Contact) -> tuple[Law, float]:
             factor=1 if damped else None,
             integer=int(exponent) if exponent != 1.0 and float(exponent).is_integer() else None,
             fraction=None if float(exponent).is_integer() else float(exponent),
+            ramp=contact.ramp_m if viscous > 0.0 else None,
         ),
         factor if damped else -1.0,
     )
@@ -216,6 +219,18 @@ def _release(scene: Scene, velocity_tolerance: float, speed: float, exponent: fl
     """
     impulse = 1e-5 * velocity_tolerance * scene.head.mass_kg
     return float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
+
+
+def _slip(scene: Scene) -> Slip | None:
+    friction = scene.friction
+    if friction is None or friction.coefficient == 0.0:
+        return None
+    return Slip(
+        geometry.slip_rows(scene),
+        geometry.slip_arm_rows(scene),
+        float(friction.coefficient),
+        float(friction.regularisation_speed_m_s),
+    )
 
 
 def _wear_rate(scene: Scene) -> Array | None:

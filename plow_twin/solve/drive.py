@@ -6,6 +6,7 @@ import numpy as np
 
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row, splat
+from plow_twin.solve.audit import audit_start, audit_step
 from plow_twin.solve.layout import (
     AT_HARD_END,
     COEFFICIENTS,
@@ -34,7 +35,7 @@ def _lay_out(p, parts, state, w, hard_time) -> bool:
     law = parts.law
     return begin(
         p, state, w, hard_time, parts.harmonics, parts.second, parts.segments,
-        law.viscous, law.factor, law.integer, law.fraction, parts.wear, parts.offset, parts.free,
+        law.viscous, law.factor, law.integer, law.fraction, parts.wear, parts.offset, parts.free, law.ramp, parts.slip,
     )  # fmt: skip
 
 
@@ -220,13 +221,15 @@ def lay_out_again(p, parts, state, w) -> None:
 
 
 @kernel()
-def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force) -> int:
+def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force, audit) -> int:
     """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
 
-    `penetration` and `force` may be None. The rows' times do not change the steps.
+    `penetration`, `force` and `audit` may be None. The rows' times do not change the steps.
     """
     rate, y = np.empty(8), np.empty(8)
-    row = first[0]
+    i = first[0]
+    if audit is not None and state.count[STEPS] == 0:
+        audit_start(p, parts, state, state.y, state.clock[T0], audit)
     while True:
         if state.clock[T0] >= t_end:
             break
@@ -237,21 +240,23 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
             return code
         t0, length = state.clock[T0], state.clock[LENGTH]
         end = t0 + length
-        while row < t.size and t[row] < end:
-            evaluate(state, w, sigma_at(state, max(t[row] - t0, 0.0)), y)
-            pose_of(y, parts.offset, q[row], v[row])
+        while i < t.size and t[i] < end:
+            evaluate(state, w, sigma_at(state, max(t[i] - t0, 0.0)), y)
+            pose_of(y, parts.offset, q[i], v[i])
             if force is not None:
-                pair_outputs(p, state, y, penetration[row], rate, force[row])
-            row += 1
-            first[0] = row
+                pair_outputs(p, state, y, penetration[i], rate, force[i])
+            i += 1
+            first[0] = i
         account(state, w, 0.0, sigma_at(state, length), totals)
+        if audit is not None:
+            audit_step(p, parts, parts.wear, state, w, audit)
         finish(p, state, w, totals, log, parts.wear, parts.law.fraction)
     if not within_range(p, state, state.y):
         return _RANGE
-    while row < t.size:
-        pose_of(state.y, parts.offset, q[row], v[row])
+    while i < t.size:
+        pose_of(state.y, parts.offset, q[i], v[i])
         if force is not None:
-            pair_outputs(p, state, state.y, penetration[row], rate, force[row])
-        row += 1
-    first[0] = row
+            pair_outputs(p, state, state.y, penetration[i], rate, force[i])
+        i += 1
+    first[0] = i
     return _OK

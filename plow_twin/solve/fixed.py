@@ -11,8 +11,11 @@ import math
 import numpy as np
 
 from plow_twin.model.contact import normal_force
+from plow_twin.model.friction import friction_force
 from plow_twin.model.kernel import kernel
+from plow_twin.solve.audit import audit_fixed, audit_start
 from plow_twin.solve.layout import COEFFICIENTS, COS, EVENTS, OFF, OMEGA, ON, SIN, STEPS, THETA, VX, VY, Status
+from plow_twin.solve.loads import combined, load_at
 from plow_twin.solve.step import pair_outputs, pose_of, touch, within_range
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
@@ -20,37 +23,9 @@ _LOG_FULL = int(Status.LOG_FULL)
 
 
 @kernel()
-def _load(p, harmonics, second, segments, t, out) -> None:
-    """Write force per mass and moment per inertia at t, world axes."""
-    for j in range(3):
-        out[j] = p.constant[j]
-    if harmonics is not None:
-        _add_harmonics(p, harmonics, second, t, out)
-    if segments is not None:
-        piece = max(np.searchsorted(segments.knots, t, side="right") - 1, 0)
-        ahead = max(t - segments.knots[piece], 0.0)
-        for j in range(3):
-            out[j] += segments.start[piece, j] + segments.slope[piece, j] * ahead
-
-
-@kernel()
-def _add_harmonics(p, harmonics, second, t, out) -> None:
-    for i in range(harmonics.omega.size):
-        sine, cosine = math.sin(harmonics.omega[i] * t), math.cos(harmonics.omega[i] * t)
-        s1 = harmonics.first[i, 0] * sine + harmonics.first[i, 1] * cosine
-        out[0] += p.direction[0, 0] * s1
-        out[1] += p.direction[0, 1] * s1
-        out[2] += harmonics.moment[i, 0] * sine + harmonics.moment[i, 1] * cosine
-        if second is not None:
-            s2 = second[i, 0] * sine + second[i, 1] * cosine
-            out[0] += p.direction[1, 0] * s2
-            out[1] += p.direction[1, 1] * s2
-
-
-@kernel()
-def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:
+def _accelerations(p, parts, offset, free, slip, state, t, z, load, out) -> None:
     """Write the rate of z = (x, y, theta, vx, vy, omega) of the centre of mass, world axes."""
-    _load(p, parts.harmonics, parts.second, parts.segments, t, load)
+    load_at(p, parts.harmonics, parts.second, parts.segments, t, load)
     A, B = p.gap, p.arm
     c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
     x, y, vx, vy = c * z[0] + s * z[1], c * z[1] - s * z[0], c * z[3] + s * z[4], c * z[4] - s * z[3]
@@ -61,10 +36,17 @@ def _accelerations(p, parts, offset, free, state, t, z, load, out) -> None:
         d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * x + A[3, pair] * y + A[4, pair] - state.depth[pair]
         if d > 0.0:
             r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (vx + om * y) + A[3, pair] * (vy - om * x)
-            f = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous)
+            f = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)
             fx -= A[2, pair] * f
             fy -= A[3, pair] * f
             torque += (B[0, pair] * c + B[1, pair] * s + B[2, pair] * x + B[3, pair] * y) * f
+            if slip is not None:
+                along = combined(slip.rows, pair, -om * s, om * c, vx + om * y, vy - om * x)
+                drag = friction_force(f, along, slip.coefficient, slip.speed)
+                # t is the normal turned by +90 degrees
+                fx += A[3, pair] * drag
+                fy -= A[2, pair] * drag
+                torque += combined(slip.arm, pair, c, s, x, y) * drag
     moment = load[2] + torque * p.inverse_inertia
     if offset is not None:
         force_x, force_y = load[0], load[1] + p.gravity
@@ -124,7 +106,7 @@ def _account(state, force_before, force, dt, totals) -> None:
 
 
 @kernel()
-def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force) -> int:
+def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force, audit) -> int:
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
     z, trial = np.empty(6), np.empty(6)
     k = np.empty((4, 6))
@@ -134,6 +116,8 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
     z[0], z[1], z[2] = c * y[0] - s * y[1], s * y[0] + c * y[1], y[THETA]
     z[3], z[4], z[5] = c * y[VX] - s * y[VY], s * y[VX] + c * y[VY], y[OMEGA]
     pair_outputs(p, state, y, pen, rate, now)
+    if audit is not None and done[0] == 0:
+        audit_start(p, parts, state, y, 0.0, audit)
     while True:
         n = done[0]
         if not within_range(p, state, y):
@@ -150,18 +134,18 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
             return _LOG_FULL
         t = n * dt
         if euler:
-            _accelerations(p, parts, parts.offset, parts.free, state, t, z, load, k[0])
+            _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t, z, load, k[0])
             for j in range(3):
                 z[3 + j] += dt * k[0, 3 + j]
                 z[j] += dt * z[3 + j]
             state.count[COEFFICIENTS] += 1
         else:
-            _accelerations(p, parts, parts.offset, parts.free, state, t, z, load, k[0])
+            _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t, z, load, k[0])
             for stage in range(1, 4):
                 part = dt if stage == 3 else 0.5 * dt
                 for j in range(6):
                     trial[j] = z[j] + part * k[stage - 1, j]
-                _accelerations(p, parts, parts.offset, parts.free, state, t + part, trial, load, k[stage])
+                _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t + part, trial, load, k[stage])
             for j in range(6):
                 z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
             state.count[COEFFICIENTS] += 4
@@ -175,6 +159,8 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
         _switch(p, state, pen, rate, t + dt, totals, log)
         pair_outputs(p, state, y, pen, rate, now)
         _account(state, before, now, dt, totals)
+        if audit is not None:
+            audit_fixed(p, parts, state, y, t + dt, dt, audit)
         done[0] = n + 1
 
 

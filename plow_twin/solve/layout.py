@@ -25,12 +25,14 @@ MAX_ORDER: Final = 30
 MAX_HALVINGS: Final = 48
 
 # indices into Work.lanes
-ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND = range(8)
+ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
 
 # contact modes; the first three are public
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
+#: Not a mode: a pair crosses the end of its damping's ramp.
+CROSSING: Final = 4
 #: Penetrating less than `Params.release`, where the force is negligible (exponents that are not integers).
 RELEASED: Final = 3
 
@@ -89,6 +91,7 @@ PARAMS: Final = np.dtype(
         ("viscous", "f8"),  # C in N s/m, 0 without
         ("damping_factor", "f8"),  # D of lambda = D / v0, or a negative number when lambda is constant
         ("speed_floor", "f8"),  # smallest v0
+        ("ramp", "f8"),  # penetration over which C grows, 0 without
         ("gravity", "f8"),
         ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
         ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
@@ -112,6 +115,7 @@ STATE: Final = np.dtype(
         ("factor", "f8", (PAIR_COUNT,)),  # lambda of each pair
         ("depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad
         ("mode", "i8", (PAIR_COUNT,)),
+        ("beyond", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
         ("clock", "f8", (10,)),
         ("step", "i8", (7,)),
         ("count", "i8", (5,)),
@@ -135,12 +139,14 @@ WORK: Final = np.dtype(
         ("guard", "f8", _WIDE),
         ("bernstein", "f8", _WIDE),
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
+        ("ramp", "f8", (3, *_WIDE)),  # square and cube of the penetration, share of C
+        ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
         ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
         ("column", "f8", (2, _ROWS)),  # one polynomial
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
-        ("lanes", "f8", (8, PAIR_COUNT)),  # masks and sums of the eight pairs
+        ("lanes", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
         ("size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
@@ -183,6 +189,16 @@ class Law(NamedTuple):
     factor: int | None  #: not None: lambda is read from State.factor
     integer: int | None  #: integer exponent of at least 2
     fraction: float | None  #: exponent that is not an integer
+    ramp: float | None  #: penetration over which the viscous part grows
+
+
+class Slip(NamedTuple):
+    """Tangential friction."""
+
+    rows: Array  #: (4, 8) place along the wall, for c, s, X, Y
+    arm: Array  #: (4, 8) arm about G
+    coefficient: float  #: mu
+    speed: float  #: regularisation speed in m/s
 
 
 class Segments(NamedTuple):
@@ -203,6 +219,7 @@ class Parts(NamedTuple):
     wear: Array | None  #: (8,) depth per impulse, k_s v / A
     offset: Array | None  #: (2,) centre of mass from the cavity's centre
     free: Array | None  #: (3,) 1 free, 0 locked
+    slip: Slip | None
 
 
 class Log(NamedTuple):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 
-from plow_twin.model.contact import power_term, power_terms, root_terms
+from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import lane, magnitude, pack, row, set_row, splat, total
 from plow_twin.solve.layout import (
@@ -26,6 +26,7 @@ from plow_twin.solve.layout import (
     COS,
     DAMPS,
     OMEGA,
+    RAMPS,
     SIN,
     THETA,
     TOUCHING,
@@ -120,29 +121,45 @@ def _raise(w, k, touching, exponent) -> None:
 
 
 @kernel(fast=True, inline=True)
-def _damp(elastic, w, k, factor):
-    """Return order k of K elastic (1 + lambda d')."""
+def _damp(elastic, w, k, viscous, factor, ramp):
+    """Return order k of the force from that of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
     force = row(w.lanes, ACTS) * row(elastic, k)
+    if ramp is not None:
+        _ramp(w, k, ramp)
+        set_row(w.damped, k, _multiply(w.ramp[2], w.rate, k))
+        return force + row(w.lanes, DAMPS) * row(w.damped, k)
+    if viscous is not None:
+        return force + row(w.lanes, DAMPS) * row(w.rate, k)
     return force if factor is None else force + row(w.lanes, DAMPS) * _multiply(elastic, w.rate, k)
 
 
 @kernel(fast=True, inline=True)
-def _push(state, w, k, viscous, factor, integer, fraction):
+def _ramp(w, k, ramp) -> None:
+    """Write order k of the share of C that acts to `w.ramp[2]`: constant for pairs beyond the ramp."""
+    set_row(w.ramp[0], k, _multiply(w.gap, w.gap, k))
+    set_row(w.ramp[1], k, _multiply(w.ramp[0], w.gap, k))
+    within = row(w.lanes, RAMPS)
+    share = ramp_terms(w.ramp[0], w.ramp[1], k, ramp) * within
+    if k == 0:
+        share = share + (within * -1.0 + 1.0)
+    set_row(w.ramp[2], k, share)
+
+
+@kernel(fast=True, inline=True)
+def _push(state, w, k, viscous, factor, integer, fraction, ramp):
     """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
     Row ACTS of `w.lanes` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
     """
-    if viscous is not None:
-        return row(w.lanes, ACTS) * row(w.gap, k) + row(w.lanes, DAMPS) * row(w.rate, k)
     if integer is not None:
         set_row(w.power[0], k, _multiply(w.gap, w.gap, k))
         for degree in range(1, integer - 1):
             set_row(w.power[degree], k, _multiply(w.power[degree - 1], w.gap, k))
-        return _damp(w.power[integer - 2], w, k, factor)
+        return _damp(w.power[integer - 2], w, k, viscous, factor, ramp)
     if fraction is not None:
         _raise(w, k, state.step[TOUCHING], fraction)
-        return _damp(w.power[0], w, k, factor)
-    return _damp(w.gap, w, k, factor)
+        return _damp(w.power[0], w, k, viscous, factor, ramp)
+    return _damp(w.gap, w, k, viscous, factor, ramp)
 
 
 @kernel(fast=True)
@@ -207,6 +224,32 @@ def _resultant(p, w, k, force):
 
 
 @kernel(fast=True)
+def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy, slip):
+    """Return order k of the friction forces' sum in head axes and of their moment (`model.friction`).
+
+    With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
+    """
+    weighted, tau, rest, drag, arm = w.slip[1], w.slip[2], w.slip[3], w.slip[4], w.slip[5]
+    rate = _combine(slip.rows, dc, ds, dx, dy) * (1.0 / slip.speed)
+    set_row(w.slip[0], k, rate)
+    set_row(arm, k, _combine(slip.arm, c, s, x, y))
+    if k == 0:
+        for pair in range(8):
+            tau[0, pair] = math.tanh(lane(rate, pair))
+        set_row(rest, 0, row(tau, 0) * row(tau, 0) * -1.0 + 1.0)
+        set_row(weighted, 0, splat(0.0))
+    else:
+        set_row(weighted, k, rate * k)
+        older = _multiply_older(weighted, rest, k) + row(weighted, k) * row(rest, 0)
+        set_row(tau, k, older * w.inverse[k])
+        set_row(rest, k, _multiply(tau, tau, k) * -1.0)
+    force = _multiply(w.force, tau, k) * slip.coefficient
+    set_row(drag, k, force)
+    # t is the wall's normal turned by +90 degrees, the gap's rows for X and Y are minus the normals
+    return total(row(p.gap, 3) * force), -total(row(p.gap, 2) * force), total(_multiply(arm, drag, k))
+
+
+@kernel(fast=True)
 def _wear(w, k, wear, alpha, beta) -> None:
     """Write order k + 1 of the growth of each pad's depth:  dh/dt = k_s F v / A (Archard)."""
     growth = row(w.force, k) * alpha
@@ -233,6 +276,8 @@ def expand(
     wear,
     offset,
     free,
+    ramp,
+    slip,
 ):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
@@ -283,12 +328,17 @@ def expand(
         if penetrating:
             set_row(w.rate, k, _combine(p.gap, dc, ds, dx, dy))
             set_row(w.arm, k, _combine(p.arm, c, s, x, yy))
-            force = _push(state, w, k, viscous, factor, integer, fraction)
+            force = _push(state, w, k, viscous, factor, integer, fraction, ramp)
             set_row(w.force, k, force)
             push_x, push_y, torque = _resultant(p, w, k, force)
             fx += push_x * im
             fy += push_y * im
             moment += torque * ii
+            if slip is not None:
+                push_x, push_y, torque = _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy, slip)
+                fx += push_x * im
+                fy += push_y * im
+                moment += torque * ii
             if wear is not None:
                 _wear(w, k, wear, alpha, beta)
         if free is not None:

@@ -23,6 +23,7 @@ from plow_twin.solve.layout import (
     CLIPPED,
     COEFFICIENTS,
     COS,
+    CROSSING,
     DAMPS,
     EVENT_PAIR,
     EVENT_TO,
@@ -38,6 +39,7 @@ from plow_twin.solve.layout import (
     ON,
     ORDER,
     PIECE,
+    RAMPS,
     RATIO,
     RECOVERIES,
     RELEASED,
@@ -90,9 +92,12 @@ def settle_modes(p, state) -> None:
     """Choose each pair's mode from its penetration, where a motion starts or is changed from outside."""
     for pair in range(8):
         state.mode[pair] = OFF
-        if p.enabled[pair] == 1 and gap_and_rate(p, state, pair)[0] > 0.0:
+        state.beyond[pair] = 0
+        depth = gap_and_rate(p, state, pair)[0]
+        if p.enabled[pair] == 1 and depth > 0.0:
             touch(p, state, pair)
-            state.mode[pair] = ON if gap_and_rate(p, state, pair)[0] >= p.release else RELEASED
+            state.mode[pair] = ON if depth >= p.release else RELEASED
+            state.beyond[pair] = 1 if depth > p.ramp else 0
     state.clock[USED] = 0.0
     state.clock[LENGTH] = -1.0
     state.clock[LAST_LENGTH] = 0.0
@@ -102,23 +107,22 @@ def settle_modes(p, state) -> None:
 
 
 @kernel(fast=True)
-def _guards(p, state, w, order, penetrating, viscous) -> None:
+def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 where the law is viscous, else d >= 0 or a small depth;
-    others: d >= 0.
+    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, else d >= 0 or a small depth; others: d >= 0.
     """
     guard, weights = w.guard, w.lanes
     for pair in range(8):
         mode = state.mode[pair]
         weights[SIGN, pair] = 0.0 if p.enabled[pair] == 0 else -1.0 if mode == OFF else 1.0
         weights[RATIO, pair] = 0.0
-        if viscous is not None and mode == ON:
+        if viscous is not None and ramp is None and mode == ON:
             weights[RATIO, pair] = viscous / p.stiffness
     sign, ratio = row(weights, SIGN), row(weights, RATIO)
     for k in range(order + 1):
         set_row(guard, k, row(w.gap, k) * sign)
-    if viscous is not None and penetrating:
+    if viscous is not None and ramp is None and penetrating:
         for k in range(order):
             set_row(guard, k, row(guard, k) + row(w.rate, k) * ratio)
     for pair in range(8):
@@ -130,10 +134,10 @@ def _guards(p, state, w, order, penetrating, viscous) -> None:
 
 
 @kernel()
-def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:
+def _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, ramp) -> bool:
     """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
 
-    on: 1 + lambda d' >= 0; clipped: the force would pull; released: d <= p.release.
+    on: 1 + lambda d' >= 0, with a ramp F >= 0; clipped: the force would pull; released: d <= p.release.
     """
     g, mode = w.column[0], state.mode[pair]
     g[order] = 0.0
@@ -141,6 +145,8 @@ def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:
         for k in range(order + 1):
             g[k] = -w.gap[k, pair]
         g[0] += p.release
+    elif ramp is not None:
+        _pull(p, w, order, pair, mode, viscous, integer, fraction)
     elif viscous is not None:
         if mode == ON:
             return False
@@ -155,6 +161,29 @@ def _second_guard(p, state, w, order, pair, viscous, factor) -> bool:
         g[0] += sign
     g[0] = max(g[0], 0.0)
     return True
+
+
+@kernel()
+def _pull(p, w, order, pair, mode, viscous, integer, fraction) -> None:
+    """Write the force of a ramped law, negative for a clipped pair, to `w.column[0]`."""
+    g, sign = w.column[0], 1.0 if mode == ON else -1.0
+    for k in range(order):
+        if integer is not None:
+            elastic = w.power[integer - 2, k, pair]
+        elif fraction is not None:
+            elastic = w.power[0, k, pair]
+        else:
+            elastic = w.gap[k, pair]
+        g[k] = sign * (p.stiffness * elastic + viscous * w.damped[k, pair])
+
+
+@kernel()
+def _ramp_guard(p, state, w, order, pair) -> None:
+    """Write the guard of a pair that stays on its side of the ramp's end to `w.column[0]`."""
+    g, sign = w.column[0], 1.0 if state.beyond[pair] == 1 else -1.0
+    for k in range(order + 1):
+        g[k] = sign * w.gap[k, pair]
+    g[0] = max(g[0] - sign * p.ramp, 0.0)
 
 
 @kernel(fast=True)
@@ -186,19 +215,31 @@ def _unsafe_pairs(w, order, h):
 
 
 @kernel(inline=True)
-def _next_mode(mode, viscous, fraction):
+def _next_mode(mode, viscous, fraction, ramp):
     """Return the mode that follows when a pair's first guard ends it."""
     if mode == OFF:
         return ON if fraction is None or fraction == 1.5 else RELEASED
-    if mode == ON and viscous is not None:
+    if mode == ON and viscous is not None and ramp is None:
         return CLIPPED
     return RELEASED if mode == ON and fraction is not None else OFF
 
 
 @kernel()
-def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fraction):
+def _sooner(state, w, order, best) -> float:
+    """Return where the guard in `w.column[0]` first turns negative before `best`, else `best`."""
+    column, reach = w.column[0], 0.0
+    for k in range(order, 0, -1):
+        reach = (reach + abs(column[k])) * best
+    if column[0] >= reach:
+        return best
+    state.count[GUARD_ROOTS] += 1
+    return min(best, first_root(column, order, best, w))
+
+
+@kernel()
+def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer, fraction, ramp):
     """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
-    _guards(p, state, w, order, penetrating, viscous)
+    _guards(p, state, w, order, penetrating, viscous, ramp)
     best, event, target = sigma, -1, 0
     unsafe = _unsafe_pairs(w, order, sigma)
     column = w.column[0]
@@ -209,19 +250,20 @@ def _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fracti
             state.count[GUARD_ROOTS] += 1
             root = first_root(column, order, best, w)
             if root < best:
-                best, event, target = root, pair, _next_mode(state.mode[pair], viscous, fraction)
+                best, event, target = root, pair, _next_mode(state.mode[pair], viscous, fraction, ramp)
     if penetrating:
         for pair in range(8):
-            if state.mode[pair] == OFF or not _second_guard(p, state, w, order, pair, viscous, factor):
+            if state.mode[pair] == OFF:
                 continue
-            reach = 0.0
-            for k in range(order, 0, -1):
-                reach = (reach + abs(column[k])) * best
-            if column[0] < reach:
-                state.count[GUARD_ROOTS] += 1
-                root = first_root(column, order, best, w)
+            if _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, ramp):
+                root = _sooner(state, w, order, best)
                 if root < best:
                     best, event, target = root, pair, CLIPPED if state.mode[pair] == ON else ON
+            if ramp is not None and state.mode[pair] != RELEASED:
+                _ramp_guard(p, state, w, order, pair)
+                root = _sooner(state, w, order, best)
+                if root < best:
+                    best, event, target = root, pair, CROSSING
     return best, event, target
 
 
@@ -247,6 +289,28 @@ def _accurate_length(p, w, order, hard):
 
 
 @kernel()
+def _before_sticking(p, state, w, order, sigma) -> float:
+    """Return the part of `sigma` over which the series of tanh r converges well enough.
+
+    Far from sticking tanh r is constant to the last bit: no coefficient tells that its poles at r = +-i pi/2 come near.
+    With |r - r_0| at most theta times their distance what the series leaves out is below theta^order.
+    """
+    theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
+    length = sigma
+    for pair in range(8):
+        if state.mode[pair] != ON:
+            continue
+        change = 0.0
+        for k in range(order - 1, 0, -1):
+            change = (change + abs(w.slip[0, k, pair])) * length
+        limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
+        if change > limit:
+            # the change is convex in sigma
+            length *= limit / change
+    return length
+
+
+@kernel()
 def _linear_load(segments, step, t0, w):
     """Add the linear load at t0 to `w.wrench` and return the time up to which it is linear."""
     piece = step[PIECE]
@@ -265,13 +329,15 @@ def _linear_load(segments, step, t0, w):
 
 
 @kernel()
-def _weigh_pairs(p, state, w, viscous, fraction) -> bool:
+def _weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
     """Write what each pair that acts contributes per order to `w.lanes`; return whether any pair penetrates."""
     mode, lanes = state.mode, w.lanes
     inside = 0
     for pair in range(8):
         lanes[BASE, pair] = 0.0
-        if fraction is not None and mode[pair] == ON and state.step[TOUCHING] >> pair & 1 == 0:
+        lanes[RAMPS, pair] = 1.0 - state.beyond[pair]
+        raised = mode[pair] == ON or (ramp is not None and mode[pair] == CLIPPED)
+        if fraction is not None and raised and state.step[TOUCHING] >> pair & 1 == 0:
             depth = gap_and_rate(p, state, pair)[0]
             if depth > 1e-3 * p.release:
                 lanes[BASE, pair] = 0.5 / math.sqrt(depth) if fraction == 1.5 else 1.0 / depth
@@ -289,7 +355,7 @@ def _weigh_pairs(p, state, w, viscous, fraction) -> bool:
 
 @kernel()
 def _time_to_part(
-    p, state, w, span, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+    p, state, w, span, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free, ramp, slip
 ):
     """Return the time until the first pair parts, where that is what shortens steps; else 0.
 
@@ -324,6 +390,8 @@ def _time_to_part(
         wear,
         offset,
         free,
+        ramp,
+        slip,
     )
     first = np.inf
     for pair in range(8):
@@ -349,12 +417,27 @@ def _time_to_part(
 
 @kernel()
 def begin(
-    p, state, w, hard_time, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+    p,
+    state,
+    w,
+    hard_time,
+    harmonics,
+    second,
+    segments,
+    viscous,
+    factor,
+    integer,
+    fraction,
+    wear,
+    offset,
+    free,
+    ramp,
+    slip,
 ) -> bool:
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step = state.clock, state.step
     t0 = clock[T0]
-    penetrating = _weigh_pairs(p, state, w, viscous, fraction)
+    penetrating = _weigh_pairs(p, state, w, viscous, fraction, ramp)
     for j in range(3):
         w.wrench[0, j] = p.constant[j]
     if segments is not None:
@@ -370,7 +453,22 @@ def begin(
         hard = math.sqrt(span)
     elif fraction is not None and penetrating:
         parting = _time_to_part(
-            p, state, w, span, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free
+            p,
+            state,
+            w,
+            span,
+            harmonics,
+            second,
+            segments,
+            viscous,
+            factor,
+            integer,
+            fraction,
+            wear,
+            offset,
+            free,
+            ramp,
+            slip,
         )
         if parting > 0.0:
             # one that ends like d^1.5 is analytic in the root of the time left
@@ -402,14 +500,18 @@ def begin(
         wear,
         offset,
         free,
+        ramp,
+        slip,
     )
     state.count[STEPS] += 1
     state.count[COEFFICIENTS] += order
     sigma = hard if order < p.order else _accurate_length(p, w, order, hard)
     if not math.isfinite(sigma):
         return False
+    if slip is not None:
+        sigma = _before_sticking(p, state, w, order, sigma)
     limited = limited and sigma == hard
-    end, pair, target = _first_event(p, state, w, order, sigma, penetrating, viscous, factor, fraction)
+    end, pair, target = _first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer, fraction, ramp)
     if pair >= 0 and step[STALL] > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.count[RECOVERIES] += 1
@@ -468,7 +570,7 @@ def pair_outputs(p, state, y, penetration, rate, force) -> None:
         r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
         penetration[pair], rate[pair], force[pair] = d, r, 0.0
         if state.mode[pair] == ON:
-            force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous)
+            force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)
 
 
 @kernel(fast=True)
@@ -570,10 +672,15 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:
         return
     step[STALL] = step[STALL] + 1 if at_once else 0
     old, new = state.mode[pair], step[EVENT_TO]
+    if new == CROSSING:
+        state.beyond[pair] = 1 - state.beyond[pair]
+        new = old
     state.mode[pair] = new
     state.count[EVENTS] += 1
     if fraction is not None:
         step[TOUCHING] = touching & ~(1 << pair)
+    if new == OFF:
+        state.beyond[pair] = 0
     if old == OFF:
         touch(p, state, pair)
         totals.makes[pair] += 1

@@ -1,0 +1,181 @@
+"""The audit of a run: is the change of energy and momentum what the forces did?
+
+Forces are evaluated anew as values, not taken from the series: loads at their time, contacts by `model.contact` and
+`model.friction`. Their power and impulse are integrated by Gauss-Legendre quadrature over each step of the series, by
+the trapezoidal rule over fixed steps. Kinetic energy and momentum come from the state alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from plow_twin.model.friction import friction_force
+from plow_twin.model.geometry import STATE_SIZE
+from plow_twin.model.kernel import kernel
+from plow_twin.solve.layout import (
+    ALPHA,
+    BETA,
+    COS,
+    OMEGA,
+    ORDER,
+    SIGMA,
+    SIN,
+    T0,
+    THETA,
+    VX,
+    VY,
+    Array,
+    new_record,
+)
+from plow_twin.solve.loads import combined, load_at
+from plow_twin.solve.step import evaluate, pair_outputs
+
+#: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
+_NODES = 24
+# indices into the powers and impulses at one instant
+LOADS, NORMAL, FRICTION, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(10)
+
+#: What is summed over a run.
+SUMS = np.dtype(
+    [
+        ("work", "f8", (SIZE,)),  # integrals of the powers and forces
+        ("turnover", "f8"),  # integral of the powers' magnitudes
+        ("energy", "f8", (2,)),  # kinetic energy at the start and now
+        ("momentum", "f8", (2, 3)),  # m vx, m vy, I omega in world axes, at the start and now
+        ("residual", "f8"),  # largest imbalance of energy so far
+        ("momentum_residual", "f8", (3,)),  # largest imbalances of momentum so far
+    ]
+)
+
+
+class Audit(NamedTuple):
+    """Quadrature and sums; `None` in its place leaves the audit out of the compiled code."""
+
+    nodes: Array
+    weights: Array
+    now: Array  #: (SIZE,) powers and forces at one instant
+    before: Array  #: (SIZE,) the same a step before
+    body: Array  #: (8,) body coordinates at a node
+    pairs: Array  #: (3, 8) penetration, rate, force
+    sums: np.record
+
+
+def new_audit() -> Audit:
+    """Return an audit that has seen nothing."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    return Audit(
+        0.5 * (nodes + 1.0), 0.5 * weights, np.zeros(SIZE), np.zeros(SIZE), np.zeros(STATE_SIZE), np.zeros((3, 8)),
+        new_record(SUMS),
+    )  # fmt: skip
+
+
+@kernel()
+def _powers(p, parts, offset, free, slip, state, y, t, pairs, out) -> None:
+    """Write powers and forces at time t in body coordinates y."""
+    c, s, om = math.cos(y[THETA]), math.sin(y[THETA]), y[OMEGA]
+    y[COS], y[SIN] = c, s
+    out[LOADS] = out[NORMAL] = out[FRICTION] = 0.0
+    m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
+    load = out[LOAD_X : LOAD_M + 1]
+    load_at(p, parts.harmonics, parts.second, parts.segments, t, load)
+    if offset is not None:
+        # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
+        across = (c * offset[0] - s * offset[1]) * (load[1] + p.gravity)
+        load[2] -= (across - (s * offset[0] + c * offset[1]) * load[0]) * m / inertia
+    load[0], load[1], load[2] = m * load[0], m * load[1], inertia * load[2]
+    pair_outputs(p, state, y, pairs[0], pairs[1], pairs[2])
+    fx = fy = torque = 0.0
+    dx, dy = y[VX] + om * y[1], y[VY] - om * y[0]
+    for pair in range(8):
+        force = pairs[2, pair]
+        fx -= p.gap[2, pair] * force
+        fy -= p.gap[3, pair] * force
+        torque += combined(p.arm, pair, c, s, y[0], y[1]) * force
+        out[NORMAL] += force * pairs[1, pair]
+        if slip is not None:
+            rate = combined(slip.rows, pair, -om * s, om * c, dx, dy)
+            drag = friction_force(force, rate, slip.coefficient, slip.speed)
+            fx += p.gap[3, pair] * drag
+            fy -= p.gap[2, pair] * drag
+            torque += combined(slip.arm, pair, c, s, y[0], y[1]) * drag
+            out[FRICTION] += drag * rate
+    out[CONTACT_X], out[CONTACT_Y], out[CONTACT_M] = c * fx - s * fy, s * fx + c * fy, torque
+    if free is not None:
+        for j in range(3):
+            load[j] *= free[j]
+            out[CONTACT_X + j] *= free[j]
+    out[LOADS] = load[0] * (c * y[VX] - s * y[VY]) + load[1] * (s * y[VX] + c * y[VY]) + load[2] * om
+
+
+@kernel()
+def _balance(p, y, audit, start) -> None:
+    """Take energy and momentum from the state; note the largest imbalances."""
+    sums = audit.sums
+    m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
+    c, s = math.cos(y[THETA]), math.sin(y[THETA])
+    sums.energy[1] = 0.5 * m * (y[VX] * y[VX] + y[VY] * y[VY]) + 0.5 * inertia * y[OMEGA] * y[OMEGA]
+    sums.momentum[1, 0] = m * (c * y[VX] - s * y[VY])
+    sums.momentum[1, 1] = m * (s * y[VX] + c * y[VY])
+    sums.momentum[1, 2] = inertia * y[OMEGA]
+    if start:
+        sums.energy[0] = sums.energy[1]
+        for j in range(3):
+            sums.momentum[0, j] = sums.momentum[1, j]
+    gained = sums.work[LOADS] - sums.work[NORMAL] - sums.work[FRICTION]
+    sums.residual = max(sums.residual, abs(sums.energy[1] - sums.energy[0] - gained))
+    for j in range(3):
+        pushed = sums.work[LOAD_X + j] + sums.work[CONTACT_X + j]
+        change = sums.momentum[1, j] - sums.momentum[0, j]
+        sums.momentum_residual[j] = max(sums.momentum_residual[j], abs(change - pushed))
+
+
+@kernel()
+def audit_start(p, parts, state, y, t, audit) -> None:
+    """Take the state that a run starts from."""
+    _balance(p, y, audit, True)
+    _powers(p, parts, parts.offset, parts.free, parts.slip, state, y, t, audit.pairs, audit.before)
+
+
+@kernel()
+def _add(audit, powers, weight) -> None:
+    sums = audit.sums
+    for i in range(SIZE):
+        sums.work[i] += weight * powers[i]
+    sums.turnover += weight * (abs(powers[LOADS]) + abs(powers[NORMAL]) + abs(powers[FRICTION]))
+
+
+@kernel()
+def audit_step(p, parts, wear, state, w, audit) -> None:
+    """Add the step under way, before it is finished."""
+    clock, y = state.clock, audit.body
+    end, depth = clock[SIGMA], state.depth.copy()
+    for i in range(audit.nodes.size):
+        sigma = end * audit.nodes[i]
+        evaluate(state, w, sigma, y)
+        if wear is not None:
+            for pair in range(8):
+                grown = 0.0
+                for k in range(state.step[ORDER], 0, -1):
+                    grown = (grown + w.worn[k, pair]) * sigma
+                state.depth[pair] = depth[pair] + (grown if state.mode[pair] != 0 else 0.0)
+        t = clock[T0] + clock[ALPHA] * sigma + 0.5 * clock[BETA] * sigma * sigma
+        _powers(p, parts, parts.offset, parts.free, parts.slip, state, y, t, audit.pairs, audit.now)
+        _add(audit, audit.now, audit.weights[i] * end * (clock[ALPHA] + clock[BETA] * sigma))
+    for pair in range(8):
+        state.depth[pair] = depth[pair]
+    evaluate(state, w, end, y)
+    _balance(p, y, audit, False)
+
+
+@kernel()
+def audit_fixed(p, parts, state, y, t, dt, audit) -> None:
+    """Add a fixed step that ends at body coordinates y and time t."""
+    _powers(p, parts, parts.offset, parts.free, parts.slip, state, y, t, audit.pairs, audit.now)
+    _add(audit, audit.before, 0.5 * dt)
+    _add(audit, audit.now, 0.5 * dt)
+    for i in range(SIZE):
+        audit.before[i] = audit.now[i]
+    _balance(p, y, audit, False)

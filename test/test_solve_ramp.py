@@ -1,0 +1,61 @@
+"""Damping that is ramped in: its limits, both solvers, and laws that a user adds."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from scenes import pose_error, preset, wall_and_point
+
+from plow_twin import Contact, ContactLaw, SceneError, add_law, simulate
+from plow_twin.model.contact_laws import exact_damping_factor
+
+
+def delivered(contact: Contact, mass: float = 2.0) -> float:
+    result = simulate(wall_and_point(contact, speed=1.0, mass=mass), 0.1, tol=1e-11)
+    return float(result.v[-1, 1])
+
+
+def test_a_short_ramp_is_kelvin_voigt_and_a_long_one_elastic() -> None:
+    stiffness, mass = 1e6, 2.0
+    damping = 2.0 * 0.1 * math.sqrt(stiffness * mass)
+    errors = [
+        abs(delivered(Contact("ramped_damping", stiffness, damping=damping, ramp_m=ramp)) - 0.7441)
+        for ramp in (1e-4, 1e-5, 1e-6)
+    ]
+    assert errors[0] > errors[1] > errors[2] and errors[2] < 1e-4
+    assert delivered(Contact("ramped_damping", stiffness, damping=damping, ramp_m=10.0)) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("stiffness", "exponent"), [(2e7, 1.0), (1e8, 1.5), (5e8, 2.2), (1e9, 2.0)])
+def test_both_solvers_agree(stiffness: float, exponent: float) -> None:
+    contact = Contact("ramped_damping", stiffness, exponent, damping=6e4, ramp_m=1e-3)
+    scene = replace(preset("paper"), contact=contact)
+    events = simulate(scene, 2.0, output_dt=0.1, audit=True)
+    steps = simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=1e-5)
+    assert pose_error(scene, steps.q, events.q) < 1e-6
+    assert events.audit is not None and events.audit.relative_imbalance < 1e-12
+    assert 2 in events.events["mode_to"]
+
+
+def test_the_ramp_belongs_to_its_law() -> None:
+    for contact in (Contact("ramped_damping", 1e7, damping=1e4), Contact("hertz", 1e7, ramp_m=1e-3)):
+        with pytest.raises(SceneError, match=r"contact\.ramp_m"):
+            replace(preset("paper"), contact=contact)
+
+
+def test_a_law_of_one_s_own_works_like_the_others() -> None:
+    """One definition: scenes, checks and every solver take it."""
+    add_law("half_exact", ContactLaw("half exact", "of this test", lambda e: 0.5 * exact_damping_factor(e)))
+    stiffness, e = 1e8, 0.6
+    scene = replace(preset("paper"), contact=Contact("half_exact", stiffness, restitution=e))
+    assert delivered(scene.contact) > e + 0.1
+    damping = 0.5 * exact_damping_factor(e)
+    assert delivered(scene.contact) == pytest.approx(
+        delivered(Contact("hunt_crossley", stiffness, damping=damping)), abs=1e-9
+    )
+    steps = simulate(scene, 1.0, output_dt=0.1, method="rk4", dt=1e-5)
+    assert pose_error(scene, steps.q, simulate(scene, 1.0, output_dt=0.1).q) < 1e-3
+    with pytest.raises(ValueError, match="half_exact"):
+        add_law("half_exact", ContactLaw("again", ""))
