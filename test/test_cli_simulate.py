@@ -181,7 +181,24 @@ def test_info_lists_marks_and_versions() -> None:
     assert derived["fx1: amplitude of the moment"] == pytest.approx(-66240)
     environment = plow_twin("info", "--json")
     assert environment.returncode == 0, environment.stderr
-    assert json.loads(environment.stdout)["numpy"] == np.__version__
+    versions = json.loads(environment.stdout)
+    assert versions["numpy"] == np.__version__
+    assert {"mcap", "rerun-sdk", "matplotlib", "pyarrow", "Jinja2", "distributed", "rclpy"} <= versions.keys()
+
+
+def test_the_audit_closes_the_books() -> None:
+    done = plow_twin(*RUN, "--audit", "--json")
+    assert done.returncode == 0, done.stderr
+    books = json.loads(done.stdout)["audit"]
+    start, end = books["kinetic_j"]
+    stored = books["stored_j"][1] - books["stored_j"][0]
+    given = books["load_work_j"] + books["gravity_work_j"]
+    taken = books["dissipated_j"] + books["friction_work_j"] + stored
+    assert end - start == pytest.approx(given - taken, abs=1e-6 * books["turnover_j"])
+    assert books["dissipated_j"] > 1.0 and books["friction_work_j"] == 0.0
+    assert 0.0 <= books["relative_imbalance"] < 1e-6 and len(books["momentum_imbalance"]) == 3
+    shown = plow_twin(*RUN, "--audit").stdout
+    assert "books of energy" in shown and "largest imbalance" in shown
 
 
 def test_words_of_the_paper_scene_say_in_a_comment_what_they_rest_on() -> None:

@@ -163,6 +163,10 @@ def test_the_command_fits_a_recording_and_marks_what_it_fitted(
         (["--unknown", "contact.stiffness=1:2:lag"], "LOW:HIGH"),
         (["--unknown", "contact.stifness=1:2"], "nearest: contact.stiffness"),
         (["--target", "paper"], "expected one of them"),
+        (["--t-end", "1"], "--t-end: got it with --recording"),
+        (["--unknown", "contact.law=flores,hu_gou"], "contact.law: got 'hu_gou', expected one of"),
+        (["--set", "contact.law=hertz"], "contact.damping: got 0.43"),
+        (["--set", "contact.law=hertz", "--unknown", "contact.damping=0.1:1"], "contact.damping"),
     ):
         assert run([*arguments, *wrong, "--out", str(tmp_path / "none")]) == 2
         assert message in capsys.readouterr().err

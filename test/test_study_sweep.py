@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from scenes import preset
 
-from plow_twin import simulate
+from plow_twin import Friction, simulate
 from plow_twin.cli.app import run
 from plow_twin.errors import SceneError
 from plow_twin.scene_file import dump_scene
@@ -76,6 +76,8 @@ def test_parameters_are_set_and_refused_by_path() -> None:
     assert (changed.clearance.horizontal_m, changed.clearance.vertical_m) == (0.05, 0.04)
     assert "clearance.vertical_m" not in changed.marks and "head.mass_kg" in changed.marks
     assert with_parameters(scene, {"contact.restitution": 0.5}).contact.damping is None
+    assert scene.friction is None and with_parameters(scene, {"contact.stiffness": 1e7}).friction is None
+    assert with_parameters(scene, {"friction.coefficient": 0.2}).friction == Friction(0.2)
     for path in parameter_paths(scene):
         value = parameter_of(scene, path)
         if value is not None:
@@ -142,6 +144,7 @@ def test_failed_members_are_listed_and_other_questions_refused(
     for wrong, message in (
         (["--x", "contact.stiffness=1:2"], "PATH=LOW:HIGH:COUNT".replace("PATH", "contact.stiffness")),
         (["--statistic", "max.ccw.z"], "nearest: max.ccw"),
+        (["--x", "contact.law=flores,hu_gou"], "contact.law: got 'hu_gou', expected one of exact_restitution"),
         (["--y", "contact.stiffness=1:2:3"], "two different ones"),
         (["--dask", "tcp://127.0.0.1:1"], "expected the address of a scheduler"),
     ):

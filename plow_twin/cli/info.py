@@ -41,8 +41,9 @@ def _environment() -> dict[str, Any]:
     from plow_twin.record.header import build_fingerprint
 
     facts: dict[str, Any] = dict(build_fingerprint())
-    extras = ("scipy", "click", "rich", "PyYAML", "jsonschema", "mcap", "rosbags", "rerun-sdk", "rclpy")
-    for name in extras:
+    core = ("scipy", "click", "rich", "PyYAML", "jsonschema")
+    extras = ("mcap", "rosbags", "rerun-sdk", "matplotlib", "pyarrow", "Jinja2", "distributed", "rclpy")
+    for name in (*core, *extras):
         try:
             facts[name] = version(name)
         except PackageNotFoundError:

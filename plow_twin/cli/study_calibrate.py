@@ -59,12 +59,13 @@ def calibrate(
     """Fit unknowns of SCENE to published figures or to a recorded motion; writes fit.yaml and calibration.json."""
     from plow_twin.study.calibrate import Search
     from plow_twin.study.fit import write_fit
-    from plow_twin.study.unknowns import Space, parse_unknown
+    from plow_twin.study.unknowns import Space, check_usable, parse_unknown
 
     with usage_errors():
         model, objective, source, proposed = _objective(scene, settings, options)
         texts = _merged(proposed, unknowns)
         space = Space(tuple(parse_unknown(text, model) for text in texts))
+        check_usable(space, model)
     simplex = options["simplex"]
     if simplex is None:
         simplex = 0 if options["target"] is None else 200
@@ -90,6 +91,12 @@ def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
     return (*kept, *(text for text in given if text.partition("=")[2] != "fixed"))
 
 
+def _check_options(options: dict[str, Any]) -> None:
+    for name, value in (("--without", options["without"]), ("--t-end", options["t_end"])):
+        if value and options["target"] is None:
+            raise click.UsageError(f"{name}: got it with --recording, expected it with --target alone")
+
+
 def _objective(
     scene: str, settings: Sequence[str], options: dict[str, Any]
 ) -> tuple[Scene, Objective, str, tuple[str, ...]]:
@@ -103,6 +110,7 @@ def _objective(
     target, recording, workers = options["target"], options["recording"], options["workers"]
     if (target is None) == (recording is None):
         raise click.UsageError("got both or none of --target and --recording, expected one of them")
+    _check_options(options)
     model = study_scene(scene, settings)
     if recording is not None:
         poses = load_poses(recording)
@@ -173,7 +181,7 @@ def _show(fit: Fit, space: Space, out: Path) -> None:
     console.print(f"objective of each start: {objectives}", highlight=False, soft_wrap=True)
     sizes = ", ".join(f"{one.objective:.4g} ({one.members})" for one in fit.clusters[:8])
     console.print(
-        f"{len(fit.clusters)} clusters of near-optimal points, objective (points): {sizes}\n"
+        f"clusters of near-optimal points: {len(fit.clusters)}, objective (points): {sizes}\n"
         f"{found.runs} runs; {out / 'fit.yaml'}, {out / 'calibration.json'}",
         highlight=False,
         soft_wrap=True,
@@ -190,7 +198,7 @@ def _show_targets(console: Any, fit: Fit) -> None:
         shown.add_column(name, justify="right", min_width=len(name))
     for row in fit.targets:
         unit = unit_of(row.statistic)
-        scale = 1e-3 if unit == "N" else 1.0
-        got = " ".join(f"{scale * value:.4g}" for value in row.got)
-        shown.add_row(row.name, got, "kN" if unit == "N" else unit, f"{row.residual:.2f}", "yes" if row.met else "no")
+        shown_unit = {"N": "kN", "1": ""}.get(unit, unit)
+        got = " ".join(f"{1e-3 * value if unit == 'N' else value:.4g}" for value in row.got)
+        shown.add_row(row.name, got, shown_unit, f"{row.residual:.2f}", "yes" if row.met else "no")
     console.print(shown)

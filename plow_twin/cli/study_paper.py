@@ -20,7 +20,11 @@ _STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
 
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but single runs failed.")
 @click.option(
-    "--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="New or empty folder for the report."
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("out/paper"),
+    show_default=True,
+    help="New or empty folder for the report.",
 )
 @click.option("--t-end", metavar="T", type=POSITIVE, default=60.0, show_default=True, help="Length of the runs [s].")
 @click.option("--workers", type=click.IntRange(min=1), help="Threads; all cores by default.")

@@ -131,7 +131,7 @@ def _show(result: Table, out: Path) -> None:
 def _show_curve(console: Any, result: Table) -> bool:
     (axis,) = result.sweep.axes
     rows = _thinned(len(axis.values), MOST_ROWS)
-    heads = [f"{name} {_unit(name)}" for name in result.sweep.statistics]
+    heads = [f"{name} {_unit(name)}".strip() for name in result.sweep.statistics]
     shown = rich_table(f"{result.sweep.size} members, {result.sweep.t_end_s:g} s", axis.path, *heads)
     for row in rows:
         shown.add_row(
@@ -147,7 +147,8 @@ def _show_grids(console: Any, result: Table) -> bool:
     rows, columns = _thinned(len(first.values), MOST_ROWS), _thinned(len(second.values), room)
     for index, name in enumerate(result.sweep.statistics):
         heads = (_text(second.values[column]) for column in columns)
-        shown = rich_table(f"{name} in {_unit(name)}, across: {second.path}", first.path, *heads)
+        unit = f" in {_unit(name)}" if _unit(name) else ""
+        shown = rich_table(f"{name}{unit}, across: {second.path}", first.path, *heads)
         for row in rows:
             cells = (_cell(result, row * len(second.values) + column, index) for column in columns)
             shown.add_row(_text(first.values[row]), *cells)
@@ -180,7 +181,7 @@ def _unit(name: str) -> str:
     from plow_twin.study.statistics import unit_of
 
     unit = unit_of(name)
-    return f"k{unit}" if unit.startswith("N") else unit
+    return f"k{unit}" if unit.startswith("N") else unit.replace("1", "")
 
 
 def _cell(result: Table, member: int, column: int) -> str:

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from plow_twin.errors import SceneError
 from plow_twin.model.geometry import half_diagonal, length_scale
 from plow_twin.model.scene import Scene
-from plow_twin.study.members import Members, run_members
+from plow_twin.study.members import run_members
 from plow_twin.study.parameters import Value, with_parameters
 from plow_twin.study.pose_recording import PoseRecording
-from plow_twin.study.statistics import statistic, statistics_of_scene
+from plow_twin.study.statistics import statistics_of
 from plow_twin.study.targets import FAILED_RESIDUAL, TargetSet
 
 Array = NDArray[np.float64]
@@ -89,8 +89,7 @@ class TargetObjective:
             return
         members = run_members(scenes, self.targets.t_end_s, self.targets.tol, workers=self.workers)
         self.runs += len(scenes)
-        statistics = _statistics(members, scenes, paths)
-        statistics[members.failed] = np.nan
+        statistics = statistics_of(members, scenes, paths)
         for place, numbers in zip(places, statistics, strict=True):
             table[place] = numbers
 
@@ -104,20 +103,6 @@ class TargetObjective:
             r = target.residual(np.where(bad[:, None, None], 1.0, part))
             rows[:, index] = np.sqrt(target.weight) * np.where(bad, missing, r)
         return rows
-
-
-def _statistics(members: Members, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
-    """Return the statistics of runs whose scenes may letter their corners differently, shape (m, paths)."""
-    result = np.zeros((len(scenes), len(paths)))
-    groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
-    for index, scene in enumerate(scenes):
-        groups.setdefault(tuple(sorted(scene.frame.labels.items())), []).append(index)
-    for rows in groups.values():
-        part = members.at(np.array(rows))
-        known = statistics_of_scene(scenes[rows[0]])
-        for column, path in enumerate(paths):
-            result[rows, column] = (known.get(path) or statistic(scenes[rows[0]], path))(part)
-    return result
 
 
 @dataclass

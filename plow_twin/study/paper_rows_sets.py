@@ -43,7 +43,7 @@ def _occurs(moment: Moment, timeline: Sequence[Hold]) -> Iterator[Row]:
     text = "never"
     if figures:
         longest, total = 1e3 * figures.longest_s, 1e3 * figures.total_s
-        text = f"longest hold {longest:.2f} ms, {total:.3g} ms in all ({figures.share:.2%})"
+        text = f"longest hold {longest:.2f} ms, {total:.1f} ms in all ({figures.share:.2%})"
     yield Row(
         _SETS, _FIGURES[moment.sense], f"{SENSE_NAMES[moment.sense]}: {braces(moment.corners)} occurs", "occurs", text,
         Verdict.of(figures is not None and figures.count > 0),

@@ -8,7 +8,8 @@ Loads are called by name: `loads.fx1.phase_rad`. Four paths are not fields but s
     clearance.scale         factor of both clearances: 1 total, 2 when a published clearance is meant per side
 
 `frame.labels` takes one of eight words, `bottom_right_ccw`: a at the bottom right, then b, c, d counter-clockwise. The
-four act on whatever the other paths have set. `contact.damping` takes the place of a restitution and the reverse.
+four act on whatever the other paths have set. `contact.damping` takes the place of a restitution and the reverse. A
+scene without friction has the paths of `friction` too: setting one switches it on.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from plow_twin.errors import PlowTwinError, Problem, SceneError
-from plow_twin.model.scene import Scene, Table
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.scene import Friction, Head, Scene, Table
 
 #: Value of a parameter: numbers, or the words of `contact.law` and `head.rotation`.
 Value = float | str
@@ -29,8 +31,10 @@ Value = float | str
 #: Paths whose values are words.
 WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
-_PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear")
+_PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
+#: What a study starts from where a scene has no friction: without effect.
+_NO_FRICTION: Final = Friction(0.0)
 _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
 
@@ -42,7 +46,7 @@ def parameter_paths(scene: Scene) -> tuple[str, ...]:
     """Return every path that a study can set in the scene."""
     paths: list[str] = []
     for name in _PARTS:
-        part = getattr(scene, name)
+        part = _part(scene, name)
         paths += [] if part is None else _paths_of(part, name)
     paths += ["clearance.scale", "frame.labels"]
     for load in scene.loads:
@@ -50,6 +54,11 @@ def parameter_paths(scene: Scene) -> tuple[str, ...]:
             paths += _paths_of(load, f"loads.{load.name}")
         paths += [f"loads.{load.name}.{name}" for name in _DERIVED]
     return tuple(paths)
+
+
+def _part(scene: Scene, name: str) -> Any:
+    part = getattr(scene, name)
+    return _NO_FRICTION if part is None and name == "friction" else part
 
 
 def _paths_of(part: Any, path: str) -> list[str]:
@@ -87,7 +96,7 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
     part, field_name = path.rsplit(".", 1)
     if path == "clearance.scale" or field_name == "scale":
         return 1.0
-    owner = _load(scene, part) if part.startswith("loads.") else getattr(scene, part)
+    owner = _load(scene, part) if part.startswith("loads.") else _part(scene, part)
     if field_name in ("sign", "arm_sign"):
         vector = _vector(owner, field_name)
         return -1.0 if next((x for x in vector if x != 0.0), 1.0) < 0.0 else 1.0
@@ -127,7 +136,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
             name = owner.removeprefix("loads.")
             loads[name] = _load_with(loads[name], field_name, value)
         else:
-            parts[owner] = _with(parts[owner], field_name, value)
+            parts[owner] = _with(parts[owner] or _NO_FRICTION, field_name, value)
     marks = {key: mark for key, mark in scene.marks.items() if not _is_set(key, values, scene)}
     return replace(scene, **parts, loads=tuple(loads.values()), marks=MappingProxyType(marks))
 
@@ -140,6 +149,21 @@ def label_words() -> dict[str, dict[str, str]]:
             order = corners[first:] + corners[:first]
             words[f"{order[0]}_{turn}"] = dict(zip("abcd", order, strict=True))
     return words
+
+
+def check_word(path: str, word: str) -> str:
+    """Return the word if it can stand at a path of `WORDS`.
+
+    Raises
+    ------
+    StudyError
+        With the words that can.
+    """
+    (rotation,) = (spec for spec in fields(Head) if spec.name == "rotation")
+    words = {"contact.law": LAWS, "head.rotation": rotation.metadata["choices"], "frame.labels": label_words()}[path]
+    if word not in words:
+        raise StudyError(f"{path}: got {word!r}, expected one of {', '.join(words)}")
+    return word
 
 
 def is_usable(scene: Scene, values: Mapping[str, Value]) -> bool:
@@ -249,7 +273,7 @@ def parse_settings(scene: Scene, texts: Sequence[str]) -> dict[str, Value]:
         path, _, rest = text.partition("=")
         check_path(scene, path)
         try:
-            values[path] = rest if path in WORDS else float(rest)
+            values[path] = check_word(path, rest) if path in WORDS else float(rest)
         except ValueError:
             raise StudyError(f"{path}: got {rest!r}, expected a number") from None
     return values

@@ -15,7 +15,7 @@ means follow from those sums. Corners by the scene's letters or by their names; 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from difflib import get_close_matches
 from functools import partial
 from itertools import combinations
@@ -86,6 +86,19 @@ UNITS: Final[Mapping[str, str]] = {
     "max": "N", "mean_in_contact": "N", "mean_over_time": "N", "impulse": "N s", "time_in_contact": "s", "makes": "1",
     "wear_depth": "m", "contact_sets": "1", "contact_set_time": "s", "contact_points": "1", "events": "1", "steps": "1",
 }  # fmt: skip
+
+
+def statistics_of(members: Members, scenes: Sequence[Scene], paths: Sequence[str]) -> Array:
+    """Return the statistics of runs, shape (m, paths), NaN where one failed; each scene may letter its own corners."""
+    result = np.full((len(scenes), len(paths)), np.nan)
+    groups: dict[tuple[tuple[str, str], ...], list[int]] = {}
+    for index in np.flatnonzero(~members.failed).tolist():
+        groups.setdefault(tuple(sorted(scenes[index].frame.labels.items())), []).append(index)
+    for rows in groups.values():
+        part, known = members.at(np.array(rows)), statistics_of_scene(scenes[rows[0]])
+        for column, path in enumerate(paths):
+            result[rows, column] = (known.get(path) or statistic(scenes[rows[0]], path))(part)
+    return result
 
 
 def statistics_of_scene(scene: Scene) -> Mapping[str, Statistic]:

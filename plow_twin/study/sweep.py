@@ -16,8 +16,8 @@ from plow_twin.model.scene import Scene
 from plow_twin.scene_file import loads_scene
 from plow_twin.solve.layout import Status
 from plow_twin.study.members import run_members
-from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, with_parameters
-from plow_twin.study.statistics import statistic
+from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, check_word, with_parameters
+from plow_twin.study.statistics import statistic, statistics_of
 
 Array = NDArray[np.float64]
 
@@ -46,9 +46,9 @@ def parse_axis(text: str, scene: Scene) -> Axis:
     check_path(scene, path)
     expected = f"{path}=LOW:HIGH:COUNT[:log] or {path}=VALUE,VALUE.."
     if path in WORDS:
-        words = tuple(word.strip() for word in rest.split(",") if word.strip())
-        if not words:
-            raise StudyError(f"axis: got {text!r}, expected {path}=WORD,WORD..")
+        words = tuple(check_word(path, word.strip()) for word in rest.split(",") if word.strip())
+        if not words or len(set(words)) < len(words):
+            raise StudyError(f"axis: got {text!r}, expected {path}=WORD,WORD.., each once")
         return Axis(path, words)
     try:
         if ":" not in rest:
@@ -171,14 +171,7 @@ def run_members_of(
         return table
     result = run_members(scenes, sweep.t_end_s, sweep.tol, workers=workers, on_done=on_done)
     table[rows, 0] = result.motions.status
-    sound = ~result.failed
-    labels = [tuple(sorted(one.frame.labels.items())) for one in scenes]
-    for labelling in set(labels):
-        mine = np.array([index for index, other in enumerate(labels) if other == labelling])
-        part = result.at(mine)
-        for column, name in enumerate(sweep.statistics):
-            numbers = np.where(sound[mine], statistic(scenes[mine[0]], name)(part), np.nan)
-            table[np.array(rows)[mine], 1 + column] = numbers
+    table[rows, 1:] = statistics_of(result, scenes, sweep.statistics)
     return table
 
 

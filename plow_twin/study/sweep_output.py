@@ -63,7 +63,8 @@ def draw(table: Table, path: Path) -> None:
             _curve(axes, table, index)
         else:
             _heat_map(axes, table, index)
-        axes.set_title(f"{name} [{_scaled(table, index)[1]}]", fontsize=10)
+        unit = _scaled(table, index)[1]
+        axes.set_title(name if unit == "1" else f"{name} [{unit}]", fontsize=10)
     figure.savefig(path, dpi=150)
 
 
@@ -78,11 +79,17 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
     (axis,) = table.sweep.axes
     numbers, unit = _scaled(table, index)
     places = _places(axis)
-    axes.plot(places, numbers, marker="o", markersize=3)
+    # between words there is nothing
+    style = "none" if isinstance(axis.values[0], str) else "-"
+    axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
     for member in table.failed:
-        axes.axvline(places[member], color="tab:red", linestyle=":", label="failed")
+        axes.axvline(
+            places[member], color="tab:red", linestyle=":", label="failed" if member == table.failed[0] else ""
+        )
+    if table.failed:
+        axes.legend(fontsize=8)
     _label(axes, axis, "x")
-    axes.set_ylabel(unit)
+    axes.set_ylabel("" if unit == "1" else unit)
     axes.grid(alpha=0.3)
 
 
@@ -95,7 +102,8 @@ def _heat_map(axes: Axes, table: Table, index: int) -> None:
         _label(axes, axis, which)
     if table.failed:
         x, y = np.unravel_index(table.failed, table.sweep.shape)
-        axes.plot(_places(first)[x], _places(second)[y], "x", color="tab:red")
+        axes.plot(_places(first)[x], _places(second)[y], "x", color="tab:red", label="failed")
+        axes.legend(fontsize=8)
     figure = axes.figure
     figure.colorbar(mesh, ax=axes)
 
@@ -124,3 +132,5 @@ def _label(axes: Axes, axis: Axis, which: str) -> None:
         getattr(axes, f"set_{which}scale")("log")
     if isinstance(axis.values[0], str):
         getattr(axes, f"set_{which}ticks")(range(len(axis.values)), axis.values)
+        if which == "x" and len(axis.values) > 3:
+            axes.tick_params("x", labelsize=8, labelrotation=40)

@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.scene import Scene
-from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, parameter_of
+from plow_twin.study.parameters import (
+    WORDS,
+    StudyError,
+    Value,
+    check_path,
+    check_word,
+    is_usable,
+    parameter_of,
+    with_parameters,
+)
 
 Array = NDArray[np.float64]
 
@@ -62,12 +71,13 @@ def parse_unknown(text: str, scene: Scene) -> Unknown:
         return Unknown(path, choices=(1.0, -1.0))
     if ":" not in rest:
         items = [item.strip() for item in rest.split(",") if item.strip()]
-        choices: tuple[Value, ...] = tuple(items) if path in WORDS else tuple(_number(item, path) for item in items)
+        choices: tuple[Value, ...] = tuple((check_word if path in WORDS else _number)(path, item) for item in items)
         if len(set(choices)) < 2:
-            raise StudyError(f"unknown {path}: got {rest!r}, expected at least two choices")
+            either = "" if path in WORDS else "LOW:HIGH[:log] or "
+            raise StudyError(f"unknown {path}: got {rest!r}, expected {either}at least two choices")
         return Unknown(path, choices=choices)
     low, high, *scale = rest.split(":")
-    bounds = _number(low, path), _number(high, path)
+    bounds = _number(path, low), _number(path, high)
     if not bounds[0] < bounds[1] or scale not in ([], ["log"], ["lin"]) or (scale == ["log"] and bounds[0] <= 0.0):
         raise StudyError(
             f"unknown {path}: got {rest!r}, expected LOW:HIGH or LOW:HIGH:log with LOW < HIGH (log: LOW > 0)"
@@ -75,7 +85,7 @@ def parse_unknown(text: str, scene: Scene) -> Unknown:
     return Unknown(path, *bounds, log=scale == ["log"])
 
 
-def _number(text: str, path: str) -> float:
+def _number(path: str, text: str) -> float:
     try:
         number = float(text)
     except ValueError:
@@ -131,6 +141,13 @@ class Space:
         return np.array(
             [u.place(u.value(float(x))) if u.choices else float(x) for u, x in zip(choices, point, strict=True)]
         )
+
+
+def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
+    """Raise what is wrong with the scene at the first of some random points, `SceneError`, when none can be run."""
+    points = np.random.default_rng(0).random((trials, space.size))
+    if not any(is_usable(scene, values) for values in space.values_of(points)):
+        with_parameters(scene, space.values(points[0]))
 
 
 def _inside(unknown: Unknown, value: Value | None) -> bool:
