@@ -28,19 +28,28 @@ ASKED = tuple(round(0.01 * k, 2) for k in range(101))
 SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 #: Damping ratios C / (2 sqrt(K m)) of the Kelvin-Voigt table.
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
+#: Ramp lengths of the ramped law, over the depth v sqrt(m/K) of the undamped impact.
+RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
 #: A law is called valid where it delivers what it was asked for within this share.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
+#: Stiffness [N/m] of the laws that add C d' to a linear spring.
+LINEAR_STIFFNESS = 1e6
 
 
 @dataclass(frozen=True)
 class Row:
-    """One free impact; `asked` is a restitution, or a damping ratio for Kelvin-Voigt."""
+    """One free impact.
+
+    `asked` is a restitution, or a damping ratio for laws that add C d'; `ramp` is the length of the ramped law's ramp
+    over the depth of the undamped impact.
+    """
 
     law: str
     asked: float
     delivered: float
+    ramp: float = 0.0
 
 
 def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_S) -> float:
@@ -62,18 +71,25 @@ def free_impact(contact: Contact, mass: float = MASS_KG, speed: float = SPEED_M_
     return float(result.v[-1, 1]) / speed
 
 
-def measure(law: str, asked: Iterable[float]) -> list[Row]:
-    """Measure one law: by restitution where it has that form, Kelvin-Voigt by damping ratio, Hertz as it is."""
+def damped(ratio: float, ramp: float, stiffness: float, mass: float, speed: float) -> Contact:
+    """Return Kelvin-Voigt of a damping ratio, ramped in over `ramp` undamped depths unless that is zero."""
+    damping = 2.0 * ratio * math.sqrt(stiffness * mass)
+    if ramp == 0.0:
+        return Contact("kelvin_voigt", stiffness, damping=damping)
+    return Contact("ramped_damping", stiffness, damping=damping, ramp_m=ramp * speed * math.sqrt(mass / stiffness))
+
+
+def measure(law: str, asked: Iterable[float], ramp: float = 0.0) -> list[Row]:
+    """Measure one law: by restitution where it has that form, with C d' by damping ratio, Hertz as it is."""
     rows = []
     for value in asked:
         if LAWS[law].takes_restitution:
             contact = Contact(law, STIFFNESS, LAWS[law].exponent or EXPONENT, restitution=value)
         elif LAWS[law].additive:
-            stiffness = 1e6
-            contact = Contact(law, stiffness, damping=2.0 * value * math.sqrt(stiffness * MASS_KG))
+            contact = damped(value, ramp, LINEAR_STIFFNESS, MASS_KG, SPEED_M_S)
         else:
             contact = Contact(law, STIFFNESS, EXPONENT)
-        rows.append(Row(law, value, free_impact(contact)))
+        rows.append(Row(law, value, free_impact(contact), ramp))
     return rows
 
 
@@ -122,6 +138,16 @@ def ratio_table(rows: Sequence[Row]) -> list[str]:
     ]
 
 
+def ramp_table(rows: Sequence[Row]) -> list[str]:
+    """Return the Markdown table of the ramped law: damping ratio across, length of the ramp down."""
+    ratios = [row.asked for row in rows if row.law == "kelvin_voigt"]
+    lines = [f"| ramp over v sqrt(m/K) | {' | '.join(f'{z:g}' for z in ratios)} |", "|---|" + "---|" * len(ratios)]
+    for ramp in RAMPS:
+        found = {row.asked: row.delivered for row in rows if row.law == "ramped_damping" and row.ramp == ramp}
+        lines.append(f"| {ramp:g} | " + " | ".join(f"{found[z]:.4f}" for z in ratios) + " |")
+    return lines
+
+
 def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw asked against delivered with the line on which both are equal."""
     import matplotlib
@@ -156,9 +182,9 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     """Write one line for each impact."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["law", "asked", "delivered"])
+        writer.writerow(["law", "asked", "ramp", "delivered"])
         # nine digits: what the solver holds on every machine
-        writer.writerows([row.law, f"{row.asked:g}", f"{row.delivered:.9f}"] for row in rows)
+        writer.writerows([row.law, f"{row.asked:g}", f"{row.ramp:g}", f"{row.delivered:.9f}"] for row in rows)
 
 
 def write_page(rows: Sequence[Row], path: Path) -> None:
@@ -166,7 +192,8 @@ def write_page(rows: Sequence[Row], path: Path) -> None:
     before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
     parts = ["## Delivered", "", *page_table(rows), "", "## Validity", "", *laws_table(rows), ""]
-    parts += ["## Kelvin-Voigt by damping ratio", "", *ratio_table(rows)]
+    parts += ["## Kelvin-Voigt by damping ratio", "", *ratio_table(rows), ""]
+    parts += ["## Ramped damping by damping ratio and ramp", "", *ramp_table(rows)]
     path.write_text("\n".join([before + BEGIN, "", *parts, "", END + after]), encoding="utf-8")
 
 
@@ -174,6 +201,7 @@ def main() -> None:
     """Measure all, write all."""
     rows = [row for law in restitution_laws() for row in measure(law, ASKED)]
     rows += measure("kelvin_voigt", RATIOS) + measure("hertz", (1.0,))
+    rows += [row for ramp in RAMPS for row in measure("ramped_damping", RATIOS, ramp)]
     write_csv(rows, TABLE)
     draw(rows, PICTURE)
     write_page(rows, PAGE)

@@ -13,6 +13,7 @@ from types import ModuleType
 
 import pytest
 from scenes import ROOT
+from scipy.integrate import solve_ivp
 
 from plow_twin import Contact
 from plow_twin.model.contact_laws import LAWS, exact_damping_factor
@@ -90,19 +91,45 @@ def test_kelvin_voigt_is_the_closed_form() -> None:
         assert restitution.measure("kelvin_voigt", [z])[0].delivered == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.parametrize(("z", "ramp"), [(0.1, 0.1), (0.3, 1.0), (2.0, 0.3)])
+def test_ramped_damping_is_that_of_another_integrator(z: float, ramp: float) -> None:
+    """u'' = -max(0, u + 2 z s u'), s the ramp: the law scaled by depth v sqrt(m/K) and time sqrt(m/K), with SciPy."""
+
+    def rates(_t: float, state: list[float]) -> tuple[float, float]:
+        u, rate = state
+        share = min(max(u / ramp, 0.0), 1.0)
+        # clipped on the way out, it pushes again where the ramp has let the damping go
+        return rate, -max(0.0, u + 2.0 * z * share * share * (3.0 - 2.0 * share) * rate)
+
+    def parted(_t: float, state: list[float]) -> float:
+        return state[0]
+
+    parted.terminal, parted.direction = True, -1.0  # type: ignore[attr-defined]
+    free = solve_ivp(rates, (0.0, 500.0), (1e-14, 1.0), events=parted, rtol=1e-12, atol=1e-14, max_step=0.02)
+    expected = -float(free.y[1, -1])
+    for stiffness, mass, speed in ((1e6, 2.0, 1.0), (3e8, 50.0, 0.3)):
+        contact = restitution.damped(z, ramp, stiffness, mass, speed)
+        assert restitution.free_impact(contact, mass, speed) == pytest.approx(expected, abs=1e-7)
+
+
 def test_the_page_is_what_the_solver_makes() -> None:
     page = restitution.PAGE.read_text(encoding="utf-8")
     with restitution.TABLE.open(newline="", encoding="utf-8") as file:
         rows = [
-            restitution.Row(row["law"], float(row["asked"]), float(row["delivered"])) for row in csv.DictReader(file)
+            restitution.Row(row["law"], float(row["asked"]), float(row["delivered"]), float(row["ramp"]))
+            for row in csv.DictReader(file)
         ]
-    assert {row.law for row in rows} >= set(restitution.restitution_laws()) | {"kelvin_voigt", "hertz"}
-    for line in (*restitution.page_table(rows), *restitution.laws_table(rows), *restitution.ratio_table(rows)):
+    assert {row.law for row in rows} == set(LAWS)
+    tables = (restitution.page_table, restitution.laws_table, restitution.ratio_table, restitution.ramp_table)
+    for line in (line for table in tables for line in table(rows)):
         assert f"{line}\n" in page, line
     for law in ("zhiying_qishao", "kelvin_voigt", "hertz"):
         stored = {row.asked: row.delivered for row in rows if row.law == law}
         for again in restitution.measure(law, list(stored)[::10]):
             assert stored[again.asked] == pytest.approx(again.delivered, abs=2e-9)
+    for row in [row for row in rows if row.law == "ramped_damping"][::9]:
+        (again,) = restitution.measure(row.law, [row.asked], row.ramp)
+        assert row.delivered == pytest.approx(again.delivered, abs=2e-9)
 
 
 def test_validity_is_where_asked_and_delivered_are_within_five_percent() -> None:

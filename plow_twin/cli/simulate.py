@@ -169,7 +169,7 @@ def _audit_table(books: Books) -> Table:
         ("- stored in contacts at the end, more than at the start", -stored),
         ("= kinetic energy gained", kinetic),
     ):
-        rows.add_row(name, f"{value:.6g}")
+        rows.add_row(name, f"{value + 0.0:.6g}")  # no -0
     rows.add_row("largest imbalance on the way", f"{books.imbalance_j:.3g}")
     rows.add_row("the same over the turnover", f"{books.relative_imbalance:.1e}")
     rows.add_row(
