@@ -47,9 +47,10 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
-    #: what the section is about: members beyond the listed error, times real time, error in tolerances
+    #: what the section is about: members beyond the listed error, times real time, share of a core, error in
+    #: tolerances, ratio of times, kernels compiled
     value: float | None = None
-    #: growth of a small displacement at t = 0 (random scenes)
+    #: growth of a small displacement at t = 0 (random scenes, ensemble)
     amplification: float | None = None
     status: str = "ok"
 
@@ -66,32 +67,56 @@ class Case:
 
 #: A case stops being repeated once its runs have taken this long together.
 TIME_PER_CASE_S = 2.0
+#: Below it the first run is a warm-up that does not count; above it neither start nor cache matters.
+WARM_UP_BELOW_S = 0.05
+#: Runs as short as this are repeated whether or not anything depends on them.
+SHORT_S = 0.02
+Choose = Callable[[Sequence[Row]], set[int]]
 
 
-def measure(cases: Sequence[Case], repeats: int, advance: Callable[[str], None]) -> list[Row]:
-    """Run all cases in turn, `repeats` rounds, so that a change of the machine's speed meets all of them alike."""
-    ready: list[tuple[Case, Callable[[], Sample]]] = []
-    for case in cases:
+def measure(
+    cases: Sequence[Case], repeats: int, advance: Callable[[str], None], choose: Choose | None = None
+) -> list[Row]:
+    """Run every case once, then those that matter `repeats` times in turn.
+
+    Taking turns lets a change of the machine's speed meet all of them alike. `choose` returns the indices of the cases
+    on which a figure depends; without it all matter.
+    """
+    rows = [case.row for case in cases]
+    ready: dict[int, Callable[[], Sample]] = {}
+    for index, case in enumerate(cases):
         advance(f"{case.row.solver} {case.row.setting}")
-        try:
-            run = case.prepare()
+        run = _first_run(case)
+        if run is not None:
+            ready[index] = run
+    chosen = set(ready) if choose is None else choose(rows)
+    for _ in range(repeats - 1):
+        for index, run in ready.items():
+            samples = cases[index].samples
+            spent = sum(sample.wall_s for sample in samples)
+            if spent < TIME_PER_CASE_S and (index in chosen or samples[0].wall_s < SHORT_S):
+                advance(f"{rows[index].solver} {rows[index].setting} again")
+                samples.append(run())
+    for index in ready:
+        _summarise(cases[index])
+    return rows
+
+
+def _first_run(case: Case) -> Callable[[], Sample] | None:
+    try:
+        run = case.prepare()
+        first = run()
+        if first.wall_s < WARM_UP_BELOW_S:
             first = run()
-        except Exception as problem:
-            case.row.status = (
-                f"not run: {problem}" if isinstance(problem, NotInstalled | ImportError) else f"failed: {problem}"
-            )
-            continue
-        if case.error is not None and first.q is not None:
-            case.row.error = case.error(first.q)
-        case.samples = [first] if first.wall_s > TIME_PER_CASE_S else []
-        ready.append((case, run))
-    for _ in range(repeats):
-        for case, run in ready:
-            if sum(sample.wall_s for sample in case.samples) < TIME_PER_CASE_S:
-                case.samples.append(run())
-    for case, _ in ready:
-        _summarise(case)
-    return [case.row for case in cases]
+    except Exception as problem:
+        missing = isinstance(problem, NotInstalled | ImportError)
+        case.row.status = f"{'not run' if missing else 'failed'}: {problem}"
+        return None
+    if case.error is not None and first.q is not None:
+        case.row.error = case.error(first.q)
+    case.samples = [first]
+    _summarise(case)
+    return run
 
 
 def _summarise(case: Case) -> None:

@@ -40,12 +40,15 @@ static inline double pushed(const scene *s, int pair, double d, double v)
     return f > 0 ? f : 0;
 }
 
-static inline void gaps(const scene *s, const double *y, double *d, double *v)
+/* penetration and rate of each pair, and the corners in head axes */
+static inline void gaps(const scene *s, const double *y, double c, double si, double *d, double *v, double *arm)
 {
-    double c = cos(y[2]), si = sin(y[2]), X = c * y[0] + si * y[1], Y = c * y[1] - si * y[0];
+    double X = c * y[0] + si * y[1], Y = c * y[1] - si * y[0];
     double VX = c * y[3] + si * y[4], VY = c * y[4] - si * y[3];
     for (int k = 0; k < 4; k++) {
         double px = c * SX[k] * s->w / 2 + si * SY[k] * s->h / 2 - X, py = -si * SX[k] * s->w / 2 + c * SY[k] * s->h / 2 - Y;
+        arm[2 * k] = px;
+        arm[2 * k + 1] = py;
         d[2 * k] = SY[k] * py - (s->h + s->gy) / 2;
         v[2 * k] = SY[k] * (-VY - y[5] * px);
         d[2 * k + 1] = SX[k] * px - (s->w + s->gx) / 2;
@@ -58,14 +61,13 @@ static int rhs(double t, N_Vector yy, N_Vector out, void *data)
     const scene *s = data;
     const double *y = N_VGetArrayPointer_Serial(yy);
     double *f = N_VGetArrayPointer_Serial(out), c = cos(y[2]), si = sin(y[2]), fx = 0, fy = 0, torque = 0;
-    double X = c * y[0] + si * y[1], Y = c * y[1] - si * y[0], VX = c * y[3] + si * y[4], VY = c * y[4] - si * y[3];
+    double d[8], v[8], arm[8];
+    gaps(s, y, c, si, d, v, arm);
     for (int k = 0; k < 4; k++) {
-        double px = c * SX[k] * s->w / 2 + si * SY[k] * s->h / 2 - X, py = -si * SX[k] * s->w / 2 + c * SY[k] * s->h / 2 - Y;
-        double a = pushed(s, 2 * k, SY[k] * py - (s->h + s->gy) / 2, SY[k] * (-VY - y[5] * px)) * SY[k];
-        double b = pushed(s, 2 * k + 1, SX[k] * px - (s->w + s->gx) / 2, SX[k] * (-VX + y[5] * py)) * SX[k];
+        double a = pushed(s, 2 * k, d[2 * k], v[2 * k]) * SY[k], b = pushed(s, 2 * k + 1, d[2 * k + 1], v[2 * k + 1]) * SX[k];
         fy += a;
         fx += b;
-        torque += px * a - py * b;
+        torque += arm[2 * k] * a - arm[2 * k + 1] * b;
     }
     double S = sin(s->omega * t);
     f[0] = y[3];
@@ -82,8 +84,9 @@ static int guards(double t, N_Vector yy, double *g, void *data)
 {
     (void)t;
     const scene *s = data;
-    double d[8], v[8];
-    gaps(s, N_VGetArrayPointer_Serial(yy), d, v);
+    const double *y = N_VGetArrayPointer_Serial(yy);
+    double d[8], v[8], arm[8];
+    gaps(s, y, cos(y[2]), sin(y[2]), d, v, arm);
     for (int i = 0; i < 8; i++) {
         g[i] = d[i];
         g[8 + i] = s->mode[i] == 0 ? 1 : s->hc ? 1 + s->C * v[i] : d[i] + s->C / s->K * v[i];
@@ -106,6 +109,18 @@ static double seconds(void)
     struct timespec t;
     clock_gettime(CLOCK_MONOTONIC, &t);
     return t.tv_sec + 1e-9 * t.tv_nsec;
+}
+
+/* adds what CVODE has counted since its last start: steps, evaluations */
+static void count(void *mem, int adams, long *counts)
+{
+    long steps = 0, calls = 0, jacobian = 0;
+    CVodeGetNumSteps(mem, &steps);
+    CVodeGetNumRhsEvals(mem, &calls);
+    if (!adams)
+        CVodeGetNumLinRhsEvals(mem, &jacobian);
+    counts[0] += steps;
+    counts[1] += calls + jacobian;
 }
 
 static int run(scene *s, int adams, double rtol, double end, double dt, double *rows, long *counts)
@@ -140,17 +155,11 @@ static int run(scene *s, int adams, double rtol, double end, double dt, double *
     memset(counts, 0, 3 * sizeof *counts);
     memcpy(rows, N_VGetArrayPointer_Serial(y), 3 * sizeof(double));
     for (long i = 1; i <= n && code >= 0;) {
-        long steps = 0, calls = 0, jacobian = 0;
         code = CVode(mem, i * dt, y, &t, CV_NORMAL);
         if (code == CV_ROOT_RETURN) {
             int found[16];
             CVodeGetRootInfo(mem, found);
-            CVodeGetNumSteps(mem, &steps);
-            CVodeGetNumRhsEvals(mem, &calls);
-            if (!adams)
-                CVodeGetNumLinRhsEvals(mem, &jacobian);
-            counts[0] += steps;
-            counts[1] += calls + jacobian;
+            count(mem, adams, counts);
             counts[2]++;
             switch_modes(s, found);
             code = CVodeReInit(mem, t, y);
@@ -158,13 +167,7 @@ static int run(scene *s, int adams, double rtol, double end, double dt, double *
         }
         memcpy(rows + 3 * i++, N_VGetArrayPointer_Serial(y), 3 * sizeof(double));
     }
-    long steps = 0, calls = 0, jacobian = 0;
-    CVodeGetNumSteps(mem, &steps);
-    CVodeGetNumRhsEvals(mem, &calls);
-    if (!adams)
-        CVodeGetNumLinRhsEvals(mem, &jacobian);
-    counts[0] += steps;
-    counts[1] += calls + jacobian;
+    count(mem, adams, counts);
     CVodeFree(&mem);
     if (fixed)
         SUNNonlinSolFree(fixed);

@@ -14,15 +14,15 @@ from lean import rhs_into
 _ATOL = np.array([1e-3, 1e-3, 1e-3, 1e-1, 1e-1, 1e-1])
 
 
+Rhs = Callable[[float, Array], Array]
+
+
 def _grid(output_dt: float) -> Array:
     return np.arange(round(T_END / output_dt) + 1) * output_dt
 
 
-def prepare_solve_ivp(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare `scipy.integrate.solve_ivp`."""
-    from scipy.integrate import solve_ivp
-
-    grid = _grid(output_dt)
+def _rhs(p: Array) -> Rhs:
+    """Return the rate of the state, compiled."""
 
     def rhs(t: float, y: Array) -> Array:
         out = np.empty(6)
@@ -30,9 +30,18 @@ def prepare_solve_ivp(p: Array, method: str, rtol: float, output_dt: float) -> C
         return out
 
     rhs(0.0, np.zeros(6))
+    return rhs
+
+
+def prepare_solve_ivp(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
+    """Prepare `scipy.integrate.solve_ivp`."""
+    from scipy.integrate import solve_ivp
+
+    solve = partial(
+        solve_ivp, _rhs(p), (0.0, T_END), np.zeros(6), method, _grid(output_dt), rtol=rtol, atol=rtol * _ATOL
+    )
 
     def run() -> Sample:
-        solve = partial(solve_ivp, rhs, (0.0, T_END), np.zeros(6), method, grid, rtol=rtol, atol=rtol * _ATOL)
         wall, result = timed(solve)
         if not result.success:
             raise RuntimeError(result.message)
@@ -45,29 +54,13 @@ def prepare_odeint(p: Array, rtol: float, output_dt: float) -> Callable[[], Samp
     """Prepare LSODA through `scipy.integrate.odeint`, whose loop is compiled."""
     from scipy.integrate import odeint
 
-    grid = _grid(output_dt)
-
-    def rhs(t: float, y: Array) -> Array:
-        out = np.empty(6)
-        rhs_into(t, y, out, p)
-        return out
-
-    rhs(0.0, np.zeros(6))
+    solve = partial(
+        odeint, _rhs(p), np.zeros(6), _grid(output_dt), rtol=rtol, atol=rtol * _ATOL, mxstep=10**7, tfirst=True,
+        full_output=True,
+    )  # fmt: skip
 
     def run() -> Sample:
-        wall, (y, info) = timed(
-            partial(
-                odeint,
-                rhs,
-                np.zeros(6),
-                grid,
-                rtol=rtol,
-                atol=rtol * _ATOL,
-                mxstep=10**7,
-                tfirst=True,
-                full_output=True,
-            )
-        )
+        wall, (y, info) = timed(solve)
         if info["message"] != "Integration successful.":
             raise RuntimeError(info["message"])
         return Sample(wall, y[:, :3], int(info["nst"][-1]), int(info["nfe"][-1]))
@@ -76,7 +69,7 @@ def prepare_odeint(p: Array, rtol: float, output_dt: float) -> Callable[[], Samp
 
 
 def prepare_sundae(p: Array, method: str, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare CVODE through scikit-sundae."""
+    """Prepare CVODE through scikit-sundae, whose right-hand side writes into an array."""
     from sksundae.cvode import CVODE
 
     grid = _grid(output_dt)
@@ -88,7 +81,7 @@ def prepare_sundae(p: Array, method: str, rtol: float, output_dt: float) -> Call
     solver = CVODE(rhs, method=method, rtol=rtol, atol=rtol * _ATOL, max_num_steps=10**8)
 
     def run() -> Sample:
-        wall, result = timed(lambda: solver.solve(grid, np.zeros(6)))
+        wall, result = timed(partial(solver.solve, grid, np.zeros(6)))
         if len(result.y) != len(grid):
             raise RuntimeError(str(result.message))
         return Sample(wall, result.y[:, :3], None, int(result.nfev))

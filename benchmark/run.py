@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import click
 import cvode
+import ensemble_rows
+import levels
+import live_rows
+import random_rows
 import summary
 import work_precision
 import workloads
@@ -31,14 +35,18 @@ PEERS: dict[str, Callable[[str], Iterator[Case]]] = {
     "python": work_precision.python_cases,
     "multibody": work_precision.multibody_cases,
 }
-SECTIONS = (*PEERS, "ensemble", "stiffness", "machine_time", "contact_events", "sampled_load", "random_scenes")
-_QUICK = frozenset({"own", "ensemble", "stiffness", "machine_time", "contact_events", "random_scenes"})
+SECTIONS = (
+    *PEERS, "ensemble", "stiffness", "machine_time", "contact_events", "features", "sampled_load", "start",
+    "random_scenes",
+)  # fmt: skip
+_QUICK = ("own", "ensemble", "stiffness", "machine_time", "contact_events", "random_scenes")
 Notify = Callable[[str], None]
+Fill = Callable[[Sequence[Row]], None]
 
 
 @click.command()
 @click.option(
-    "--quick", is_flag=True, help="Own rows only, few of them, once; for tests. Writes no picture and no page."
+    "--quick", is_flag=True, help="Own rows of KV only, few of them, once; for tests. Writes no picture and no page."
 )
 @click.option("--only", multiple=True, type=click.Choice(SECTIONS), help="Measure this part only; repeatable.")
 @click.option("--repeats", default=7, show_default=True, type=click.IntRange(1), help="Rounds over all cases.")
@@ -47,8 +55,12 @@ Notify = Callable[[str], None]
     type=click.Path(path_type=Path, dir_okay=False),
     help="CSV file; benchmark/results/<machine>.csv by default.",
 )
-def main(quick: bool, only: tuple[str, ...], repeats: int, out: Path | None) -> None:
+@click.option("--summary", "page", type=click.Path(path_type=Path, dir_okay=False), help="Markdown file of the tables.")
+def main(quick: bool, only: tuple[str, ...], repeats: int, out: Path | None, page: Path | None) -> None:
     """Run the benchmark."""
+    complete = not quick and not only
+    if out is None and not complete:
+        raise click.UsageError("a part is not the committed table: name a file with --out")
     console = Console(stderr=True)
     chosen = set(only) or (set(_QUICK) if quick else set(SECTIONS))
     columns = SpinnerColumn(), TextColumn("{task.description}"), MofNCompleteColumn(), TimeElapsedColumn()
@@ -60,47 +72,49 @@ def main(quick: bool, only: tuple[str, ...], repeats: int, out: Path | None) -> 
 
         rows = _run(chosen, 1 if quick else repeats, quick, notify)
     path = out or RESULTS / f"{machine_name()}.csv"
-    complete = not quick and not only
-    if out is None and not complete:
-        raise click.UsageError("a part is not the committed table: name a file with --out")
     write_csv(path, rows)
-    if complete:
-        _publish(rows)
+    measured = summary.text(rows, machine_name(), _versions())
+    if page is not None:
+        page.write_text(measured + "\n", encoding="utf-8")
+    if out is None:
+        _publish(rows, measured)
     click.echo(str(path))
 
 
 def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Row]:
-    rows = []
-    for scene in NAMES:
-        cases = [case for name, build in PEERS.items() if name in chosen for case in build(scene)]
-        if quick:
-            cases = [case for case in cases if _is_quick(case.row)]
-        rows += measure(cases, repeats, notify)
-        if "multibody" in chosen:
-            rows += work_precision.unmodelled(scene)
-    further = {
-        "stiffness": workloads.stiffness_cases,
-        "machine_time": lambda: workloads.horizon_cases(10.0 if quick else 3600.0),
-        "contact_events": workloads.event_cases,
+    rows: list[Row] = []
+    if quick:
+        rows += measure(list(work_precision.quick_cases()) if "own" in chosen else [], 1, notify)
+    else:
+        for scene in NAMES:
+            cases = [case for name, build in PEERS.items() if name in chosen for case in build(scene)]
+            rows += measure(cases, repeats, notify, levels.contenders)
+            if "multibody" in chosen:
+                rows += work_precision.unmodelled(scene)
+    further: dict[str, tuple[Iterable[Case], Fill]] = {
+        "stiffness": (workloads.stiffness_cases(), lambda rows: None),
+        "machine_time": (workloads.horizon_cases(10.0 if quick else workloads.HOUR_S), workloads.add_steps_per_hour),
+        "contact_events": (workloads.event_cases(quick), workloads.add_steps_per_event),
+        "features": (workloads.feature_cases(), workloads.add_ratios),
     }
-    for name, build in further.items():
+    for name, (more, fill) in further.items():
         if name in chosen:
-            rows += measure(list(build()), min(repeats, 3), notify)
+            found = measure(list(more), repeats, notify)
+            fill(found)
+            rows += found
     if "sampled_load" in chosen:
-        rows += workloads.sampled_rows(repeats, notify)
+        rows += live_rows.sampled_rows(repeats, notify)
+    if "start" in chosen:
+        rows += live_rows.start_rows(notify)
     if "ensemble" in chosen:
-        rows += workloads.ensemble_rows(*((3, 2) if quick else (40, 25)), repeats=min(repeats, 3), notify=notify)
+        size = (3, 2) if quick else (ensemble_rows.COLUMNS, ensemble_rows.ROWS)
+        rows += ensemble_rows.ensemble_rows(*size, repeats=min(repeats, 3), notify=notify)
     if "random_scenes" in chosen:
-        rows += workloads.random_rows(quick, notify)
+        rows += random_rows.random_rows(quick, notify)
     return rows
 
 
-def _is_quick(row: Row) -> bool:
-    settings = ("tol=0.001", "tol=1e-06", "tol=1e-09", "tol=1e-12", "dt=0.001")
-    return row.solver != work_precision.OURS_BARE and row.setting in settings
-
-
-def _publish(rows: list[Row]) -> None:
+def _publish(rows: list[Row], measured: str) -> None:
     """Draw the picture and replace the measured part of the page."""
     import plot
 
@@ -108,7 +122,6 @@ def _publish(rows: list[Row]) -> None:
     text = PAGE.read_text(encoding="utf-8")
     before, _, rest = text.partition(summary.BEGIN)
     _, _, after = rest.partition(summary.END)
-    measured = summary.text(rows, machine_name(), _versions())
     PAGE.write_text(f"{before}{summary.BEGIN}\n\n{measured}\n\n{summary.END}{after}", encoding="utf-8")
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
 
 import cvode
 import exudyn_peer
@@ -14,23 +16,35 @@ from cases import Array, Case, Row, Sample, pose_error, timed
 from lean import rk4
 
 from plow_twin import Scene, SolverError, Status, simulate
-from plow_twin.simulate import BUDGET, Motion, output_times, run_events
+from plow_twin.simulate import BUDGET, Method, Motion, output_times, run_events
 from plow_twin.solve.compiled import compile_scene
-from plow_twin.solve.layout import new_work
+from plow_twin.solve.layout import COEFFICIENTS, STEPS, T0, new_work
 
 SECTION = "work_precision"
 OURS, OURS_BARE = "plow_twin events", "plow_twin events, poses only"
 OURS_RK4, LEAN_RK4 = "plow_twin RK4", "lean RK4 (numba)"
-TOLERANCES = tuple(10.0**-i for i in range(1, 13))
-FIXED_STEPS = (1e-3, 2e-4, 1e-4, 2e-5, 1e-5)
-_LADDER = tuple(10.0**-i for i in range(2, 15))
-_SHORT_LADDER = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
-_SCIPY = {"DOP853": _SHORT_LADDER, "Radau": (1e-3, 1e-5, 1e-7), "BDF": (1e-3, 1e-5, 1e-7), "LSODA": _SHORT_LADDER}
-_MUJOCO = (("Euler", 1e-3), ("Euler", 1e-4), ("implicitfast", 1e-3), ("RK4", 1e-3), ("RK4", 1e-4))
-_EXUDYN = (
-    ("VelocityVerlet", 1e-3, None), ("VelocityVerlet", 1e-4, None), ("RK44", 1e-3, None), ("RK44", 2e-4, None),
-    ("RK67", 1e-3, None), ("DOPRI5", 1e-3, 1e-3), ("DOPRI5", 1e-3, 1e-8),
-)  # fmt: skip
+OURS_CALL = "plow_twin simulate(), whole call"
+
+
+def _decades(loosest: int, tightest: int, per_decade: int = 2) -> tuple[float, ...]:
+    """Return tolerances from 10^-loosest to 10^-tightest, loosest first."""
+    return tuple(10.0 ** (-i / per_decade) for i in range(per_decade * loosest, per_decade * tightest + 1))
+
+
+TOLERANCES = _decades(1, 12)
+#: What --quick takes of them.
+QUICK_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
+FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
+LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
+_LADDER = _decades(2, 12)
+#: CVODE in C goes on to where it breaks down.
+_C_LADDER = _decades(2, 14)
+#: Radau and BDF in Python take seconds and are far from the fastest: whole decades, sparse output.
+_SCIPY_FAST = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12)}
+_SCIPY_SLOW = {"Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
+_MUJOCO = {"Euler": (1e-3, 5e-4, 2e-4, 1e-4), "implicitfast": (1e-3, 5e-4), "RK4": (1e-3, 5e-4, 2e-4)}
+_EXUDYN = {"VelocityVerlet": (1e-3, 5e-4, 2e-4, 1e-4), "RK44": (1e-3, 5e-4, 2e-4), "RK67": (1e-3, 5e-4)}
+_EXUDYN_CONTROLLED = (1e-3, 1e-5, 1e-8)
 
 
 def _case(
@@ -43,32 +57,49 @@ def _case(
 
 
 def prepare_simulate(
-    scene: Scene, output_dt: float | None, t_end: float = T_END, tol: float = 1e-9, dt: float | None = None
+    scene: Scene,
+    output_dt: float | None,
+    t_end: float = T_END,
+    tol: float = 1e-9,
+    dt: float | None = None,
+    *,
+    audit: bool = False,
+    whole_call: bool = False,
 ) -> Callable[[], Sample]:
-    """Prepare `simulate` with everything it gives: poses, rates, forces, penetrations, events, statistics."""
+    """Prepare `simulate` with everything it gives: poses, rates, forces, penetrations, events, statistics.
+
+    The time is that of the run as `simulate` itself reports it, or (`whole_call`) from call to return.
+    """
+    method: Method = "events" if dt is None else "rk4"
 
     def run() -> Sample:
-        if dt is None:
-            result = simulate(scene, t_end, output_dt, tol)
-        else:
-            result = simulate(scene, t_end, output_dt, method="rk4", dt=dt)
+        wall, result = timed(lambda: simulate(scene, t_end, output_dt, tol, method, dt, audit))
         solver = result.solver
-        return Sample(result.wall_s, result.q, solver["steps"], solver["evaluations"], len(result.events))
+        return Sample(
+            wall if whole_call else result.wall_s, result.q, solver["steps"], solver["evaluations"], len(result.events)
+        )
 
     return run
 
 
-def prepare_bare(scene: Scene, output_dt: float, tol: float) -> Callable[[], Sample]:
+def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_END) -> Callable[[], Sample]:
     """Prepare the compiled loop alone, with poses and rates as its only output, as the peers have it."""
-    compiled, work, times = compile_scene(scene, tol), new_work(), output_times(T_END, output_dt)
+    compiled, work, times = compile_scene(scene, tol), new_work(), output_times(t_end, output_dt)
+
+    def solve() -> tuple[int, Motion]:
+        motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)))
+        return run_events(compiled, motion, times, t_end, work, BUDGET)[0], motion
 
     def run() -> Sample:
-        motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)))
-        wall, (code, _) = timed(lambda: run_events(compiled, motion, times, T_END, work, BUDGET))
+        wall, (code, motion) = timed(solve)
         if code != Status.OK:
-            raise SolverError(Status(code).text)
-        return Sample(wall, motion.q)
+            raise SolverError(f"at t = {motion.state.clock[T0]:.9g} s: {Status(code).text}")
+        count = motion.state.count
+        return Sample(wall, motion.q, int(count[STEPS]), int(count[COEFFICIENTS]), int(motion.log.length[0]))
 
+    # compiles
+    nothing = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))
+    run_events(compiled, nothing, np.zeros(1), 0.0, work, BUDGET)
     return run
 
 
@@ -89,86 +120,84 @@ def own_cases(scene_name: str) -> Iterator[Case]:
     scene = bench_scene(scene_name)
     for output_dt in (SPARSE, DENSE):
         for tol in TOLERANCES:
+            setting = f"tol={tol:.3g}"
+            yield _case(scene_name, OURS, setting, output_dt, partial(prepare_simulate, scene, output_dt, tol=tol))
             yield _case(
-                scene_name,
-                OURS,
-                f"tol={tol:g}",
-                output_dt,
-                lambda o=output_dt, e=tol: prepare_simulate(scene, o, tol=e),
-            )
-            yield _case(
-                scene_name, OURS_BARE, f"tol={tol:g}", output_dt, lambda o=output_dt, e=tol: prepare_bare(scene, o, e)
-            )
+                scene_name, OURS_CALL, setting, output_dt,
+                partial(prepare_simulate, scene, output_dt, tol=tol, whole_call=True),
+            )  # fmt: skip
+            yield _case(scene_name, OURS_BARE, setting, output_dt, partial(prepare_bare, scene, output_dt, tol))
         for dt in FIXED_STEPS:
             yield _case(
-                scene_name,
-                OURS_RK4,
-                f"dt={dt:g}",
-                output_dt,
-                lambda o=output_dt, h=dt: prepare_simulate(scene, o, dt=h),
+                scene_name, OURS_RK4, f"dt={dt:g}", output_dt, partial(prepare_simulate, scene, output_dt, dt=dt)
             )
+
+
+def quick_cases() -> Iterator[Case]:
+    """Yield a few own rows that need one compiled kernel."""
+    scene = bench_scene("kv")
+    for output_dt in (SPARSE, DENSE):
+        for tol in QUICK_TOLERANCES:
+            prepare = partial(prepare_bare, scene, output_dt, tol)
+            yield _case("kv", OURS_BARE, f"tol={tol:.3g}", output_dt, prepare)
 
 
 def lean_cases(scene_name: str) -> Iterator[Case]:
     """Yield plain RK4."""
     p = constants(bench_scene(scene_name))
     for output_dt in (SPARSE, DENSE):
-        for dt in (*FIXED_STEPS, 1e-6):
-            yield _case(scene_name, LEAN_RK4, f"dt={dt:g}", output_dt, lambda o=output_dt, h=dt: _prepare_lean(p, h, o))
+        for dt in LEAN_STEPS:
+            yield _case(scene_name, LEAN_RK4, f"dt={dt:g}", output_dt, partial(_prepare_lean, p, dt, output_dt))
 
 
 def cvode_cases(scene_name: str) -> Iterator[Case]:
     """Yield CVODE called from C, with and without its own rootfinding."""
     p = constants(bench_scene(scene_name))
-    for output_dt in (SPARSE, DENSE):
-        for method in ("adams", "bdf"):
-            for roots in (False, True):
-                for rtol in _LADDER:
-                    name = "Adams" if method == "adams" else "BDF"
-                    solver = f"CVODE {name} (C{', rootfinding' if roots else ''})"
-                    yield _case(
-                        scene_name, solver, f"rtol={rtol:g}", output_dt,
-                        lambda m=method, r=roots, e=rtol, o=output_dt: cvode.prepare(p, scene_name, m, r, e, o),
-                    )  # fmt: skip
+    for output_dt, method, roots, rtol in product((SPARSE, DENSE), ("adams", "bdf"), (False, True), _C_LADDER):
+        name = "Adams" if method == "adams" else "BDF"
+        yield _case(
+            scene_name, f"CVODE {name} (C{', rootfinding' if roots else ''})", f"rtol={rtol:.3g}", output_dt,
+            partial(cvode.prepare, p, scene_name, method, roots, rtol, output_dt),
+        )  # fmt: skip
 
 
 def python_cases(scene_name: str) -> Iterator[Case]:
     """Yield solvers called from Python."""
     p = constants(bench_scene(scene_name))
     for output_dt in (SPARSE, DENSE):
-        for rtol in _LADDER[1:-1]:
+        for rtol in _LADDER:
+            setting = f"rtol={rtol:.3g}"
             yield _case(
-                scene_name, "LSODA (SciPy odeint)", f"rtol={rtol:g}", output_dt,
-                lambda e=rtol, o=output_dt: python_peers.prepare_odeint(p, e, o),
+                scene_name, "LSODA (SciPy odeint)", setting, output_dt,
+                partial(python_peers.prepare_odeint, p, rtol, output_dt),
             )  # fmt: skip
-        for method in ("Adams", "BDF"):
-            for rtol in _LADDER[1:-1]:
+            for method in ("Adams", "BDF"):
                 yield _case(
-                    scene_name, f"CVODE {method} (scikit-sundae)", f"rtol={rtol:g}", output_dt,
-                    lambda m=method, e=rtol, o=output_dt: python_peers.prepare_sundae(p, m, e, o),
+                    scene_name, f"CVODE {method} (scikit-sundae)", setting, output_dt,
+                    partial(python_peers.prepare_sundae, p, method, rtol, output_dt),
                 )  # fmt: skip
-        for method, ladder in _SCIPY.items():
-            for rtol in ladder:
-                yield _case(
-                    scene_name, f"{method} (SciPy solve_ivp)", f"rtol={rtol:g}", output_dt,
-                    lambda m=method, e=rtol, o=output_dt: python_peers.prepare_solve_ivp(p, m, e, o),
-                )  # fmt: skip
+        methods = _SCIPY_FAST | _SCIPY_SLOW if output_dt == SPARSE else _SCIPY_FAST
+        for method, rtol in ((method, rtol) for method, ladder in methods.items() for rtol in ladder):
+            yield _case(
+                scene_name, f"{method} (SciPy solve_ivp)", f"rtol={rtol:.3g}", output_dt,
+                partial(python_peers.prepare_solve_ivp, p, method, rtol, output_dt),
+            )  # fmt: skip
 
 
 def multibody_cases(scene_name: str) -> Iterator[Case]:
     """Yield MuJoCo and Exudyn; both write rows at each of their steps or each 1 ms."""
     p = constants(bench_scene(scene_name))
-    for integrator, dt in _MUJOCO if scene_name == "kv" else ():
-        yield _case(
-            scene_name, f"MuJoCo {integrator}", f"dt={dt:g}", DENSE,
-            lambda i=integrator, h=dt: mujoco_peer.prepare(p, i, h, DENSE),
-        )  # fmt: skip
-    for solver, dt, rtol in _EXUDYN:
-        setting = f"dt={dt:g}" if rtol is None else f"rtol={rtol:g}"
-        yield _case(
-            scene_name, f"Exudyn {solver}", setting, DENSE,
-            lambda s=solver, h=dt, e=rtol: exudyn_peer.prepare(p, s, h, e, DENSE),
-        )  # fmt: skip
+    for integrator, steps in _MUJOCO.items() if scene_name == "kv" else ():
+        for dt in steps:
+            prepare = partial(mujoco_peer.prepare, p, integrator, dt, DENSE)
+            yield _case(scene_name, f"MuJoCo {integrator}", f"dt={dt:g}", DENSE, prepare)
+    for solver, steps in _EXUDYN.items():
+        for dt in steps:
+            prepare = partial(exudyn_peer.prepare, p, solver, dt, None, DENSE)
+            yield _case(scene_name, f"Exudyn {solver}", f"dt={dt:g}", DENSE, prepare)
+    for rtol in _EXUDYN_CONTROLLED:
+        prepare = partial(exudyn_peer.prepare, p, "DOPRI5", 1e-3, rtol, DENSE)
+        yield _case(scene_name, "Exudyn DOPRI5", f"rtol={rtol:g}", DENSE, prepare)
 
 
 def unmodelled(scene_name: str) -> Iterator[Row]:

@@ -1,0 +1,125 @@
+"""Many clearance pairs at once, against our own run at the tightest tolerance."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from bench_scenes import SPARSE, T_END, bench_scene, constants, error_scale
+from cases import Array, Row, pose_error, timed
+from lean import rk4
+from work_precision import LEAN_RK4, OURS
+
+from plow_twin import Clearance, Initial, Scene
+from plow_twin.ensemble import simulate_many
+
+Notify = Callable[[str], None]
+SECTION = "ensemble"
+COLUMNS, ROWS = 40, 25
+PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
+#: From loose to tight; the first at which every pair is within `LISTED` is the one that is timed with care.
+TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
+EXACT = 1e-12
+#: Error in clearances beyond which a pair is listed.
+LISTED = 1e-4
+#: Displacement at t = 0 in clearances by which amplification is measured; not so small that rounding shows.
+PERTURBATION = 1e-8
+
+
+def clearance_pairs(columns: int, rows: int) -> list[Scene]:
+    """Return KV scenes with horizontal and vertical clearances over 20..30 mm."""
+    scene = bench_scene("kv")
+    return [
+        dataclasses.replace(scene, clearance=Clearance(float(gx), float(gy)))
+        for gx in np.linspace(0.020, 0.030, columns)
+        for gy in np.linspace(0.020, 0.030, rows)
+    ]
+
+
+def ensemble_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterator[Row]:
+    """Yield one run at each tolerance down to the one that all pairs need, that one timed, plain RK4, and a list."""
+    scenes = clearance_pairs(columns, rows)
+    name = f"kv, {len(scenes)} clearance pairs"
+    notify(f"ensemble at {EXACT:g}")
+    exact = simulate_many(scenes, T_END, SPARSE, EXACT).q
+    error = np.zeros(0)
+    for tol in TOLERANCES:
+        notify(f"ensemble tol={tol:g}")
+        row, error = _own_row(name, scenes, exact, tol, 1, 1)
+        if row.error is not None and row.error <= LISTED:
+            break
+        yield row
+    for workers in dict.fromkeys((1, os.cpu_count() or 1)):
+        notify(f"ensemble tol={tol:g}, {workers} threads")
+        yield _own_row(name, scenes, exact, tol, workers, repeats)[0]
+    for dt in (1e-3, 1e-4) if repeats > 1 else (1e-3,):
+        notify(f"ensemble lean RK4 dt={dt:g}")
+        yield _lean_row(name, scenes, exact, dt)
+    notify("ensemble amplification")
+    growth = _amplification(scenes, exact)
+    for index in sorted({*np.flatnonzero(error > LISTED), *np.argsort(-growth)[:10]}, key=lambda i: -growth[i]):
+        yield _member_row(scenes[index], tol, float(error[index]), float(growth[index]))
+
+
+def core_row(rows: Sequence[Row]) -> Row | None:
+    """Return the row of one core at the tolerance that all pairs need: the last one."""
+    own = [row for row in rows if row.section == SECTION and row.solver == OURS and row.setting.endswith(", threads=1")]
+    return own[-1] if own else None
+
+
+def _own_row(
+    name: str, scenes: Sequence[Scene], exact: Array, tol: float, workers: int, repeats: int
+) -> tuple[Row, Array]:
+    walls: list[float] = []
+    for _ in range(repeats):
+        wall, ensemble = timed(lambda: simulate_many(scenes, T_END, SPARSE, tol, workers))
+        walls.append(wall)
+    error = _member_errors(scenes, ensemble.q, exact)
+    row = Row(SECTION, name, OURS, f"tol={tol:g}, threads={workers}", SPARSE, T_END)
+    row.wall_ms, row.wall_min_ms, row.runs = 1e3 * float(np.median(walls)), 1e3 * min(walls), len(walls)
+    row.error, row.steps, row.events = float(error.max()), int(ensemble.steps.sum()), int(ensemble.events.sum())
+    row.value = float((error > LISTED).sum())
+    return row, error
+
+
+def _member_errors(scenes: Sequence[Scene], q: Array, exact: Array) -> Array:
+    return np.array([pose_error(b, error_scale(s))(a) for s, a, b in zip(scenes, q, exact, strict=True)])
+
+
+def _amplification(scenes: Sequence[Scene], exact: Array) -> Array:
+    """Return how much a displacement at t = 0 has grown at most, the larger of one along x and one along theta."""
+    growth = np.zeros(len(scenes))
+    for axis in (0, 2):
+        moved = []
+        for scene in scenes:
+            q = [0.0, 0.0, 0.0]
+            q[axis] = PERTURBATION * error_scale(scene)[axis]
+            moved.append(dataclasses.replace(scene, initial=Initial(q=(q[0], q[1], q[2]))))
+        away = simulate_many(moved, T_END, SPARSE, EXACT).q
+        growth = np.maximum(growth, _member_errors(scenes, away, exact) / PERTURBATION)
+    return growth
+
+
+def _member_row(scene: Scene, tol: float, error: float, growth: float) -> Row:
+    gx, gy = scene.clearance.horizontal_m, scene.clearance.vertical_m
+    name = f"kv, gx={1e3 * gx:.4g} mm, gy={1e3 * gy:.4g} mm"
+    status = f"error beyond {LISTED:g}" if error > LISTED else "ok"
+    return Row(SECTION, name, OURS, f"tol={tol:g}", SPARSE, T_END, error=error, amplification=growth, status=status)
+
+
+def _lean_row(name: str, scenes: Sequence[Scene], exact: Array, dt: float) -> Row:
+    steps, stride = round(T_END / dt), round(SPARSE / dt)
+    q = np.zeros_like(exact)
+    parameters = [constants(scene) for scene in scenes]
+    rk4(parameters[0], dt, stride, stride, q[0])
+
+    def run() -> None:
+        for p, rows in zip(parameters, q, strict=True):
+            rk4(p, dt, steps, stride, rows)
+
+    wall, _ = timed(run)
+    error = _member_errors(scenes, q, exact)
+    return Row(SECTION, name, LEAN_RK4, f"dt={dt:g}, threads=1", SPARSE, T_END, 1e3 * wall, 1e3 * wall, 1,
+               float(error.max()), steps * len(scenes), value=float((error > LISTED).sum()))  # fmt: skip

@@ -1,0 +1,101 @@
+"""Time at equal error: what each solver needs to stay below an error, from its ladder of settings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from cases import Row
+from work_precision import OURS, OURS_BARE, OURS_CALL, OURS_RK4, SECTION
+
+LEVELS = (1e-2, 1e-3, 1e-6, 1e-9)
+OUTPUTS = (0.1, 1e-3)
+Member = Callable[[str], bool]
+
+#: Groups of peers that are compared as one: the fastest member at a level stands for the group.
+PEERS: dict[str, Member] = {
+    "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
+    "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,
+    "best from Python": lambda solver: "SciPy" in solver or "scikit-sundae" in solver,
+    "best multibody engine": lambda solver: solver.startswith(("MuJoCo", "Exudyn")),
+    "lean jitted RK4": lambda solver: solver.startswith("lean"),
+    "our RK4": lambda solver: solver == OURS_RK4,
+}
+OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
+#: A solver slower than its group's fastest by more than this is measured once.
+_NEAR = 1.5
+
+
+@dataclass(frozen=True)
+class Reached:
+    """The time in ms at which a solver reaches an error, and the setting or the two settings that it lies between."""
+
+    wall_ms: float
+    solver: str
+    setting: str
+
+
+def ladders(rows: Sequence[Row], scene: str, output_s: float, member: Member) -> list[list[Row]]:
+    """Return the rows of each solver of a group, in the order of the settings: loosest first."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.section == SECTION and row.scene == scene and row.output_s == output_s and member(row.solver):
+            found.setdefault(row.solver, []).append(row)
+    return list(found.values())
+
+
+def reach(ladder: Sequence[Row], level: float) -> Reached | None:
+    """Return the least time for an error of at most `level`: a setting, or log time over log error between two.
+
+    Only between neighbouring settings, of which one misses the level and the next reaches it; never beyond the ladder.
+    """
+    done = [row for row in ladder if row.status == "ok" and row.error is not None and row.wall_ms is not None]
+    times = [Reached(_wall(row), row.solver, row.setting) for row in done if _error(row) <= level]
+    for loose, tight in pairwise(done):
+        if level < _error(loose) < math.inf and _error(tight) <= level and _wall(loose) < _wall(tight):
+            share = math.log(_error(loose) / level) / math.log(_error(loose) / max(_error(tight), 1e-17))
+            wall = _wall(loose) * (_wall(tight) / _wall(loose)) ** share
+            times.append(Reached(wall, loose.solver, f"between {loose.setting} and {tight.setting}"))
+    return min(times, key=lambda reached: reached.wall_ms, default=None)
+
+
+def fastest(rows: Sequence[Row], scene: str, output_s: float, level: float, member: Member) -> Reached | None:
+    """Return what the fastest solver of a group needs for an error of at most `level`."""
+    times = [reach(ladder, level) for ladder in ladders(rows, scene, output_s, member)]
+    return min((time for time in times if time is not None), key=lambda time: time.wall_ms, default=None)
+
+
+def contenders(rows: Sequence[Row]) -> set[int]:
+    """Return the indices of the rows on which a figure of the tables depends, after one run of each."""
+    picked: list[Row] = []
+    for scene in {row.scene for row in rows}:
+        for output_s in OUTPUTS:
+            for member in (*PEERS.values(), *OWN.values()):
+                group = ladders(rows, scene, output_s, member)
+                for level in LEVELS:
+                    picked += _contenders_at(group, level)
+    wanted = {id(row) for row in picked}
+    return {index for index, row in enumerate(rows) if id(row) in wanted}
+
+
+def _contenders_at(group: Sequence[Sequence[Row]], level: float) -> list[Row]:
+    times = [reach(ladder, level) for ladder in group]
+    least = min((time.wall_ms for time in times if time is not None), default=math.inf)
+    picked: list[Row] = []
+    for ladder, time in zip(group, times, strict=True):
+        if time is None or time.wall_ms > _NEAR * least:
+            continue
+        for before, row in zip([None, *ladder[:-1]], ladder, strict=True):
+            if row.error is not None and row.error <= level and _wall(row) <= _NEAR * _NEAR * least:
+                picked += [row] if before is None else [before, row]
+    return picked
+
+
+def _error(row: Row) -> float:
+    return math.inf if row.error is None else row.error
+
+
+def _wall(row: Row) -> float:
+    return math.inf if row.wall_ms is None else row.wall_ms

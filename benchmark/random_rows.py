@@ -1,0 +1,71 @@
+"""The random scenes against their references."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+
+import random_scenes
+from cases import Row
+from work_precision import OURS_BARE, prepare_bare
+
+from plow_twin import Scene, SolverError
+
+TOLERANCES = (1e-3, 1e-6, 1e-9)
+#: Growth of a displacement at t = 0 from which on a scene is listed by itself: no step control can hold a tolerance.
+AMPLIFIES = 1e4
+QUICK_COUNT = 10
+
+
+def random_rows(few: bool, notify: Callable[[str], None]) -> Iterator[Row]:
+    """Yield the random scenes: error in tolerances (`value`) against the reference, and the scene's amplification.
+
+    `few` takes some of those that need no other kernel than the KV bench scene.
+    """
+    saved = random_scenes.load()
+    chosen = [index for index, scene in enumerate(saved.scenes) if not few or _is_plain(scene)]
+    for tol in TOLERANCES:
+        chaotic = saved.chaotic(tol)
+        for index in chosen[: QUICK_COUNT if few else None]:
+            notify(f"random scene {index}, tol={tol:g}")
+            yield _row(saved, index, tol, bool(chaotic[index]))
+
+
+def exponent_of(row: Row) -> float:
+    """Return the exponent of the contact law that the row's scene names."""
+    found = re.search(r" n=(\S+)", row.scene)
+    assert found is not None
+    return float(found[1])
+
+
+def _is_plain(scene: Scene) -> bool:
+    return scene.contact.law == "kelvin_voigt" and len(scene.loads) == 1 and not any(scene.head.com_offset_m)
+
+
+def _row(saved: random_scenes.RandomScenes, index: int, tol: float, chaotic: bool) -> Row:
+    scene, output_dt, t_end = saved.scenes[index], random_scenes.OUTPUT_DT, random_scenes.T_END
+    row = Row("random_scenes", _describe(index, scene), OURS_BARE, f"tol={tol:g}", output_dt, t_end)
+    row.amplification = float(saved.amplification[index])
+    try:
+        sample = prepare_bare(scene, output_dt, tol, t_end)()
+    except SolverError as problem:
+        row.status = f"failed: {problem}"
+        return row
+    assert sample.q is not None
+    row.wall_ms = row.wall_min_ms = 1e3 * sample.wall_s
+    row.runs, row.steps, row.events = 1, sample.steps, sample.events
+    row.error = random_scenes.distance(scene, sample.q, saved.q[index])
+    row.value = row.error / tol
+    if chaotic:
+        row.status = f"chaotic: references part by {saved.disagreement[index]:.1g}"
+    return row
+
+
+def _describe(index: int, scene: Scene) -> str:
+    contact = scene.contact
+    damping = f"e={contact.restitution:.3g}" if contact.restitution is not None else f"damping={contact.damping:.3g}"
+    gx, gy = 1e3 * scene.clearance.horizontal_m, 1e3 * scene.clearance.vertical_m
+    return (
+        f"#{index} {contact.law} K={contact.stiffness:.3g} n={contact.exponent:g} {damping} "
+        f"m={scene.head.mass_kg:.4g} kg gaps={gx:.3g}x{gy:.3g} mm"
+    )
