@@ -41,11 +41,19 @@ def test_the_readme_s_example_runs() -> None:
     assert "'method': 'events'" in done.stdout
 
 
+def test_the_model_page_s_law_of_one_s_own_runs() -> None:
+    (example,) = blocks(ROOT / "docs" / "model.md", "python")
+    # a process of its own: the law stays where it was added
+    code = f"{example}\nfrom plow_twin.model.contact_laws import LAWS\nprint(LAWS[contact.law].damping_factor(0.4))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=False)
+    assert (done.stdout.strip(), done.stderr) == (str(1.2 * (1.0 - 0.4) / 0.4), "")
+
+
 def test_the_interface_page_is_the_code_s() -> None:
     page = (ROOT / "docs" / "interface.md").read_text()
     (scene,) = blocks(ROOT / "docs" / "interface.md", "yaml")
     assert yaml.safe_load(scene)["version"] == 1
-    assert loads_scene(scene, ROOT).wear is not None
+    assert loads_scene(scene, ROOT).wear is not None and loads_scene(scene, ROOT).friction is not None
     for name in (*PAIR_NAMES, *LAWS):
         assert f"`{name}`" in page, name
     for verb in commands.commands:
