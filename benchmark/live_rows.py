@@ -30,7 +30,7 @@ def sampled_rows(repeats: int, notify: Notify) -> Iterator[Row]:
     wrench = np.sin(p[14] * t)[:, None] * p[11:14]
     notify("sampled load")
     yield _one_twin(scene, t, wrench, repeats)
-    for samples, simulated_s in ((10, 1.0), (1, 0.5)):
+    for samples, simulated_s in ((10, 1.0), (1, 0.1)):
         notify(f"{TWINS} twins, {samples} samples a call")
         rows = round(simulated_s * 1e3)
         walls = [_many_twins(scene, t[:rows], wrench[:rows], samples) for _ in range(min(repeats, 3))]
