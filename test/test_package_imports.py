@@ -12,7 +12,7 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
-CORE = {"errors", "model", "solve", "twin", "simulate", "ensemble"}
+CORE = {"errors", "model", "solve", "twin", "books", "simulate", "ensemble"}
 #: For each room of the package, the rooms it may import.
 ROOMS = {
     "errors": set(),
