@@ -35,19 +35,19 @@ def version() -> str:
 
 
 def prepare(p: Array, law: str, method: str, roots: bool, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare one setting; each call starts the process for one warm-up run and one that counts."""
+    """Prepare one setting; each call starts the process, which times its run without its start."""
     executable = program()
     numbers = " ".join(repr(float(number)) for number in p)
 
     def run() -> Sample:
         with TemporaryDirectory() as folder:
             poses = Path(folder) / "poses"
-            setting = [law, method, str(int(roots)), repr(rtol), repr(T_END), repr(output_dt), "2", str(poses)]
+            setting = [law, method, str(int(roots)), repr(rtol), repr(T_END), repr(output_dt), "1", str(poses)]
             done = subprocess.run([executable, *setting], input=numbers, capture_output=True, text=True)
             if done.returncode != 0:
                 raise RuntimeError(done.stderr.strip() or f"exit code {done.returncode}")
             lines = done.stdout.split("\n")
-            steps, evaluations, events = (int(word) for word in lines[2].split())
-            return Sample(min(map(float, lines[:2])), np.fromfile(poses).reshape(-1, 3), steps, evaluations, events)
+            steps, evaluations, events = (int(word) for word in lines[1].split())
+            return Sample(float(lines[0]), np.fromfile(poses).reshape(-1, 3), steps, evaluations, events)
 
     return run

@@ -24,8 +24,8 @@ PEERS: dict[str, Member] = {
     "our RK4": lambda solver: solver == OURS_RK4,
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
-#: A solver slower than its group's fastest by more than this is measured once.
-_NEAR = 1.5
+#: A solver slower than its group's fastest by more than this is measured once, and so is a setting among its solver's.
+_NEAR = 2.0
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def _contenders_at(group: Sequence[Sequence[Row]], level: float) -> list[Row]:
         if time is None or time.wall_ms > _NEAR * least:
             continue
         for before, row in zip([None, *ladder[:-1]], ladder, strict=True):
-            if row.error is not None and row.error <= level and _wall(row) <= _NEAR * _NEAR * least:
+            if row.error is not None and row.error <= level and _wall(row) <= _NEAR * time.wall_ms:
                 picked += [row] if before is None else [before, row]
     return picked
 

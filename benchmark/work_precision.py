@@ -36,12 +36,11 @@ TOLERANCES = _decades(1, 12)
 QUICK_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
 FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
-_LADDER = _decades(2, 12)
+_LADDER = _decades(2, 13)
 #: CVODE in C goes on to where it breaks down.
 _C_LADDER = _decades(2, 14)
-#: Radau and BDF in Python take seconds and are far from the fastest: whole decades, sparse output.
-_SCIPY_FAST = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12)}
-_SCIPY_SLOW = {"Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
+#: solve_ivp steps in Python, far from the fastest: sparse output only; Radau and BDF, which take seconds, by decades.
+_SOLVE_IVP = {"LSODA": _decades(3, 12), "DOP853": _decades(3, 12), "Radau": _decades(3, 8, 1), "BDF": _decades(3, 8, 1)}
 _MUJOCO = {"Euler": (1e-3, 5e-4, 2e-4, 1e-4), "implicitfast": (1e-3, 5e-4), "RK4": (1e-3, 5e-4, 2e-4)}
 _EXUDYN = {"VelocityVerlet": (1e-3, 5e-4, 2e-4, 1e-4), "RK44": (1e-3, 5e-4, 2e-4), "RK67": (1e-3, 5e-4)}
 _EXUDYN_CONTROLLED = (1e-3, 1e-5, 1e-8)
@@ -176,12 +175,9 @@ def python_cases(scene_name: str) -> Iterator[Case]:
                     scene_name, f"CVODE {method} (scikit-sundae)", setting, output_dt,
                     partial(python_peers.prepare_sundae, p, method, rtol, output_dt),
                 )  # fmt: skip
-        methods = _SCIPY_FAST | _SCIPY_SLOW if output_dt == SPARSE else _SCIPY_FAST
-        for method, rtol in ((method, rtol) for method, ladder in methods.items() for rtol in ladder):
-            yield _case(
-                scene_name, f"{method} (SciPy solve_ivp)", f"rtol={rtol:.3g}", output_dt,
-                partial(python_peers.prepare_solve_ivp, p, method, rtol, output_dt),
-            )  # fmt: skip
+    for method, rtol in ((method, rtol) for method, ladder in _SOLVE_IVP.items() for rtol in ladder):
+        prepare = partial(python_peers.prepare_solve_ivp, p, method, rtol, SPARSE)
+        yield _case(scene_name, f"{method} (SciPy solve_ivp)", f"rtol={rtol:.3g}", SPARSE, prepare)
 
 
 def multibody_cases(scene_name: str) -> Iterator[Case]:
