@@ -153,6 +153,17 @@ def test_failed_members_are_listed_and_other_questions_refused(
         assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("module", "extra"), [("pyarrow", "study"), ("distributed", "dask")])
+def test_a_missing_library_is_named_before_the_work(
+    module: str, extra: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    arguments = ["study", "sweep", "paper", *GRID, "--statistic", "max", "--t-end", "2", "--dask", "tcp://127.0.0.1:1"]
+    assert run([*arguments, "--out", str(tmp_path / "out")]) == 1
+    assert f"{module}, which is not installed: pip install 'plow_twin[{extra}]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_dask_worker_killed_in_the_middle_loses_nothing(tmp_path: Path) -> None:
     from distributed import LocalCluster
 

@@ -69,10 +69,12 @@ def sweep(
 ) -> int:
     """Sweep one or two parameters of SCENE, a file or a preset; writes sweep.parquet and sweep.png."""
     from plow_twin.scene_file import dump_scene
+    from plow_twin.study.report import require
     from plow_twin.study.store import Store
     from plow_twin.study.sweep import Sweep, parse_axis
     from plow_twin.study.sweep_output import draw, write_parquet
 
+    require("matplotlib", "pyarrow", *(["distributed"] if dask else []))
     with usage_errors():
         model = study_scene(scene, settings)
         axes = tuple(parse_axis(text, model) for text in (first, second) if text is not None)

@@ -18,6 +18,7 @@ from plow_twin.study.paper_recording import Recording, record
 from plow_twin.study.paper_rotation import RotationRow, rotation_rows
 from plow_twin.study.paper_rows import FITTED, Row, Verdict, all_rows, one_run_rows
 from plow_twin.study.paper_runs import PaperRuns, run_all
+from plow_twin.study.report import require
 
 OnProgress = Callable[[float], object]
 #: Form of the head's rotation in words, by its place in `Rotation.scenes`.
@@ -106,7 +107,7 @@ def study_paper(
         A file cannot be written.
     """
     begin = time.perf_counter()
-    _require("matplotlib", "jinja2", *(("mcap", "rosbags", "rerun") if recording else ()))
+    require("matplotlib", "jinja2", *(("mcap", "rosbags", "rerun") if recording else ()))
     found = compare(scene, t_end, workers, lambda share: on_progress(0.2 * share))
     figures = out / "figures"
     figures.mkdir(parents=True, exist_ok=True)
@@ -124,14 +125,6 @@ def study_paper(
     _write(study, out)
     on_progress(1.0)
     return study
-
-
-def _require(*modules: str) -> None:
-    """Raise `ModuleNotFoundError` before minutes of work, not after."""
-    from importlib import import_module
-
-    for module in modules:
-        import_module(module)
 
 
 def _changes(runs: PaperRuns) -> list[Change]:

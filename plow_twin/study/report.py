@@ -7,8 +7,15 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+
+def require(*modules: str) -> None:
+    """Raise `ModuleNotFoundError` before minutes of work, not after."""
+    for module in modules:
+        import_module(module)
 
 
 def write_html(path: Path, template: str, context: Mapping[str, Any]) -> None:
