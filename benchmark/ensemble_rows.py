@@ -38,7 +38,7 @@ def clearance_pairs(columns: int, rows: int) -> list[Scene]:
     ]
 
 
-def ensemble_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iterator[Row]:
+def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
     """Yield one run at each tolerance down to the one that all pairs need, that one timed, plain RK4, and a list."""
     scenes = clearance_pairs(columns, rows)
     name = f"kv, {len(scenes)} clearance pairs"
@@ -54,7 +54,7 @@ def ensemble_rows(columns: int, rows: int, repeats: int, notify: Notify) -> Iter
     for workers in dict.fromkeys((1, os.cpu_count() or 1)):
         notify(f"ensemble tol={tol:g}, {workers} threads")
         yield _own_row(name, scenes, exact, tol, workers, repeats)[0]
-    for dt in (1e-3, 1e-4) if repeats > 1 else (1e-3,):
+    for dt in lean_steps:
         notify(f"ensemble lean RK4 dt={dt:g}")
         yield _lean_row(name, scenes, exact, dt)
     notify("ensemble amplification")

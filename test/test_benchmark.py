@@ -38,7 +38,7 @@ def test_every_part_has_its_rows(rows: list[dict[str, str]]) -> None:
         "work_precision": 2 * 4, "stiffness": 8, "machine_time": 2, "contact_events": 6, "random_scenes": 3 * 10,
         "ensemble": counted["ensemble"],
     }  # fmt: skip
-    assert counted["ensemble"] >= 3 + 6
+    assert counted["ensemble"] >= 1 + 6
 
 
 def test_errors_on_the_bench_scene_are_within_the_tolerance(rows: list[dict[str, str]]) -> None:
