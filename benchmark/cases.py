@@ -66,7 +66,7 @@ class Case:
 
 
 #: A case stops being repeated once its runs have taken this long together.
-TIME_PER_CASE_S = 2.0
+TIME_PER_CASE_S = 1.0
 #: Below it the first run is a warm-up that does not count; above it neither start nor cache matters.
 WARM_UP_BELOW_S = 0.05
 #: Runs as short as this are repeated whether or not anything depends on them.

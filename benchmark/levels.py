@@ -25,7 +25,7 @@ PEERS: dict[str, Member] = {
 }
 OWN: dict[str, Member] = {name: name.__eq__ for name in (OURS_BARE, OURS, OURS_CALL)}
 #: A solver slower than its group's fastest by more than this is measured once, and so is a setting among its solver's.
-_NEAR = 2.0
+_NEAR = 1.4
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ Fill = Callable[[Sequence[Row]], None]
     "--quick", is_flag=True, help="Own rows of KV only, few of them, once; for tests. Writes no picture and no page."
 )
 @click.option("--only", multiple=True, type=click.Choice(SECTIONS), help="Measure this part only; repeatable.")
-@click.option("--repeats", default=7, show_default=True, type=click.IntRange(1), help="Rounds over all cases.")
+@click.option("--repeats", default=5, show_default=True, type=click.IntRange(1), help="Rounds over all cases.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
