@@ -88,7 +88,8 @@ def _contenders_at(group: Sequence[Sequence[Row]], level: float) -> list[Row]:
         if time is None or time.wall_ms > _NEAR * least:
             continue
         for before, row in zip([None, *ladder[:-1]], ladder, strict=True):
-            if row.error is not None and row.error <= level and _wall(row) <= _NEAR * time.wall_ms:
+            crossing = before is not None and _error(before) > level
+            if _error(row) <= level and (crossing or _wall(row) <= _NEAR * time.wall_ms):
                 picked += [row] if before is None else [before, row]
     return picked
 
