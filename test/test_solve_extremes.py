@@ -108,7 +108,6 @@ def test_ten_hours_of_driven_motion_do_not_drift() -> None:
     ],
     ids=["viscous", "n = 1", "n = 1.5"],
 )
-@pytest.mark.xfail(strict=True, reason="a pair that starts inside and moves out fast is pulled")
 def test_a_start_inside_the_wall_is_never_pulled(contact: Contact, clearance: float) -> None:
     scene = Scene(
         Head(45.0, 0.3), Frame(0.15, 1.0), Clearance(clearance, clearance), contact, Gravity(0.0),
@@ -120,7 +119,6 @@ def test_a_start_inside_the_wall_is_never_pulled(contact: Contact, clearance: fl
 
 
 @pytest.mark.parametrize("speed", [0.0, 1e-160])
-@pytest.mark.xfail(strict=True, reason="d = 0 with no rate at the start, n = 1.5: 0 / 0 in the root of time")
 def test_a_start_exactly_on_the_wall_is_solved(speed: float) -> None:
     contact = Contact("exact_restitution", 1e9, 1.5, restitution=0.5)
     scene = Scene(
@@ -131,7 +129,6 @@ def test_a_start_exactly_on_the_wall_is_solved(speed: float) -> None:
     assert np.isfinite(result.q).all() and result.force[-1].max() > 0.0
 
 
-@pytest.mark.xfail(strict=True, reason="rows inside a step show the wear of the step's start")
 def test_rows_within_a_step_show_the_wear_of_their_time() -> None:
     """A clamped head relaxes as its pads wear: F = K d0 exp(-K k_s v t / A)."""
     stiffness, depth, k_s, area, speed = 1e7, 1e-4, 2e-9, 0.015, 2.0

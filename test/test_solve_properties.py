@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, assume, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from plow_twin import (
@@ -192,15 +192,7 @@ def advance(case: Case) -> tuple[Status, list[twin_module.Advance]]:
     return Status.OK, rows
 
 
-def starts_where_the_solver_is_wrong(case: Case) -> bool:
-    """The starts of the two expected failures of test_solve_extremes."""
-    row = Twin(case.scene, tol=1e-3).advance(0.0)
-    inside = row.penetration >= 0.0
-    return bool((inside & (row.rate <= 0.0)).any())
-
-
 def check(case: Case) -> Status:
-    assume(not starts_where_the_solver_is_wrong(case))
     status, rows = advance(case)
     assert status in (Status.OK, Status.OUT_OF_RANGE, Status.NON_FINITE, Status.BUDGET)
     if len(rows) < 2:
@@ -242,9 +234,6 @@ def check_energy(
     slack = (1e3 * case.tol + 1e-9) * scale + work_error
     # the tolerance is one of the pose: where the forces push, it is energy
     slack += 100.0 * case.tol * length_scale(case.scene) * peak.sum(axis=1).max()
-    if case.scene.wear is not None:
-        # rows show the wear of their step's start (expected failure in test_solve_extremes)
-        slack += wear_depth.max() * peak.sum(axis=1).max()
     rise = gain - np.minimum.accumulate(gain)
     assert (rise <= slack).all(), (rise.max() / scale, case.tol, int(rise.argmax()))
     if case.scene.contact.law == "hertz" and case.scene.wear is None:

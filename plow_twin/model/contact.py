@@ -19,10 +19,10 @@ from plow_twin.model.lanes import row, splat
 
 
 @kernel(inline=True)
-def normal_force(
+def free_force(
     penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float, ramp: float
 ) -> float:
-    """Return F >= 0 in N for penetration d in m and rate d' in m/s; zero for d <= 0.
+    """Return the law's F in N for penetration d in m and rate d' in m/s, negative where it would pull; 0 for d <= 0.
 
     `factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero. `ramp` in m is zero without a ramp.
     """
@@ -32,7 +32,15 @@ def normal_force(
     if penetration < ramp:
         share = penetration / ramp
         viscous *= share * share * (3.0 - 2.0 * share)
-    return max(0.0, elastic * (1.0 + factor * rate) + viscous * rate)
+    return elastic * (1.0 + factor * rate) + viscous * rate
+
+
+@kernel(inline=True)
+def normal_force(
+    penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float, ramp: float
+) -> float:
+    """Return F >= 0 in N: a contact never pulls (`free_force`)."""
+    return max(0.0, free_force(penetration, rate, stiffness, exponent, factor, viscous, ramp))
 
 
 @kernel(fast=True, inline=True)

@@ -15,12 +15,12 @@ import numpy as np
 from plow_twin.model.friction import friction_force
 from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import row, set_row
 from plow_twin.solve.layout import (
     ALPHA,
     BETA,
     COS,
     OMEGA,
-    ORDER,
     SIGMA,
     SIN,
     T0,
@@ -31,7 +31,7 @@ from plow_twin.solve.layout import (
     new_record,
 )
 from plow_twin.solve.loads import combined, load_at
-from plow_twin.solve.step import evaluate, pair_outputs
+from plow_twin.solve.step import evaluate, pair_outputs, worn_depth
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
 _NODES = 24
@@ -59,6 +59,7 @@ class Audit(NamedTuple):
     now: Array  #: (SIZE,) powers and forces at one instant
     before: Array  #: (SIZE,) the same a step before
     body: Array  #: (8,) body coordinates at a node
+    depth: Array  #: (8,) wear depth at a node
     pairs: Array  #: (3, 8) penetration, rate, force
     sums: np.record
 
@@ -67,13 +68,13 @@ def new_audit() -> Audit:
     """Return an audit that has seen nothing."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     return Audit(
-        0.5 * (nodes + 1.0), 0.5 * weights, np.zeros(SIZE), np.zeros(SIZE), np.zeros(STATE_SIZE), np.zeros((3, 8)),
-        new_record(SUMS),
+        0.5 * (nodes + 1.0), 0.5 * weights, np.zeros(SIZE), np.zeros(SIZE), np.zeros(STATE_SIZE), np.zeros(8),
+        np.zeros((3, 8)), new_record(SUMS),
     )  # fmt: skip
 
 
 @kernel()
-def _powers(p, parts, offset, free, slip, state, y, t, pairs, out) -> None:
+def _powers(p, parts, offset, free, slip, state, depth, y, t, pairs, out) -> None:
     """Write powers and forces at time t in body coordinates y."""
     c, s, om = math.cos(y[THETA]), math.sin(y[THETA]), y[OMEGA]
     y[COS], y[SIN] = c, s
@@ -86,7 +87,7 @@ def _powers(p, parts, offset, free, slip, state, y, t, pairs, out) -> None:
         across = (c * offset[0] - s * offset[1]) * (load[1] + p.gravity)
         load[2] -= (across - (s * offset[0] + c * offset[1]) * load[0]) * m / inertia
     load[0], load[1], load[2] = m * load[0], m * load[1], inertia * load[2]
-    pair_outputs(p, state, y, pairs[0], pairs[1], pairs[2])
+    pair_outputs(p, state, depth, y, pairs[0], pairs[1], pairs[2])
     fx = fy = torque = 0.0
     dx, dy = y[VX] + om * y[1], y[VY] - om * y[0]
     for pair in range(8):
@@ -136,7 +137,7 @@ def _balance(p, y, audit, start) -> None:
 def audit_start(p, parts, state, y, t, audit) -> None:
     """Take the state that a run starts from."""
     _balance(p, y, audit, True)
-    _powers(p, parts, parts.offset, parts.free, parts.slip, state, y, t, audit.pairs, audit.before)
+    _powers(p, parts, parts.offset, parts.free, parts.slip, state, state.depth, y, t, audit.pairs, audit.before)
 
 
 @kernel()
@@ -150,22 +151,16 @@ def _add(audit, powers, weight) -> None:
 @kernel()
 def audit_step(p, parts, wear, state, w, audit) -> None:
     """Add the step under way, before it is finished."""
-    clock, y = state.clock, audit.body
-    end, depth = clock[SIGMA], state.depth.copy()
+    clock, y, depth, end = state.clock, audit.body, audit.depth, state.clock[SIGMA]
+    set_row(depth, 0, row(state.depth, 0))
     for i in range(audit.nodes.size):
         sigma = end * audit.nodes[i]
         evaluate(state, w, sigma, y)
         if wear is not None:
-            for pair in range(8):
-                grown = 0.0
-                for k in range(state.step[ORDER], 0, -1):
-                    grown = (grown + w.worn[k, pair]) * sigma
-                state.depth[pair] = depth[pair] + (grown if state.mode[pair] != 0 else 0.0)
+            worn_depth(state, w, sigma, depth)
         t = clock[T0] + clock[ALPHA] * sigma + 0.5 * clock[BETA] * sigma * sigma
-        _powers(p, parts, parts.offset, parts.free, parts.slip, state, y, t, audit.pairs, audit.now)
+        _powers(p, parts, parts.offset, parts.free, parts.slip, state, depth, y, t, audit.pairs, audit.now)
         _add(audit, audit.now, audit.weights[i] * end * (clock[ALPHA] + clock[BETA] * sigma))
-    for pair in range(8):
-        state.depth[pair] = depth[pair]
     evaluate(state, w, end, y)
     _balance(p, y, audit, False)
 
@@ -173,7 +168,7 @@ def audit_step(p, parts, wear, state, w, audit) -> None:
 @kernel()
 def audit_fixed(p, parts, state, y, t, dt, audit) -> None:
     """Add a fixed step that ends at body coordinates y and time t."""
-    _powers(p, parts, parts.offset, parts.free, parts.slip, state, y, t, audit.pairs, audit.now)
+    _powers(p, parts, parts.offset, parts.free, parts.slip, state, state.depth, y, t, audit.pairs, audit.now)
     _add(audit, audit.before, 0.5 * dt)
     _add(audit, audit.now, 0.5 * dt)
     for i in range(SIZE):

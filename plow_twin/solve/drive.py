@@ -24,7 +24,17 @@ from plow_twin.solve.layout import (
     USED,
     Status,
 )
-from plow_twin.solve.step import account, begin, evaluate, finish, pair_outputs, pose_of, sigma_at, within_range
+from plow_twin.solve.step import (
+    account,
+    begin,
+    evaluate,
+    finish,
+    pair_outputs,
+    pose_of,
+    sigma_at,
+    within_range,
+    worn_depth,
+)
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
@@ -81,6 +91,24 @@ def _proceed(p, parts, state, w, totals, target, hard_time, budget) -> int:
 
 
 @kernel()
+def _worn_at(state, w, wear, sigma, out) -> None:
+    """Write each pad's wear depth at sigma of the step under way."""
+    if wear is not None:
+        worn_depth(state, w, sigma, out)
+    else:
+        set_row(out, 0, row(state.depth, 0))
+
+
+@kernel()
+def _worn_now(state, w, wear, out) -> None:
+    """Write each pad's wear depth at the present time, also within a step."""
+    if state.clock[LENGTH] >= 0.0:
+        _worn_at(state, w, wear, sigma_at(state, state.clock[USED]), out)
+    else:
+        set_row(out, 0, row(state.depth, 0))
+
+
+@kernel()
 def _clear(totals) -> None:
     """Begin to count anew what an advance reports."""
     set_row(totals.peak, 0, splat(0.0))
@@ -117,11 +145,11 @@ def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, pea
     y = w.moved
     _present(state, w, y)
     pose_of(y, parts.offset, q[i], v[i])
-    pair_outputs(p, state, y, penetration[i], rate[i], force[i])
+    _worn_now(state, w, parts.wear, depth[i])
+    pair_outputs(p, state, depth[i], y, penetration[i], rate[i], force[i])
     for pair in range(8):
         peak[i, pair] = max(totals.peak[pair], force[i, pair])
         impulse[i, pair], makes[i, pair] = totals.impulse[pair], totals.makes[pair]
-        depth[i, pair] = state.depth[pair]
     _clear(totals)
 
 
@@ -185,7 +213,7 @@ def advance_samples(
         piece.knots[0] = state.clock[T0]
         for j in range(3):
             piece.start[0, j] = wrench[i, j]
-            piece.slope[0, j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 0.0 else 0.0
+            piece.slope[0, j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
         status[i] = _advance(p, parts, state, w, totals, times[i], times[i], before + budget)
         steps[i] = state.count[STEPS] - before
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
@@ -226,7 +254,7 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
 
     `penetration`, `force` and `audit` may be None. The rows' times do not change the steps.
     """
-    rate, y = np.empty(8), np.empty(8)
+    rate, y, depth, wear = np.empty(8), np.empty(8), np.empty(8), parts.wear
     i = first[0]
     if audit is not None and state.count[STEPS] == 0:
         audit_start(p, parts, state, state.y, state.clock[T0], audit)
@@ -241,22 +269,24 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
         t0, length = state.clock[T0], state.clock[LENGTH]
         end = t0 + length
         while i < t.size and t[i] < end:
-            evaluate(state, w, sigma_at(state, max(t[i] - t0, 0.0)), y)
+            sigma = sigma_at(state, max(t[i] - t0, 0.0))
+            evaluate(state, w, sigma, y)
             pose_of(y, parts.offset, q[i], v[i])
             if force is not None:
-                pair_outputs(p, state, y, penetration[i], rate, force[i])
+                _worn_at(state, w, wear, sigma, depth)
+                pair_outputs(p, state, depth, y, penetration[i], rate, force[i])
             i += 1
             first[0] = i
         account(state, w, 0.0, sigma_at(state, length), totals)
         if audit is not None:
-            audit_step(p, parts, parts.wear, state, w, audit)
+            audit_step(p, parts, wear, state, w, audit)
         finish(p, state, w, totals, log, parts.wear, parts.law.fraction)
     if not within_range(p, state, state.y):
         return _RANGE
     while i < t.size:
         pose_of(state.y, parts.offset, q[i], v[i])
         if force is not None:
-            pair_outputs(p, state, state.y, penetration[i], rate, force[i])
+            pair_outputs(p, state, state.depth, state.y, penetration[i], rate, force[i])
         i += 1
     first[0] = i
     return _OK

@@ -115,7 +115,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
     c, s = y[COS], y[SIN]
     z[0], z[1], z[2] = c * y[0] - s * y[1], s * y[0] + c * y[1], y[THETA]
     z[3], z[4], z[5] = c * y[VX] - s * y[VY], s * y[VX] + c * y[VY], y[OMEGA]
-    pair_outputs(p, state, y, pen, rate, now)
+    pair_outputs(p, state, state.depth, y, pen, rate, now)
     if audit is not None and done[0] == 0:
         audit_start(p, parts, state, y, 0.0, audit)
     while True:
@@ -127,7 +127,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
             row = (n + stride - 1) // stride
             pose_of(y, parts.offset, q[row], v[row])
             if force is not None:
-                pair_outputs(p, state, y, penetration[row], rate, force[row])
+                pair_outputs(p, state, state.depth, y, penetration[row], rate, force[row])
         if n >= steps:
             return _OK
         if log.length[0] + 8 > log.time.size:
@@ -155,9 +155,9 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
         _to_body(z, y)
         _wear(parts.wear, state, now, dt)
         before[:] = now
-        pair_outputs(p, state, y, pen, rate, now)
+        pair_outputs(p, state, state.depth, y, pen, rate, now)
         _switch(p, state, pen, rate, t + dt, totals, log)
-        pair_outputs(p, state, y, pen, rate, now)
+        pair_outputs(p, state, state.depth, y, pen, rate, now)
         _account(state, before, now, dt, totals)
         if audit is not None:
             audit_fixed(p, parts, state, y, t + dt, dt, audit)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from plow_twin.model.contact import normal_force
+from plow_twin.model.contact import free_force, normal_force
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import below, magnitude, row, set_row, splat
 from plow_twin.solve.layout import (
@@ -93,10 +93,12 @@ def settle_modes(p, state) -> None:
     for pair in range(8):
         state.mode[pair] = OFF
         state.beyond[pair] = 0
-        depth = gap_and_rate(p, state, pair)[0]
+        depth, rate = gap_and_rate(p, state, pair)
         if p.enabled[pair] == 1 and depth > 0.0:
             touch(p, state, pair)
             state.mode[pair] = ON if depth >= p.release else RELEASED
+            if free_force(depth, rate, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp) < 0.0:
+                state.mode[pair] = CLIPPED
             state.beyond[pair] = 1 if depth > p.ramp else 0
     state.clock[USED] = 0.0
     state.clock[LENGTH] = -1.0
@@ -130,6 +132,9 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
         if state.mode[pair] == ON:
             # released below a quarter of the depth at which it acts again, so that no pair hovers between
             first -= min(0.25 * p.release, 0.5 * first)
+        elif state.mode[pair] == RELEASED:
+            # and let go a little outside the wall
+            first = max(guard[0, pair] + 0.25 * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
 
@@ -561,12 +566,12 @@ def pose_of(y, offset, q, v) -> None:
 
 
 @kernel()
-def pair_outputs(p, state, y, penetration, rate, force) -> None:
-    """Write penetration, rate and force of the eight pairs in body coordinates y, shape (8,) each."""
+def pair_outputs(p, state, depth, y, penetration, rate, force) -> None:
+    """Write penetration, rate and force of the eight pairs in body coordinates y, worn by `depth`; shape (8,) each."""
     A = p.gap
     c, s, om = y[COS], y[SIN], y[OMEGA]
     for pair in range(8):
-        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair] - state.depth[pair]
+        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair] - depth[pair]
         r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
         penetration[pair], rate[pair], force[pair] = d, r, 0.0
         if state.mode[pair] == ON:
@@ -635,6 +640,13 @@ def _swap_rows(a, b, order) -> None:
 
 
 @kernel(inline=True)
+def _slow_touch(p) -> float:
+    """Return the speed below which a pair cannot reach the release depth by the speed of its touch alone."""
+    acceleration = p.threshold[0] * p.weight / p.radius
+    return 1e-3 * math.sqrt(2.0 * acceleration * p.release)
+
+
+@kernel(inline=True)
 def _penetrating(state) -> bool:
     inside = 0
     for pair in range(8):
@@ -642,17 +654,27 @@ def _penetrating(state) -> bool:
     return inside > 0
 
 
+@kernel(fast=True)
+def worn_depth(state, w, sigma, out) -> None:
+    """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
+    depth = row(state.depth, 0)
+    if _penetrating(state):
+        # row 0 would be the depth itself; pairs without force do not wear
+        order = state.step[ORDER]
+        growth = row(w.worn, order)
+        for k in range(order - 1, 0, -1):
+            growth = growth * sigma + row(w.worn, k)
+        depth = depth + growth * sigma
+    set_row(out, 0, depth)
+
+
 @kernel()
 def finish(p, state, w, totals, log, wear, fraction) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
     clock, step, y = state.clock, state.step, state.y
-    sigma, order = clock[SIGMA], step[ORDER]
-    if wear is not None and _penetrating(state):
-        # row 0 would be the depth itself; pairs without force have not worn
-        growth = row(w.worn, order)
-        for k in range(order - 1, 0, -1):
-            growth = growth * sigma + row(w.worn, k)
-        set_row(state.depth, 0, row(state.depth, 0) + growth * sigma)
+    sigma = clock[SIGMA]
+    if wear is not None:
+        worn_depth(state, w, sigma, state.depth)
     evaluate(state, w, sigma, y)
     y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
     before = clock[T0]
@@ -685,7 +707,7 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:
         touch(p, state, pair)
         totals.makes[pair] += 1
         if fraction is not None and new == ON:
-            if gap_and_rate(p, state, pair)[1] > 0.0:
+            if gap_and_rate(p, state, pair)[1] > _slow_touch(p):
                 step[TOUCHING] |= 1 << pair
                 clock[TOUCHED] = clock[T0]
             else:
