@@ -13,16 +13,18 @@ INSTALLED := $(VENV)/.installed
 SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
+# two processes, each with whole files: much of the time goes to compiling and to waiting for nodes
+PARALLEL ?= -n 2 --dist loadfile
 BENCH_ARGS ?=
 
 demo: $(INSTALLED)
 	"$(VENV)/bin/plow-twin" demo --speed $(SPEED) --out "$(OUT)"
 
 test: $(INSTALLED)
-	"$(VENV)/bin/python" -m pytest -m "not stress" $(PYTEST_ARGS)
+	"$(VENV)/bin/python" -m pytest -m "not stress" $(PARALLEL) $(PYTEST_ARGS)
 
 stress: $(INSTALLED)
-	"$(VENV)/bin/python" -m pytest -m stress $(PYTEST_ARGS)
+	"$(VENV)/bin/python" -m pytest -m stress $(PARALLEL) $(PYTEST_ARGS)
 
 lint: $(INSTALLED)
 	"$(VENV)/bin/ruff" check .
