@@ -10,15 +10,31 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive
 from plow_twin.solve.compiled import Compiled, compile_scene, per_mass
-from plow_twin.solve.layout import LENGTH, NOW, STATE, STEPS, TOTALS, Status, new_record, new_work
+from plow_twin.solve.layout import (
+    BOUNDED,
+    COEFFICIENTS,
+    LENGTH,
+    NOW,
+    STATE,
+    STEPS,
+    TOTALS,
+    Bound,
+    Status,
+    new_record,
+    new_work,
+)
+from plow_twin.solve.step import PARTING_ORDER
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Steps one advance may take before it gives up.
 DEFAULT_BUDGET = 50_000_000
+#: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
+LEAST_EVALUATIONS = 16
 
 
 @dataclass(frozen=True)
@@ -43,6 +59,8 @@ class Advance:
         Steps the solver took.
     status : Status
         Anything but `OK` means that the state is the last good one.
+    error_estimate_m : float
+        Estimated error of the pose in m where `max_evaluations` did not suffice for the tolerance, else 0.
     """
 
     t: float
@@ -57,6 +75,7 @@ class Advance:
     wear_depth: NDArray[np.float64]
     steps: int
     status: Status
+    error_estimate_m: float
 
 
 @dataclass(frozen=True)
@@ -75,6 +94,7 @@ class AdvanceSeries:
     wear_depth: NDArray[np.float64]
     steps: NDArray[np.int64]
     status: NDArray[np.int64]
+    error_estimate_m: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.t)
@@ -82,7 +102,11 @@ class AdvanceSeries:
     def __getitem__(self, index: int) -> Advance:
         fields = {name: getattr(self, name)[index] for name in _ROW_FIELDS}
         return Advance(
-            t=float(self.t[index]), steps=int(self.steps[index]), status=Status(int(self.status[index])), **fields
+            t=float(self.t[index]),
+            steps=int(self.steps[index]),
+            status=Status(int(self.status[index])),
+            error_estimate_m=float(self.error_estimate_m[index]),
+            **fields,
         )
 
 
@@ -102,6 +126,10 @@ class Twin:
         loads are not used.
     start : float
         Model time of the scene's initial state in s.
+    max_evaluations : int, optional
+        For hard real-time: an advance evaluates the equations of motion at most so often (an order of the series counts
+        as one). Where that is not enough the rest of the way is taken by a few Runge-Kutta steps, and
+        `error_estimate_m` of the advance is not zero. At least `LEAST_EVALUATIONS`.
 
     Notes
     -----
@@ -116,6 +144,7 @@ class Twin:
         tol: float = 1e-9,
         excitation: Literal["scene", "sampled"] = "scene",
         start: float = 0.0,
+        max_evaluations: int | None = None,
     ) -> None:
         if excitation not in ("scene", "sampled"):
             raise ValueError(f"excitation: got {excitation!r}, expected 'scene' or 'sampled'")
@@ -124,6 +153,7 @@ class Twin:
         self.excitation = excitation
         self._compiled: Compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
         self._parts = self._compiled.parts
+        self._budget, self._bound = _bounded(max_evaluations, int(self._compiled.params.order))
         self._work = new_work()
         self._totals = new_record(TOTALS)
         self._state = self._compiled.initial_state(start)
@@ -193,7 +223,7 @@ class Twin:
         ends = np.concatenate([self._wrench[None], samples])
         drive.advance_samples(
             self._compiled.params, self._parts, self._state, self._work, self._totals, times,
-            per_mass(self.scene, ends), DEFAULT_BUDGET, *_columns(out),
+            per_mass(self.scene, ends), self._budget, *_columns(out), self._bound,
         )  # fmt: skip
         self._wrench = samples[-1].copy() if len(samples) else self._wrench
         return out
@@ -245,6 +275,16 @@ class Twin:
         """Steps taken so far."""
         return int(self._state.count[STEPS])
 
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the equations of motion so far; an order of the series counts as one."""
+        return int(self._state.count[COEFFICIENTS])
+
+    @property
+    def bounded(self) -> int:
+        """Advances so far whose end was coarse because of `max_evaluations`."""
+        return int(self._state.count[BOUNDED])
+
     def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
         self._check_times(times)
         out = _empty_series(times)
@@ -255,8 +295,9 @@ class Twin:
             self._work,
             self._totals,
             times,
-            DEFAULT_BUDGET,
+            self._budget,
             *_columns(out),
+            self._bound,
         )
         return out
 
@@ -279,6 +320,17 @@ class Twin:
             self._parts.wear[:] = wear.coefficient_m2_n * speed / wear.pad_area_m2
 
 
+def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None]:
+    """Return the steps of the series that an advance may take, and what is kept for its coarse end."""
+    if max_evaluations is None:
+        return DEFAULT_BUDGET, None
+    if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:
+        raise ValueError(f"max_evaluations: got {max_evaluations!r}, expected an integer >= {LEAST_EVALUATIONS}")
+    coarse = max(LEAST_EVALUATIONS // 4, max_evaluations // 16)
+    budget = (int(max_evaluations) - 4 * coarse) // (order + PARTING_ORDER)
+    return budget, Bound(coarse, np.zeros(1), np.zeros((6, 6)), np.zeros(3), np.zeros((4, PAIR_COUNT)))
+
+
 def _empty_series(times: NDArray[np.float64]) -> AdvanceSeries:
     n = len(times)
 
@@ -298,8 +350,9 @@ def _empty_series(times: NDArray[np.float64]) -> AdvanceSeries:
         wear_depth=rows(8),
         steps=np.zeros(n, np.int64),
         status=np.zeros(n, np.int64),
+        error_estimate_m=np.zeros(n),
     )
 
 
 def _columns(out: AdvanceSeries) -> tuple[NDArray[np.float64] | NDArray[np.int64], ...]:
-    return tuple(getattr(out, name) for name in (*_ROW_FIELDS, "steps", "status"))
+    return tuple(getattr(out, name) for name in (*_ROW_FIELDS, "steps", "status", "error_estimate_m"))

@@ -165,3 +165,25 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
     twin.advance(0.02)
     twin.restore(twin.snapshot())
     assert [len(kernel.signatures) for kernel in (drive.advance_times, drive.end_step, drive.lay_out_again)] == before
+
+
+def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:
+    scene, t = preset("bench_kv"), np.arange(1, 4001) * 1e-3
+    wrench = compile_loads(scene.loads).at(t)
+    exact = Twin(scene, excitation="sampled").advance_samples(t, wrench)
+    for bound in (16, 64, 400):
+        twin = Twin(scene, excitation="sampled", max_evaluations=bound)
+        before, most = 0, 0
+        for row in range(len(t)):
+            advance = twin.advance(t[row], wrench[row])
+            used = twin.evaluations - before
+            before, most = twin.evaluations, max(most, used)
+            assert advance.status is Status.OK
+        assert most <= bound
+        series = Twin(scene, excitation="sampled", max_evaluations=bound).advance_samples(t, wrench)
+        error, estimate = np.abs(series.q - exact.q).max(), series.error_estimate_m.sum()
+        assert (twin.bounded == 0) == (estimate == 0.0) == (error == 0.0)
+        assert error <= 10.0 * estimate and error < 1e-4
+    assert twin.bounded == 0
+    with pytest.raises(ValueError, match="max_evaluations: got 15, expected an integer >= 16"):
+        Twin(scene, max_evaluations=15)

@@ -7,6 +7,7 @@ import numpy as np
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row, splat
 from plow_twin.solve.audit import audit_start, audit_step
+from plow_twin.solve.fixed import end_coarsely
 from plow_twin.solve.layout import (
     AT_HARD_END,
     COEFFICIENTS,
@@ -118,8 +119,11 @@ def _clear(totals) -> None:
 
 
 @kernel()
-def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:
-    """Proceed to `target`; when that fails, time goes on but the head stays as it was, and nothing is counted."""
+def _advance(p, parts, state, w, totals, target, hard_time, budget, bound) -> int:
+    """Proceed to `target`; when that fails, time goes on but the head stays as it was, and nothing is counted.
+
+    With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
+    """
     saved = w.saved
     _present(state, w, saved[0])
     set_row(saved, 1, row(state.factor, 0))
@@ -127,6 +131,10 @@ def _advance(p, parts, state, w, totals, target, hard_time, budget) -> int:
     for pair in range(8):
         w.modes[pair] = state.mode[pair]
     code = _proceed(p, parts, state, w, totals, target, hard_time, budget)
+    if bound is not None:
+        bound.error[0] = 0.0
+        if code == _BUDGET:
+            code = end_coarsely(p, parts, state, totals, target, bound)
     if code != _OK:
         set_row(state.y, 0, row(saved, 0))
         set_row(state.factor, 0, row(saved, 1))
@@ -173,11 +181,15 @@ def advance_times(
     depth,
     steps,
     status,
+    error_estimate,
+    bound,
 ) -> None:
     """Advance to each time under the scene's own loads and write a row for each."""
     for i in range(times.size):
         before = state.count[STEPS]
-        status[i] = _advance(p, parts, state, w, totals, times[i], np.inf, before + budget)
+        status[i] = _advance(p, parts, state, w, totals, times[i], np.inf, before + budget, bound)
+        if bound is not None:
+            error_estimate[i] = bound.error[0]
         steps[i] = state.count[STEPS] - before
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
 
@@ -203,6 +215,8 @@ def advance_samples(
     depth,
     steps,
     status,
+    error_estimate,
+    bound,
 ) -> None:
     """Advance to each time under a wrench that runs straight from wrench[i] to wrench[i + 1]; a sample ends a step."""
     piece = parts.segments
@@ -214,7 +228,9 @@ def advance_samples(
         for j in range(3):
             piece.start[0, j] = wrench[i, j]
             piece.slope[0, j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
-        status[i] = _advance(p, parts, state, w, totals, times[i], times[i], before + budget)
+        status[i] = _advance(p, parts, state, w, totals, times[i], times[i], before + budget, bound)
+        if bound is not None:
+            error_estimate[i] = bound.error[0]
         steps[i] = state.count[STEPS] - before
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
 

@@ -14,9 +14,29 @@ from plow_twin.model.contact import normal_force
 from plow_twin.model.friction import friction_force
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.audit import audit_fixed, audit_start
-from plow_twin.solve.layout import COEFFICIENTS, COS, EVENTS, OFF, OMEGA, ON, SIN, STEPS, THETA, VX, VY, Status
+from plow_twin.solve.layout import (
+    BOUNDED,
+    COEFFICIENTS,
+    COS,
+    EVENTS,
+    LAST_LENGTH,
+    NOW,
+    OFF,
+    OMEGA,
+    ON,
+    SIN,
+    STALL,
+    STEPS,
+    T0,
+    THETA,
+    TOUCHED,
+    TOUCHING,
+    VX,
+    VY,
+    Status,
+)
 from plow_twin.solve.loads import combined, load_at
-from plow_twin.solve.step import pair_outputs, pose_of, touch, within_range
+from plow_twin.solve.step import mode_inside, pair_outputs, pose_of, touch, within_range
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _LOG_FULL = int(Status.LOG_FULL)
@@ -81,10 +101,11 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:
         if mode == ON:
             touch(p, state, pair)
             totals.makes[pair] += 1
-        i = log.length[0]
-        log.time[i], log.pair[i], log.rate[i] = time, pair, rate[pair]
-        log.mode_from[i], log.mode_to[i] = state.mode[pair], mode
-        log.length[0] = i + 1
+        if log is not None:
+            i = log.length[0]
+            log.time[i], log.pair[i], log.rate[i] = time, pair, rate[pair]
+            log.mode_from[i], log.mode_to[i] = state.mode[pair], mode
+            log.length[0] = i + 1
         state.mode[pair] = mode
         state.count[EVENTS] += 1
 
@@ -106,15 +127,86 @@ def _account(state, force_before, force, dt, totals) -> None:
 
 
 @kernel()
+def _to_world(y, z) -> None:
+    """Write z from body coordinates."""
+    c, s = y[COS], y[SIN]
+    z[0], z[1], z[2] = c * y[0] - s * y[1], s * y[0] + c * y[1], y[THETA]
+    z[3], z[4], z[5] = c * y[VX] - s * y[VY], s * y[VX] + c * y[VY], y[OMEGA]
+
+
+@kernel()
+def _runge_kutta(p, parts, state, t, dt, z, trial, k, load) -> None:
+    """Take one step of the classical Runge-Kutta method; z (6,) in place, the four stages stay in k (4, 6)."""
+    _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t, z, load, k[0])
+    for stage in range(1, 4):
+        part = dt if stage == 3 else 0.5 * dt
+        for j in range(6):
+            trial[j] = z[j] + part * k[stage - 1, j]
+        _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t + part, trial, load, k[stage])
+    for j in range(6):
+        z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
+    state.count[COEFFICIENTS] += 4
+
+
+@kernel()
+def end_coarsely(p, parts, state, totals, target, bound) -> int:
+    """Bring the state to `target` by the bound's few Runge-Kutta steps; estimate the error. Returns a `Status`.
+
+    The estimate is the two middle stages' difference, |k2 - k3| dt / 3, of the order below the method's, with errors of
+    the velocity counted over the time left; and where a pair has touched or parted within a step the impulse in doubt,
+    F dt / 2, over the time in which the largest load crosses the clearance.
+    """
+    y, clock, z, k = state.y, state.clock, bound.z[0], bound.z[2:]
+    pen, rate, now, before = bound.pairs[0], bound.pairs[1], bound.pairs[2], bound.pairs[3]
+    start = clock[T0]
+    dt = (target - start) / bound.steps
+    _to_world(y, z)
+    for pair in range(8):
+        # a pair that was clipped or released is inside all the same
+        state.mode[pair] = OFF if state.mode[pair] == OFF else ON
+    pair_outputs(p, state, state.depth, y, pen, rate, now)
+    state.count[BOUNDED] += 1
+    for n in range(bound.steps):
+        _runge_kutta(p, parts, state, start + n * dt, dt, z, bound.z[1], k, bound.load)
+        left = target - start - (n + 1) * dt
+        for j in range(3):
+            radius = p.radius if j == 2 else 1.0
+            off, drift = abs(k[1, j] - k[2, j]), abs(k[1, 3 + j] - k[2, 3 + j])
+            bound.error[0] += radius * dt / 3.0 * (off + (left + dt) * drift)
+        if not np.isfinite(z).all():
+            return _NON_FINITE
+        state.count[STEPS] += 1
+        _to_body(z, y)
+        _wear(parts.wear, state, now, dt)
+        for pair in range(8):
+            before[pair] = now[pair]
+        pair_outputs(p, state, state.depth, y, pen, rate, now)
+        _switch(p, state, pen, rate, start + (n + 1) * dt, totals, None)
+        pair_outputs(p, state, state.depth, y, pen, rate, now)
+        for pair in range(8):
+            if (before[pair] > 0.0) != (now[pair] > 0.0):
+                doubt = 0.5 * dt * (before[pair] + now[pair]) * p.inverse_mass
+                bound.error[0] += doubt * p.position_tolerance / p.velocity_tolerance
+        _account(state, before, now, dt, totals)
+        if not within_range(p, state, y):
+            return _RANGE
+    clock[T0] = clock[NOW] = target
+    clock[LAST_LENGTH], clock[TOUCHED] = 0.0, -np.inf
+    state.step[TOUCHING] = state.step[STALL] = 0
+    for pair in range(8):
+        if state.mode[pair] == ON:
+            state.mode[pair] = mode_inside(p, state, pair)
+    return _OK
+
+
+@kernel()
 def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force, audit) -> int:
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
     z, trial = np.empty(6), np.empty(6)
     k = np.empty((4, 6))
     load, y = np.empty(3), state.y
     pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
-    c, s = y[COS], y[SIN]
-    z[0], z[1], z[2] = c * y[0] - s * y[1], s * y[0] + c * y[1], y[THETA]
-    z[3], z[4], z[5] = c * y[VX] - s * y[VY], s * y[VX] + c * y[VY], y[OMEGA]
+    _to_world(y, z)
     pair_outputs(p, state, state.depth, y, pen, rate, now)
     if audit is not None and done[0] == 0:
         audit_start(p, parts, state, y, 0.0, audit)
@@ -140,15 +232,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
                 z[j] += dt * z[3 + j]
             state.count[COEFFICIENTS] += 1
         else:
-            _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t, z, load, k[0])
-            for stage in range(1, 4):
-                part = dt if stage == 3 else 0.5 * dt
-                for j in range(6):
-                    trial[j] = z[j] + part * k[stage - 1, j]
-                _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t + part, trial, load, k[stage])
-            for j in range(6):
-                z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
-            state.count[COEFFICIENTS] += 4
+            _runge_kutta(p, parts, state, t, dt, z, trial, k, load)
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.count[STEPS] += 1

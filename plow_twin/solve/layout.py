@@ -44,7 +44,7 @@ T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW = rang
 # indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
 ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END = range(7)
 # indices into State.count
-STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES = range(5)
+STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES, BOUNDED = range(6)
 
 
 class Status(IntEnum):
@@ -118,7 +118,7 @@ STATE: Final = np.dtype(
         ("beyond", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
         ("clock", "f8", (10,)),
         ("step", "i8", (7,)),
-        ("count", "i8", (5,)),
+        ("count", "i8", (6,)),
     ]
 )
 
@@ -220,6 +220,16 @@ class Parts(NamedTuple):
     offset: Array | None  #: (2,) centre of mass from the cavity's centre
     free: Array | None  #: (3,) 1 free, 0 locked
     slip: Slip | None
+
+
+class Bound(NamedTuple):
+    """What bounds the work of an advance, and scratch space for its coarse end."""
+
+    steps: int  #: Runge-Kutta steps that are kept for the end
+    error: Array  #: (1,) error estimate in m of the advance, 0 while the bound does not bite
+    z: Array  #: (6, 6) state, trial state, four stages
+    load: Array  #: (3,)
+    pairs: Array  #: (4, 8) penetration, rate, force, force before
 
 
 class Log(NamedTuple):

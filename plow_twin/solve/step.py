@@ -64,7 +64,7 @@ from plow_twin.solve.series import expand, expand_harmonics
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
 #: A pair that would part within so many steps like the last is looked at, by a series of this order.
-_PARTING_REACH, _PARTING_ORDER = 1.3, 6
+_PARTING_REACH, PARTING_ORDER = 1.3, 6
 #: A touch no farther back than so many steps like the last still shapes the series.
 _TOUCH_REACH = 2.5
 
@@ -88,18 +88,24 @@ def touch(p, state, pair) -> None:
 
 
 @kernel()
+def mode_inside(p, state, pair):
+    """Return the mode of a pair that penetrates, and note on which side of its ramp's end it is."""
+    depth, rate = gap_and_rate(p, state, pair)
+    state.beyond[pair] = 1 if depth > p.ramp else 0
+    if free_force(depth, rate, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp) < 0.0:
+        return CLIPPED
+    return ON if depth >= p.release else RELEASED
+
+
+@kernel()
 def settle_modes(p, state) -> None:
     """Choose each pair's mode from its penetration, where a motion starts or is changed from outside."""
     for pair in range(8):
         state.mode[pair] = OFF
         state.beyond[pair] = 0
-        depth, rate = gap_and_rate(p, state, pair)
-        if p.enabled[pair] == 1 and depth > 0.0:
+        if p.enabled[pair] == 1 and gap_and_rate(p, state, pair)[0] > 0.0:
             touch(p, state, pair)
-            state.mode[pair] = ON if depth >= p.release else RELEASED
-            if free_force(depth, rate, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp) < 0.0:
-                state.mode[pair] = CLIPPED
-            state.beyond[pair] = 1 if depth > p.ramp else 0
+            state.mode[pair] = mode_inside(p, state, pair)
     state.clock[USED] = 0.0
     state.clock[LENGTH] = -1.0
     state.clock[LAST_LENGTH] = 0.0
@@ -377,12 +383,12 @@ def _time_to_part(
     if not near:
         return 0.0
     if harmonics is not None:
-        expand_harmonics(harmonics, second, state.clock[T0], 1.0, 0.0, _PARTING_ORDER, w)
+        expand_harmonics(harmonics, second, state.clock[T0], 1.0, 0.0, PARTING_ORDER, w)
     order = expand(
         p,
         state,
         w,
-        _PARTING_ORDER,
+        PARTING_ORDER,
         True,
         span,
         harmonics,
@@ -398,6 +404,7 @@ def _time_to_part(
         ramp,
         slip,
     )
+    state.count[COEFFICIENTS] += order
     first = np.inf
     for pair in range(8):
         if state.mode[pair] != ON or w.gap[1, pair] >= 0.0:
