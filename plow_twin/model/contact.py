@@ -22,14 +22,12 @@ from plow_twin.model.lanes import row, splat
 def free_force(
     penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float, ramp: float
 ) -> float:
-    """Return the law's F in N for penetration d in m and rate d' in m/s, negative where it would pull; 0 for d <= 0.
+    """Return the law's F in N for penetration d in m and rate d' in m/s, negative where it would pull.
 
     `factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero. `ramp` in m is zero without a ramp.
     """
-    if penetration <= 0.0:
-        return 0.0
-    elastic = stiffness * (penetration if exponent == 1.0 else penetration**exponent)
-    if penetration < ramp:
+    elastic = stiffness * (penetration if exponent == 1.0 else max(penetration, 0.0) ** exponent)
+    if ramp > 0.0 and penetration < ramp:
         share = penetration / ramp
         viscous *= share * share * (3.0 - 2.0 * share)
     return elastic * (1.0 + factor * rate) + viscous * rate
@@ -39,7 +37,9 @@ def free_force(
 def normal_force(
     penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float, ramp: float
 ) -> float:
-    """Return F >= 0 in N: a contact never pulls (`free_force`)."""
+    """Return F >= 0 in N: a contact never pulls, nor acts from outside (`free_force`)."""
+    if penetration <= 0.0:
+        return 0.0
     return max(0.0, free_force(penetration, rate, stiffness, exponent, factor, viscous, ramp))
 
 

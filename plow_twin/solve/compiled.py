@@ -21,6 +21,7 @@ from plow_twin.solve.layout import (
     T0,
     Array,
     Harmonics,
+    Implicit,
     Law,
     Params,
     Parts,
@@ -30,6 +31,7 @@ from plow_twin.solve.layout import (
     new_record,
 )
 from plow_twin.solve.step import settle_modes
+from plow_twin.solve.stiff import new_implicit
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
@@ -39,6 +41,8 @@ STEP_SHARE = 3e-4
 STEP_SHARE_FRACTION = 1e-6
 #: Mode changes at one instant before the solver goes on past it.
 MAX_EVENTS_AT_ONCE = 64
+#: Rate of decay over the spring's frequency from which implicit steps are compiled in.
+_OVERDAMPED = 200.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +132,8 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     segments = segments_of(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
         segments = Segments(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
-    parts = Parts(harmonics, second, segments, law, _wear_rate(scene), offset, free, _slip(scene))
+    parts = Parts(harmonics, second, segments, law, _wear_rate(scene), offset, free, _slip(scene), None)
+    parts = parts._replace(implicit=_implicit(scene, parts, params))
     return Compiled(scene, params, parts, loads)
 
 
@@ -219,6 +224,24 @@ def _release(scene: Scene, velocity_tolerance: float, speed: float, exponent: fl
     """
     impulse = 1e-5 * velocity_tolerance * scene.head.mass_kg
     return float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
+
+
+def _implicit(scene: Scene, parts: Parts, params: Params) -> Implicit | None:
+    """Return what implicit steps need, where a contact's damping can outweigh its spring far enough to pay."""
+    law, contact = parts.law, scene.contact
+    if law.ramp is not None or parts.slip is not None or parts.wear is not None:
+        return None
+    mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
+    largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
+    depth = (largest_force / contact.stiffness) ** (1.0 / contact.exponent)
+    spring = contact.exponent * largest_force / depth
+    if law.viscous is not None:
+        damping = law.viscous
+    elif law.factor is not None:
+        damping = largest_force * (contact.damping or params.damping_factor / params.speed_floor)
+    else:
+        return None
+    return new_implicit() if damping * mobility > _OVERDAMPED * math.sqrt(spring * mobility) else None
 
 
 def _slip(scene: Scene) -> Slip | None:

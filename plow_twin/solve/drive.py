@@ -47,6 +47,7 @@ def _lay_out(p, parts, state, w, hard_time) -> bool:
     return begin(
         p, state, w, hard_time, parts.harmonics, parts.second, parts.segments,
         law.viscous, law.factor, law.integer, law.fraction, parts.wear, parts.offset, parts.free, law.ramp, parts.slip,
+        parts.implicit, parts,
     )  # fmt: skip
 
 

@@ -6,88 +6,30 @@ independently of the series: a check on them as much as a method.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from plow_twin.model.contact import normal_force
-from plow_twin.model.friction import friction_force
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.audit import audit_fixed, audit_start
 from plow_twin.solve.layout import (
     BOUNDED,
     COEFFICIENTS,
-    COS,
     EVENTS,
     LAST_LENGTH,
     NOW,
     OFF,
-    OMEGA,
     ON,
-    SIN,
     STALL,
     STEPS,
     T0,
-    THETA,
     TOUCHED,
     TOUCHING,
-    VX,
-    VY,
     Status,
 )
-from plow_twin.solve.loads import combined, load_at
+from plow_twin.solve.motion import accelerate, to_body, to_world
 from plow_twin.solve.step import mode_inside, pair_outputs, pose_of, touch, within_range
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _LOG_FULL = int(Status.LOG_FULL)
-
-
-@kernel()
-def _accelerations(p, parts, offset, free, slip, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega) of the centre of mass, world axes."""
-    load_at(p, parts.harmonics, parts.second, parts.segments, t, load)
-    A, B = p.gap, p.arm
-    c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
-    x, y, vx, vy = c * z[0] + s * z[1], c * z[1] - s * z[0], c * z[3] + s * z[4], c * z[4] - s * z[3]
-    fx = fy = torque = 0.0
-    for pair in range(8):
-        if p.enabled[pair] == 0:
-            continue
-        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * x + A[3, pair] * y + A[4, pair] - state.depth[pair]
-        if d > 0.0:
-            r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (vx + om * y) + A[3, pair] * (vy - om * x)
-            f = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)
-            fx -= A[2, pair] * f
-            fy -= A[3, pair] * f
-            torque += (B[0, pair] * c + B[1, pair] * s + B[2, pair] * x + B[3, pair] * y) * f
-            if slip is not None:
-                along = combined(slip.rows, pair, -om * s, om * c, vx + om * y, vy - om * x)
-                drag = friction_force(f, along, slip.coefficient, slip.speed)
-                # t is the normal turned by +90 degrees
-                fx += A[3, pair] * drag
-                fy -= A[2, pair] * drag
-                torque += combined(slip.arm, pair, c, s, x, y) * drag
-    moment = load[2] + torque * p.inverse_inertia
-    if offset is not None:
-        force_x, force_y = load[0], load[1] + p.gravity
-        across = (c * offset[0] - s * offset[1]) * force_y - (s * offset[0] + c * offset[1]) * force_x
-        moment -= across * p.inverse_inertia / p.inverse_mass
-    out[0], out[1], out[2] = z[3], z[4], z[5]
-    out[3] = load[0] + (c * fx - s * fy) * p.inverse_mass
-    out[4] = load[1] + (s * fx + c * fy) * p.inverse_mass
-    out[5] = moment
-    if free is not None:
-        for j in range(3):
-            out[3 + j] *= free[j]
-
-
-@kernel()
-def _to_body(z, y) -> None:
-    """Write body coordinates from z."""
-    c, s = math.cos(z[2]), math.sin(z[2])
-    y[0], y[1] = c * z[0] + s * z[1], c * z[1] - s * z[0]
-    y[VX], y[VY], y[OMEGA] = c * z[3] + s * z[4], c * z[4] - s * z[3], z[5]
-    y[COS], y[SIN], y[THETA] = c, s, z[2]
 
 
 @kernel()
@@ -127,22 +69,14 @@ def _account(state, force_before, force, dt, totals) -> None:
 
 
 @kernel()
-def _to_world(y, z) -> None:
-    """Write z from body coordinates."""
-    c, s = y[COS], y[SIN]
-    z[0], z[1], z[2] = c * y[0] - s * y[1], s * y[0] + c * y[1], y[THETA]
-    z[3], z[4], z[5] = c * y[VX] - s * y[VY], s * y[VX] + c * y[VY], y[OMEGA]
-
-
-@kernel()
 def _runge_kutta(p, parts, state, t, dt, z, trial, k, load) -> None:
     """Take one step of the classical Runge-Kutta method; z (6,) in place, the four stages stay in k (4, 6)."""
-    _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t, z, load, k[0])
+    accelerate(p, parts, parts.offset, parts.free, parts.slip, False, state, t, z, load, k[0])
     for stage in range(1, 4):
         part = dt if stage == 3 else 0.5 * dt
         for j in range(6):
             trial[j] = z[j] + part * k[stage - 1, j]
-        _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t + part, trial, load, k[stage])
+        accelerate(p, parts, parts.offset, parts.free, parts.slip, False, state, t + part, trial, load, k[stage])
     for j in range(6):
         z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
     state.count[COEFFICIENTS] += 4
@@ -160,7 +94,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     pen, rate, now, before = bound.pairs[0], bound.pairs[1], bound.pairs[2], bound.pairs[3]
     start = clock[T0]
     dt = (target - start) / bound.steps
-    _to_world(y, z)
+    to_world(y, z)
     for pair in range(8):
         # a pair that was clipped or released is inside all the same
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
@@ -176,7 +110,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.count[STEPS] += 1
-        _to_body(z, y)
+        to_body(z, y)
         _wear(parts.wear, state, now, dt)
         for pair in range(8):
             before[pair] = now[pair]
@@ -206,7 +140,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
     k = np.empty((4, 6))
     load, y = np.empty(3), state.y
     pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
-    _to_world(y, z)
+    to_world(y, z)
     pair_outputs(p, state, state.depth, y, pen, rate, now)
     if audit is not None and done[0] == 0:
         audit_start(p, parts, state, y, 0.0, audit)
@@ -226,7 +160,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
             return _LOG_FULL
         t = n * dt
         if euler:
-            _accelerations(p, parts, parts.offset, parts.free, parts.slip, state, t, z, load, k[0])
+            accelerate(p, parts, parts.offset, parts.free, parts.slip, False, state, t, z, load, k[0])
             for j in range(3):
                 z[3 + j] += dt * k[0, 3 + j]
                 z[j] += dt * z[3 + j]
@@ -236,7 +170,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.count[STEPS] += 1
-        _to_body(z, y)
+        to_body(z, y)
         _wear(parts.wear, state, now, dt)
         before[:] = now
         pair_outputs(p, state, state.depth, y, pen, rate, now)

@@ -40,11 +40,11 @@ RELEASED: Final = 3
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
 # indices into State.clock: step's start, time into it and length; map of the series' variable to time; end of what is
 # linear; length of the step before; last touch; present time, bit for bit as it was asked for
-T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW = range(10)
+T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW, IMPLICIT_LENGTH, EXPLICIT_LENGTH = range(12)
 # indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
-ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END = range(7)
+ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END, OVERDAMPED = range(8)
 # indices into State.count
-STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES, BOUNDED = range(6)
+STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES, BOUNDED, IMPLICIT = range(7)
 
 
 class Status(IntEnum):
@@ -116,9 +116,9 @@ STATE: Final = np.dtype(
         ("depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad
         ("mode", "i8", (PAIR_COUNT,)),
         ("beyond", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
-        ("clock", "f8", (10,)),
-        ("step", "i8", (7,)),
-        ("count", "i8", (6,)),
+        ("clock", "f8", (12,)),
+        ("step", "i8", (8,)),
+        ("count", "i8", (7,)),
     ]
 )
 
@@ -201,6 +201,24 @@ class Slip(NamedTuple):
     speed: float  #: regularisation speed in m/s
 
 
+class Implicit(NamedTuple):
+    """Nodes, weights and scratch space of an implicit step with s stages (`solve.stiff`)."""
+
+    nodes: Array  #: (s,)
+    weights: Array  #: (s, s)
+    from_values: Array  #: (s + 1, s + 1) coefficients from values at the start and at the nodes
+    from_stages: Array  #: (s, s) the same from values at the nodes
+    z: Array  #: (s + 1, 6) state at the start and at the nodes
+    rate: Array  #: (2, 6) rates for a difference
+    accelerations: Array  #: (s, 3)
+    jacobians: Array  #: (s, 2, 3, 3) of the accelerations, by place and by velocity
+    matrix: Array  #: (3 s, 3 s)
+    residual: Array  #: (3 s,)
+    body: Array  #: (s + 1, 8) body coordinates
+    forces: Array  #: (s, 8)
+    load: Array  #: (3,)
+
+
 class Segments(NamedTuple):
     """Linear pieces of a sampled load, per mass and inertia."""
 
@@ -220,6 +238,7 @@ class Parts(NamedTuple):
     offset: Array | None  #: (2,) centre of mass from the cavity's centre
     free: Array | None  #: (3,) 1 free, 0 locked
     slip: Slip | None
+    implicit: Implicit | None
 
 
 class Bound(NamedTuple):

@@ -38,6 +38,7 @@ from plow_twin.solve.layout import (
     OMEGA,
     ON,
     ORDER,
+    OVERDAMPED,
     PIECE,
     RAMPS,
     RATIO,
@@ -60,6 +61,7 @@ from plow_twin.solve.layout import (
 )
 from plow_twin.solve.polynomial import first_root, maximum, shift_column
 from plow_twin.solve.series import expand, expand_harmonics
+from plow_twin.solve.stiff import PATIENCE, STAGES, collocate, note_explicit
 
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
@@ -138,8 +140,8 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
         if state.mode[pair] == ON:
             # released below a quarter of the depth at which it acts again, so that no pair hovers between
             first -= min(0.25 * p.release, 0.5 * first)
-        elif state.mode[pair] == RELEASED:
-            # and let go a little outside the wall
+        elif state.mode[pair] == RELEASED and first <= 1e-6 * p.release:
+            # one that rests on the wall is let go a little outside
             first = max(guard[0, pair] + 0.25 * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
@@ -445,6 +447,8 @@ def begin(
     free,
     ramp,
     slip,
+    implicit,
+    parts,
 ) -> bool:
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step = state.clock, state.step
@@ -458,17 +462,56 @@ def begin(
     span = min(hard_time - t0, LONGEST_STEP)
     limited = span < LONGEST_STEP
     clock[ALPHA], clock[BETA] = 1.0, 0.0
-    hard = span
-    if step[TOUCHING] != 0:
-        # a force that starts like d^1.5 is analytic in the square root of time
-        clock[ALPHA], clock[BETA] = 0.0, 2.0
-        hard = math.sqrt(span)
-    elif fraction is not None and penetrating:
-        parting = _time_to_part(
+    hard, length = span, 0.0
+    if implicit is not None and penetrating and step[OVERDAMPED] >= PATIENCE:
+        length = collocate(p, parts, state, w, span, implicit)
+    if length > 0.0:
+        order, sigma = STAGES, length
+        state.count[STEPS] += 1
+    else:
+        if step[TOUCHING] != 0:
+            # a force that starts like d^1.5 is analytic in the square root of time
+            clock[ALPHA], clock[BETA] = 0.0, 2.0
+            hard = math.sqrt(span)
+        elif fraction is not None and penetrating:
+            parting = _time_to_part(
+                p,
+                state,
+                w,
+                span,
+                harmonics,
+                second,
+                segments,
+                viscous,
+                factor,
+                integer,
+                fraction,
+                wear,
+                offset,
+                free,
+                ramp,
+                slip,
+            )
+            if parting > 0.0:
+                # one that ends like d^1.5 is analytic in the root of the time left
+                root = math.sqrt(parting)
+                clock[ALPHA], clock[BETA] = 2.0 * root, -2.0
+                hard = root if parting <= span else root - math.sqrt(parting - span)
+                limited = limited and parting > span
+            elif fraction == 1.5 and 0.0 < t0 - clock[TOUCHED] < _TOUCH_REACH * clock[LAST_LENGTH]:
+                # and still in the root of the time since its start, some steps on
+                root = math.sqrt(t0 - clock[TOUCHED])
+                clock[ALPHA], clock[BETA] = 2.0 * root, 2.0
+                hard = math.sqrt(t0 - clock[TOUCHED] + span) - root
+        if harmonics is not None:
+            expand_harmonics(harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
+        order = expand(
             p,
             state,
             w,
-            span,
+            p.order,
+            penetrating,
+            hard,
             harmonics,
             second,
             segments,
@@ -482,46 +525,15 @@ def begin(
             ramp,
             slip,
         )
-        if parting > 0.0:
-            # one that ends like d^1.5 is analytic in the root of the time left
-            root = math.sqrt(parting)
-            clock[ALPHA], clock[BETA] = 2.0 * root, -2.0
-            hard = root if parting <= span else root - math.sqrt(parting - span)
-            limited = limited and parting > span
-        elif fraction == 1.5 and 0.0 < t0 - clock[TOUCHED] < _TOUCH_REACH * clock[LAST_LENGTH]:
-            # and still in the root of the time since its start, some steps on
-            root = math.sqrt(t0 - clock[TOUCHED])
-            clock[ALPHA], clock[BETA] = 2.0 * root, 2.0
-            hard = math.sqrt(t0 - clock[TOUCHED] + span) - root
-    if harmonics is not None:
-        expand_harmonics(harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
-    order = expand(
-        p,
-        state,
-        w,
-        p.order,
-        penetrating,
-        hard,
-        harmonics,
-        second,
-        segments,
-        viscous,
-        factor,
-        integer,
-        fraction,
-        wear,
-        offset,
-        free,
-        ramp,
-        slip,
-    )
-    state.count[STEPS] += 1
-    state.count[COEFFICIENTS] += order
-    sigma = hard if order < p.order else _accurate_length(p, w, order, hard)
-    if not math.isfinite(sigma):
-        return False
-    if slip is not None:
-        sigma = _before_sticking(p, state, w, order, sigma)
+        state.count[STEPS] += 1
+        state.count[COEFFICIENTS] += order
+        sigma = hard if order < p.order else _accurate_length(p, w, order, hard)
+        if not math.isfinite(sigma):
+            return False
+        if slip is not None:
+            sigma = _before_sticking(p, state, w, order, sigma)
+        if implicit is not None and penetrating:
+            note_explicit(p, state, w, clock[ALPHA] * sigma + 0.5 * clock[BETA] * sigma * sigma, sigma < hard)
     limited = limited and sigma == hard
     end, pair, target = _first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer, fraction, ramp)
     if pair >= 0 and step[STALL] > p.max_events:
@@ -708,6 +720,7 @@ def finish(p, state, w, totals, log, wear, fraction) -> None:
     state.count[EVENTS] += 1
     if fraction is not None:
         step[TOUCHING] = touching & ~(1 << pair)
+    step[OVERDAMPED] = 0
     if new == OFF:
         state.beyond[pair] = 0
     if old == OFF:
