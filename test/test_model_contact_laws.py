@@ -10,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plow_twin import Clearance, Contact, Frame, Head, Scene, SceneError
-from plow_twin.model.contact import normal_force, power_term
+from plow_twin.model.contact import free_force, normal_force, power_term, power_terms, root_terms
 from plow_twin.model.contact_laws import DAMPING_FACTOR_CAP, LAWS, exact_damping_factor
+from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import row, set_row
 
 
 @pytest.mark.parametrize(
@@ -38,11 +40,20 @@ def test_limits_of_restitution_stay_finite() -> None:
 
 @given(st.floats(-0.01, 0.02), st.floats(-5.0, 5.0), st.floats(0.0, 20.0), st.sampled_from([1.0, 1.5, 2.0, 2.2]))
 def test_contact_never_pulls_and_acts_only_inside(d: float, rate: float, factor: float, n: float) -> None:
-    force = normal_force(d, rate, 1e7, n, factor, 0.0)
+    force = normal_force(d, rate, 1e7, n, factor, 0.0, 0.0)
     assert force >= 0.0
     assert d > 0.0 or force == 0.0
     if d > 0.0 and 1.0 + factor * rate > 0.0:
         assert force == pytest.approx(1e7 * d**n * (1.0 + factor * rate))
+    if d > 0.0:
+        assert force == max(0.0, free_force(d, rate, 1e7, n, factor, 0.0, 0.0))
+
+
+def test_ramped_damping_grows_smoothly_to_its_value() -> None:
+    damping, ramp, rate = 5e4, 1e-3, 0.3
+    for share, part in ((0.0, 0.0), (0.25, 0.15625), (0.5, 0.5), (1.0, 1.0), (3.0, 1.0)):
+        d = share * ramp
+        assert free_force(d, rate, 1e7, 1.0, 0.0, damping, ramp) == pytest.approx(1e7 * d + part * damping * rate)
 
 
 @pytest.mark.parametrize(("shift", "n"), [(0, 1.5), (0, 2.2), (2, 1.5)])
@@ -54,6 +65,28 @@ def test_power_series_equals_the_power(shift: int, n: float) -> None:
         power[k, 3] = power_term(base, power, 3, k, n, shift)
     value = np.polynomial.polynomial.polyval(t, base[:, 3]) ** n
     assert np.polynomial.polynomial.polyval(t, power[:, 3]) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize("n", [0.5, 1.5, 2.2])
+def test_eight_power_series_side_by_side(n: float) -> None:
+    order, rng = 24, np.random.default_rng(5)
+    base, power = np.zeros((order + 1, 8)), np.zeros((order + 1, 8))
+    base[0], base[1:5] = rng.uniform(0.5, 2.0, 8), rng.uniform(-0.3, 0.3, (4, 8))
+    _raise(base, power, n, 1.0 / base[0], 0.5 / np.sqrt(base[0]))
+    t = 0.2
+    value = np.polynomial.polynomial.polyval(t, base) ** n
+    assert np.polynomial.polynomial.polyval(t, power) == pytest.approx(value, rel=1e-12)
+
+
+@kernel()
+def _raise(base, power, n, inverse, half_root) -> None:  # type: ignore[no-untyped-def]
+    for lane in range(8):
+        power[0, lane] = base[0, lane] ** n
+    for k in range(1, base.shape[0]):
+        if n == 0.5:
+            set_row(power, k, root_terms(base, power, k) * row(half_root, 0))
+        else:
+            set_row(power, k, power_terms(base, power, k, n) * row(inverse, 0))
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import pytest
 from scenes import pose_error, preset, wall_and_point
 
 from plow_twin import Contact, ContactLaw, SceneError, add_law, simulate
+from plow_twin.model import contact_laws
 from plow_twin.model.contact_laws import exact_damping_factor
 
 
@@ -45,6 +47,15 @@ def test_the_ramp_belongs_to_its_law() -> None:
             replace(preset("paper"), contact=contact)
 
 
+@pytest.fixture
+def laws_restored() -> Iterator[None]:
+    before = dict(contact_laws._LAWS)
+    yield
+    contact_laws._LAWS.clear()
+    contact_laws._LAWS.update(before)
+
+
+@pytest.mark.usefixtures("laws_restored")
 def test_a_law_of_one_s_own_works_like_the_others() -> None:
     """One definition: scenes, checks and every solver take it."""
     add_law("half_exact", ContactLaw("half exact", "of this test", lambda e: 0.5 * exact_damping_factor(e)))

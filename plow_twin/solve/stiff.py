@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import roots_jacobi
 
 from plow_twin.model.contact import free_force
@@ -39,19 +40,38 @@ PATIENCE, _GAIN = 20, 100.0
 _DECAY_TIMES = 4.0
 
 
+def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
+    """Return c with sum_i c[k, i] f(nodes[i]) the coefficient k of the polynomial through the nodes, shape (n, n).
+
+    In extended precision: the inverse of a Vandermonde matrix would lose half of the digits.
+    """
+    n = len(nodes)
+    columns = np.zeros((n, n), np.longdouble)
+    for i in range(n):
+        polynomial = np.ones(1, np.longdouble)
+        for j in range(n):
+            if j != i:
+                product = np.zeros(len(polynomial) + 1, np.longdouble)
+                product[1:] += polynomial
+                product[:-1] -= nodes[j] * polynomial
+                polynomial = product / (nodes[i] - nodes[j])
+        columns[:, i] = polynomial
+    return columns
+
+
 def new_implicit() -> Implicit:
     """Return nodes, weights and scratch space."""
     inner = 0.5 * (roots_jacobi(STAGES - 1, 1.0, 0.0)[0] + 1.0)
-    nodes = np.append(np.sort(inner), 1.0)
-    powers = np.arange(STAGES)
-    weights = (nodes[:, None] ** (powers + 1) / (powers + 1)) @ np.linalg.inv(nodes[:, None] ** powers)
-    with_start = np.append(0.0, nodes)
+    nodes = np.append(np.sort(inner), 1.0).astype(np.longdouble)
+    degree = np.arange(1, STAGES + 1)
+    from_stages = _coefficients(nodes)
+    weights = (nodes[:, None] ** degree / degree) @ from_stages
     size = 3 * STAGES
     return Implicit(
-        nodes, weights, np.linalg.inv(with_start[:, None] ** np.arange(STAGES + 1)),
-        np.linalg.inv(nodes[:, None] ** powers), np.zeros((STAGES + 1, 6)), np.zeros((2, 6)), np.zeros((STAGES, 3)),
-        np.zeros((STAGES, 2, 3, 3)), np.zeros((size, size)), np.zeros(size), np.zeros((STAGES + 1, 8)),
-        np.zeros((STAGES, 8)), np.zeros(3),
+        nodes.astype(np.float64), weights.astype(np.float64),
+        _coefficients(np.append(np.longdouble(0.0), nodes)).astype(np.float64), from_stages.astype(np.float64),
+        np.zeros((STAGES + 1, 6)), np.zeros((2, 6)), np.zeros((STAGES, 3)), np.zeros((STAGES, 2, 3, 3)),
+        np.zeros((size, size)), np.zeros(size), np.zeros((STAGES + 1, 8)), np.zeros((STAGES, 8)), np.zeros(3),
     )  # fmt: skip
 
 
@@ -251,7 +271,8 @@ def collocate(p, parts, state, w, span, implicit) -> float:
     least = _GAIN * clock[EXPLICIT_LENGTH]
     h = min(max(clock[IMPLICIT_LENGTH], 2.0 * least), span)
     to_world(state.y, implicit.z[0])
-    admissible = p.threshold[p.order]
+    # one that stands for so many explicit steps may spend their shares; much of it is a layer at the start that decays
+    admissible = _GAIN * p.threshold[p.order]
     while h >= least:
         if _solve(p, parts, state, clock[T0], h, implicit):
             size = _write_series(p, state, h, w, implicit)
