@@ -27,7 +27,7 @@ from plow_twin.solve.layout import (
     new_record,
     new_work,
 )
-from plow_twin.solve.step import PARTING_ORDER
+from plow_twin.solve.length import PARTING_ORDER
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 

@@ -1,4 +1,4 @@
-"""Overdamped contact: implicit steps agree with explicit ones, are taken only there, and cost no more as it stiffens."""
+"""Overdamped contact: implicit steps agree with explicit ones, are taken only there, and cost no more when stiffer."""
 
 from __future__ import annotations
 

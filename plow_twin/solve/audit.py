@@ -31,7 +31,7 @@ from plow_twin.solve.layout import (
     new_record,
 )
 from plow_twin.solve.loads import combined, load_at
-from plow_twin.solve.step import evaluate, pair_outputs, worn_depth
+from plow_twin.solve.readout import evaluate, pair_outputs, worn_depth
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
 _NODES = 24

@@ -13,6 +13,7 @@ from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import DOF_NAMES, Contact, Scene
+from plow_twin.solve.contacts import settle_modes
 from plow_twin.solve.layout import (
     MAX_ORDER,
     NOW,
@@ -30,7 +31,6 @@ from plow_twin.solve.layout import (
     State,
     new_record,
 )
-from plow_twin.solve.step import settle_modes
 from plow_twin.solve.stiff import new_implicit
 
 #: Tightest and loosest tolerance.

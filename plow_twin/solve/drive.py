@@ -6,7 +6,9 @@ import numpy as np
 
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row, splat
+from plow_twin.solve.accounts import account
 from plow_twin.solve.audit import audit_start, audit_step
+from plow_twin.solve.contacts import within_range
 from plow_twin.solve.fixed import end_coarsely
 from plow_twin.solve.layout import (
     AT_HARD_END,
@@ -25,17 +27,8 @@ from plow_twin.solve.layout import (
     USED,
     Status,
 )
-from plow_twin.solve.step import (
-    account,
-    begin,
-    evaluate,
-    finish,
-    pair_outputs,
-    pose_of,
-    sigma_at,
-    within_range,
-    worn_depth,
-)
+from plow_twin.solve.readout import evaluate, pair_outputs, pose_of, sigma_at, worn_depth
+from plow_twin.solve.step import begin, finish
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)

@@ -10,6 +10,7 @@ import numpy as np
 
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.audit import audit_fixed, audit_start
+from plow_twin.solve.contacts import mode_inside, touch, within_range
 from plow_twin.solve.layout import (
     BOUNDED,
     COEFFICIENTS,
@@ -26,7 +27,7 @@ from plow_twin.solve.layout import (
     Status,
 )
 from plow_twin.solve.motion import accelerate, to_body, to_world
-from plow_twin.solve.step import mode_inside, pair_outputs, pose_of, touch, within_range
+from plow_twin.solve.readout import pair_outputs, pose_of
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _LOG_FULL = int(Status.LOG_FULL)

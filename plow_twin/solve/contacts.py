@@ -1,0 +1,130 @@
+"""The eight pairs: how deep they are, in which mode, what they contribute, and the range in which the model holds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.model.contact import free_force
+from plow_twin.model.kernel import kernel
+from plow_twin.solve.layout import (
+    ACTS,
+    BASE,
+    CLIPPED,
+    COS,
+    DAMPS,
+    LAST_LENGTH,
+    LENGTH,
+    OFF,
+    OMEGA,
+    ON,
+    RAMPS,
+    RELEASED,
+    SIN,
+    STALL,
+    THETA,
+    TOUCHED,
+    TOUCHING,
+    USED,
+    VX,
+    VY,
+)
+
+
+@kernel(inline=True)
+def gap_and_rate(p, state, pair):
+    """Return penetration and its rate of one pair at the step's start."""
+    y, A = state.y, p.gap
+    c, s, om = y[COS], y[SIN], y[OMEGA]
+    d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair] - state.depth[pair]
+    r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
+    return d, r
+
+
+@kernel()
+def touch(p, state, pair) -> None:
+    """Start a contact: read its impact speed, lambda = D / v0."""
+    if p.damping_factor >= 0.0:
+        _, speed = gap_and_rate(p, state, pair)
+        state.factor[pair] = p.damping_factor / max(speed, p.speed_floor)
+
+
+@kernel()
+def mode_inside(p, state, pair):
+    """Return the mode of a pair that penetrates, and note on which side of its ramp's end it is."""
+    depth, rate = gap_and_rate(p, state, pair)
+    state.beyond[pair] = 1 if depth > p.ramp else 0
+    if free_force(depth, rate, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp) < 0.0:
+        return CLIPPED
+    return ON if depth >= p.release else RELEASED
+
+
+@kernel()
+def settle_modes(p, state) -> None:
+    """Choose each pair's mode from its penetration, where a motion starts or is changed from outside."""
+    for pair in range(8):
+        state.mode[pair] = OFF
+        state.beyond[pair] = 0
+        if p.enabled[pair] == 1 and gap_and_rate(p, state, pair)[0] > 0.0:
+            touch(p, state, pair)
+            state.mode[pair] = mode_inside(p, state, pair)
+    state.clock[USED] = 0.0
+    state.clock[LENGTH] = -1.0
+    state.clock[LAST_LENGTH] = 0.0
+    state.clock[TOUCHED] = -np.inf
+    state.step[TOUCHING] = 0
+    state.step[STALL] = 0
+
+
+@kernel()
+def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
+    """Write what each pair that acts contributes per order to `w.lanes`; return whether any pair penetrates."""
+    mode, lanes = state.mode, w.lanes
+    inside = 0
+    for pair in range(8):
+        lanes[BASE, pair] = 0.0
+        lanes[RAMPS, pair] = 1.0 - state.beyond[pair]
+        raised = mode[pair] == ON or (ramp is not None and mode[pair] == CLIPPED)
+        if fraction is not None and raised and state.step[TOUCHING] >> pair & 1 == 0:
+            depth = gap_and_rate(p, state, pair)[0]
+            if depth > 1e-3 * p.release:
+                lanes[BASE, pair] = 0.5 / math.sqrt(depth) if fraction == 1.5 else 1.0 / depth
+            else:
+                # interrupted right after its touch: too shallow for a series of its power
+                mode[pair] = RELEASED
+        acts = mode[pair] == ON
+        lanes[ACTS, pair] = p.stiffness if acts else 0.0
+        lanes[DAMPS, pair] = 0.0
+        if acts:
+            lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
+        inside += 0 if mode[pair] == OFF else 1
+    return inside > 0
+
+
+@kernel(inline=True)
+def slow_touch(p) -> float:
+    """Return the speed below which a pair cannot reach the release depth by the speed of its touch alone."""
+    acceleration = p.threshold[0] * p.weight / p.radius
+    return 1e-3 * math.sqrt(2.0 * acceleration * p.release)
+
+
+@kernel(inline=True)
+def any_penetrates(state) -> bool:
+    """Tell whether any pair is inside its wall, with or without force."""
+    inside = 0
+    for pair in range(8):
+        inside += 0 if state.mode[pair] == OFF else 1
+    return inside > 0
+
+
+@kernel()
+def within_range(p, state, y) -> bool:
+    """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
+    deepest = 0.0
+    for pair in range(8):
+        if p.enabled[pair] == 1:
+            A = p.gap
+            depth = A[0, pair] * y[COS] + A[1, pair] * y[SIN] + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair]
+            deepest = max(deepest, depth - state.depth[pair])
+    return abs(y[THETA]) <= 0.7853981633974483 and deepest <= p.half_cavity

@@ -1,0 +1,184 @@
+"""The first event of a step: guards that stay positive while a mode lasts, and where one of them first does not.
+
+Guards are polynomials of the step; `polynomial.first_root` finds where one turns negative.
+"""
+
+from __future__ import annotations
+
+from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import below, magnitude, row, set_row, splat
+from plow_twin.solve.layout import (
+    CLIPPED,
+    CROSSING,
+    GUARD_ROOTS,
+    OFF,
+    ON,
+    RATIO,
+    RELEASED,
+    SIGN,
+)
+from plow_twin.solve.polynomial import first_root
+
+
+@kernel(fast=True)
+def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
+    """Write each pair's first guard to `w.guard`.
+
+    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, else d >= 0 or a small depth; others: d >= 0.
+    """
+    guard, weights = w.guard, w.lanes
+    for pair in range(8):
+        mode = state.mode[pair]
+        weights[SIGN, pair] = 0.0 if p.enabled[pair] == 0 else -1.0 if mode == OFF else 1.0
+        weights[RATIO, pair] = 0.0
+        if viscous is not None and ramp is None and mode == ON:
+            weights[RATIO, pair] = viscous / p.stiffness
+    sign, ratio = row(weights, SIGN), row(weights, RATIO)
+    for k in range(order + 1):
+        set_row(guard, k, row(w.gap, k) * sign)
+    if viscous is not None and ramp is None and penetrating:
+        for k in range(order):
+            set_row(guard, k, row(guard, k) + row(w.rate, k) * ratio)
+    for pair in range(8):
+        first = max(guard[0, pair], 0.0)
+        if state.mode[pair] == ON:
+            # released below a quarter of the depth at which it acts again, so that no pair hovers between
+            first -= min(0.25 * p.release, 0.5 * first)
+        elif state.mode[pair] == RELEASED and first <= 1e-6 * p.release:
+            # one that rests on the wall is let go a little outside
+            first = max(guard[0, pair] + 0.25 * p.release, 0.0)
+        guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
+
+
+@kernel()
+def _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, ramp) -> bool:
+    """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
+
+    on: 1 + lambda d' >= 0, with a ramp F >= 0; clipped: the force would pull; released: d <= p.release.
+    """
+    g, mode = w.column[0], state.mode[pair]
+    g[order] = 0.0
+    if mode == RELEASED:
+        for k in range(order + 1):
+            g[k] = -w.gap[k, pair]
+        g[0] += p.release
+    elif ramp is not None:
+        _pull(p, w, order, pair, mode, viscous, integer, fraction)
+    elif viscous is not None:
+        if mode == ON:
+            return False
+        for k in range(order):
+            g[k] = -(w.gap[k, pair] + viscous / p.stiffness * w.rate[k, pair])
+    else:
+        if factor is None:
+            return False
+        sign = 1.0 if mode == ON else -1.0
+        for k in range(order):
+            g[k] = sign * state.factor[pair] * w.rate[k, pair]
+        g[0] += sign
+    g[0] = max(g[0], 0.0)
+    return True
+
+
+@kernel()
+def _pull(p, w, order, pair, mode, viscous, integer, fraction) -> None:
+    """Write the force of a ramped law, negative for a clipped pair, to `w.column[0]`."""
+    g, sign = w.column[0], 1.0 if mode == ON else -1.0
+    for k in range(order):
+        if integer is not None:
+            elastic = w.power[integer - 2, k, pair]
+        elif fraction is not None:
+            elastic = w.power[0, k, pair]
+        else:
+            elastic = w.gap[k, pair]
+        g[k] = sign * (p.stiffness * elastic + viscous * w.damped[k, pair])
+
+
+@kernel()
+def _ramp_guard(p, state, w, order, pair) -> None:
+    """Write the guard of a pair that stays on its side of the ramp's end to `w.column[0]`."""
+    g, sign = w.column[0], 1.0 if state.beyond[pair] == 1 else -1.0
+    for k in range(order + 1):
+        g[k] = sign * w.gap[k, pair]
+    g[0] = max(g[0] - sign * p.ramp, 0.0)
+
+
+@kernel(fast=True)
+def _unsafe_pairs(w, order, h):
+    """Return a bit for each guard that is not proved to stay positive on [0, h].
+
+    The first proof is g_0 > sum |g_k| h^k; where it fails, that no Bernstein coefficient is negative.
+    """
+    guard, b = w.guard, w.bernstein
+    reach = magnitude(row(guard, order)) * h
+    for k in range(order - 1, 0, -1):
+        reach = (reach + magnitude(row(guard, k))) * h
+    if below(row(guard, 0), reach) == 0:
+        return 0
+    power = 1.0
+    for k in range(order + 1):
+        set_row(b, k, row(guard, k) * (power * w.binomial[order, k]))
+        power *= h
+    for r in range(1, order + 1):
+        before = row(b, r - 1)
+        for j in range(r, order + 1):
+            here = row(b, j)
+            set_row(b, j, here + before)
+            before = here
+    zero, bits = splat(0.0), 0
+    for k in range(order + 1):
+        bits |= below(row(b, k), zero)
+    return bits
+
+
+@kernel(inline=True)
+def _next_mode(mode, viscous, fraction, ramp):
+    """Return the mode that follows when a pair's first guard ends it."""
+    if mode == OFF:
+        return ON if fraction is None or fraction == 1.5 else RELEASED
+    if mode == ON and viscous is not None and ramp is None:
+        return CLIPPED
+    return RELEASED if mode == ON and fraction is not None else OFF
+
+
+@kernel()
+def _sooner(state, w, order, best) -> float:
+    """Return where the guard in `w.column[0]` first turns negative before `best`, else `best`."""
+    column, reach = w.column[0], 0.0
+    for k in range(order, 0, -1):
+        reach = (reach + abs(column[k])) * best
+    if column[0] >= reach:
+        return best
+    state.count[GUARD_ROOTS] += 1
+    return min(best, first_root(column, order, best, w))
+
+
+@kernel()
+def first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer, fraction, ramp):
+    """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
+    _guards(p, state, w, order, penetrating, viscous, ramp)
+    best, event, target = sigma, -1, 0
+    unsafe = _unsafe_pairs(w, order, sigma)
+    column = w.column[0]
+    for pair in range(8):
+        if unsafe >> pair & 1:
+            for k in range(order + 1):
+                column[k] = w.guard[k, pair]
+            state.count[GUARD_ROOTS] += 1
+            root = first_root(column, order, best, w)
+            if root < best:
+                best, event, target = root, pair, _next_mode(state.mode[pair], viscous, fraction, ramp)
+    if penetrating:
+        for pair in range(8):
+            if state.mode[pair] == OFF:
+                continue
+            if _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, ramp):
+                root = _sooner(state, w, order, best)
+                if root < best:
+                    best, event, target = root, pair, CLIPPED if state.mode[pair] == ON else ON
+            if ramp is not None and state.mode[pair] != RELEASED:
+                _ramp_guard(p, state, w, order, pair)
+                root = _sooner(state, w, order, best)
+                if root < best:
+                    best, event, target = root, pair, CROSSING
+    return best, event, target

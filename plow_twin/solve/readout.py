@@ -1,0 +1,84 @@
+"""What a step under way tells at any of its times: state, pose, wear, penetrations and forces."""
+
+from __future__ import annotations
+
+import math
+
+from plow_twin.model.contact import normal_force
+from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import row, set_row
+from plow_twin.solve.contacts import any_penetrates
+from plow_twin.solve.layout import (
+    ALPHA,
+    BETA,
+    COS,
+    LENGTH,
+    OMEGA,
+    ON,
+    ORDER,
+    SIGMA,
+    SIN,
+    THETA,
+    VX,
+    VY,
+)
+
+
+@kernel(inline=True)
+def sigma_at(state, used):
+    """Return sigma at `used` seconds into the step."""
+    clock = state.clock
+    if used >= clock[LENGTH]:
+        return clock[SIGMA]
+    if clock[BETA] == 0.0:
+        return used
+    # the root of alpha sigma + beta sigma^2 / 2 = used that suffers no cancellation
+    return 2.0 * used / (clock[ALPHA] + math.sqrt(max(clock[ALPHA] ** 2 + 2.0 * clock[BETA] * used, 0.0)))
+
+
+@kernel(fast=True)
+def evaluate(state, w, sigma, out) -> None:
+    """Write the body-coordinate state at sigma to `out`, shape (8,)."""
+    order, series = state.step[ORDER], w.series
+    value = row(series, order)
+    for k in range(order - 1, -1, -1):
+        value = value * sigma + row(series, k)
+    set_row(out, 0, value)
+
+
+@kernel(fast=True)
+def worn_depth(state, w, sigma, out) -> None:
+    """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
+    depth = row(state.depth, 0)
+    if any_penetrates(state):
+        # row 0 would be the depth itself; pairs without force do not wear
+        order = state.step[ORDER]
+        growth = row(w.worn, order)
+        for k in range(order - 1, 0, -1):
+            growth = growth * sigma + row(w.worn, k)
+        depth = depth + growth * sigma
+    set_row(out, 0, depth)
+
+
+@kernel()
+def pose_of(y, offset, q, v) -> None:
+    """Write pose and rate of the cavity's centre in world axes from body coordinates; inverse of `body_state`."""
+    c, s, x, yy, vx, vy, om = y[COS], y[SIN], y[0], y[1], y[VX], y[VY], y[OMEGA]
+    if offset is not None:
+        x, yy = x - offset[0], yy - offset[1]
+        vx, vy = vx + om * offset[1], vy - om * offset[0]
+    q[0], q[1], q[2] = c * x - s * yy, s * x + c * yy, y[THETA]
+    v[0], v[1], v[2] = c * vx - s * vy, s * vx + c * vy, om
+
+
+@kernel()
+def pair_outputs(p, state, depth, y, penetration, rate, force) -> None:
+    """Write penetration, rate and force of the eight pairs in body coordinates y, worn by `depth`; shape (8,) each."""
+    A = p.gap
+    c, s, om = y[COS], y[SIN], y[OMEGA]
+    for pair in range(8):
+        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair] - depth[pair]
+        r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
+        penetration[pair], rate[pair], force[pair] = d, r, 0.0
+        if state.mode[pair] == ON:
+            force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)
