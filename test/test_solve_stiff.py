@@ -62,3 +62,13 @@ def test_scenes_that_are_not_overdamped_do_not_compile_it() -> None:
     for scene in (preset("paper"), preset("bench_kv"), preset("bench_hc"), damped(1e6)):
         assert implicit_of(scene) is None
     assert implicit_of(damped(1e9)) is not None
+
+
+def test_a_restored_twin_goes_on_with_the_same_bits() -> None:
+    twin, other = Twin(damped(1e9)), Twin(damped(1e9))
+    for t in np.linspace(0.01, 0.4, 23):
+        expected = twin.advance(t)
+        other.restore(twin.snapshot())
+        assert other.digest() == twin.digest()
+        assert np.array_equal(other.advance(t + 0.007).q, Twin.advance(twin, t + 0.007).q)
+        assert expected.status.name == "OK"

@@ -12,19 +12,22 @@ from plow_twin.solve.contacts import within_range
 from plow_twin.solve.fixed import end_coarsely
 from plow_twin.solve.layout import (
     AT_HARD_END,
-    COEFFICIENTS,
     EVENT_PAIR,
-    GUARD_ROOTS,
+    EXPLICIT_LENGTH,
+    IMPLICIT_LENGTH,
     LENGTH,
     NOW,
+    OVERDAMPED,
     PIECE,
-    RECOVERIES,
     SIGMA,
     STALL,
     STEPS,
     T0,
     TOUCHING,
     USED,
+    WAS_EXPLICIT,
+    WAS_IMPLICIT,
+    WAS_OVERDAMPED,
     Status,
 )
 from plow_twin.solve.readout import evaluate, pair_outputs, pose_of, sigma_at, worn_depth
@@ -250,11 +253,19 @@ def lay_out_again(p, parts, state, w) -> None:
 
     Only the scene's own loads leave a step under way, and there it has no hard end.
     """
-    used, steps, coefficients = state.clock[USED], state.count[STEPS], state.count[COEFFICIENTS]
-    roots, recoveries = state.count[GUARD_ROOTS], state.count[RECOVERIES]
+    used, implicit = state.clock[USED], parts.implicit
+    if implicit is not None:
+        # what laying it out has changed
+        state.clock[IMPLICIT_LENGTH], state.clock[EXPLICIT_LENGTH] = (
+            state.clock[WAS_IMPLICIT],
+            state.clock[WAS_EXPLICIT],
+        )
+        state.step[OVERDAMPED] = state.step[WAS_OVERDAMPED]
+    for i in range(state.count.size):
+        w.counted[i] = state.count[i]
     _lay_out(p, parts, state, w, np.inf)
-    state.count[STEPS], state.count[COEFFICIENTS] = steps, coefficients
-    state.count[GUARD_ROOTS], state.count[RECOVERIES] = roots, recoveries
+    for i in range(state.count.size):
+        state.count[i] = w.counted[i]
     state.clock[USED] = used
 
 

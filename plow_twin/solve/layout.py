@@ -39,10 +39,12 @@ RELEASED: Final = 3
 # indices into State.y
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
 # indices into State.clock: step's start, time into it and length; map of the series' variable to time; end of what is
-# linear; length of the step before; last touch; present time, bit for bit as it was asked for
-T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW, IMPLICIT_LENGTH, EXPLICIT_LENGTH = range(12)
+# linear; length of the step before; last touch; present time, bit for bit as it was asked for; lengths of the next
+# implicit and of the last explicit step, and both as they were before the step under way was laid out
+T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW = range(10)
+IMPLICIT_LENGTH, EXPLICIT_LENGTH, WAS_IMPLICIT, WAS_EXPLICIT = range(10, 14)
 # indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
-ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END, OVERDAMPED = range(8)
+ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END, OVERDAMPED, WAS_OVERDAMPED = range(9)
 # indices into State.count
 STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES, BOUNDED, IMPLICIT = range(7)
 
@@ -116,8 +118,8 @@ STATE: Final = np.dtype(
         ("depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad
         ("mode", "i8", (PAIR_COUNT,)),
         ("beyond", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
-        ("clock", "f8", (12,)),
-        ("step", "i8", (8,)),
+        ("clock", "f8", (14,)),
+        ("step", "i8", (9,)),
         ("count", "i8", (7,)),
     ]
 )
@@ -152,6 +154,7 @@ WORK: Final = np.dtype(
         ("moved", "f8", (STATE_SIZE,)),
         ("saved", "f8", (3, PAIR_COUNT)),  # y, factor and depth before an advance
         ("modes", "i8", (PAIR_COUNT,)),  # and the modes
+        ("counted", "i8", (7,)),  # counters before a step is laid out again
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
     ]

@@ -23,7 +23,9 @@ from plow_twin.solve.layout import (
     EVENT_PAIR,
     EVENT_TO,
     EVENTS,
+    EXPLICIT_LENGTH,
     HARD_END,
+    IMPLICIT_LENGTH,
     LAST_LENGTH,
     LENGTH,
     NOW,
@@ -43,6 +45,9 @@ from plow_twin.solve.layout import (
     TOUCHED,
     TOUCHING,
     USED,
+    WAS_EXPLICIT,
+    WAS_IMPLICIT,
+    WAS_OVERDAMPED,
 )
 from plow_twin.solve.length import accurate_length, before_sticking, time_to_part
 from plow_twin.solve.readout import evaluate, worn_depth
@@ -107,6 +112,9 @@ def begin(
     limited = span < LONGEST_STEP
     clock[ALPHA], clock[BETA] = 1.0, 0.0
     hard, length = span, 0.0
+    if implicit is not None:
+        clock[WAS_IMPLICIT], clock[WAS_EXPLICIT] = clock[IMPLICIT_LENGTH], clock[EXPLICIT_LENGTH]
+        step[WAS_OVERDAMPED] = step[OVERDAMPED]
     if implicit is not None and penetrating and step[OVERDAMPED] >= PATIENCE:
         length = collocate(p, parts, state, w, span, implicit)
     if length > 0.0:

@@ -19,14 +19,22 @@ from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row, splat
 from plow_twin.solve.layout import (
     COEFFICIENTS,
+    COS,
     DAMPS,
     EXPLICIT_LENGTH,
     IMPLICIT,
     IMPLICIT_LENGTH,
+    OMEGA,
     ON,
     OVERDAMPED,
+    SIN,
     T0,
+    THETA,
+    VX,
+    VY,
     Implicit,
+    X,
+    Y,
 )
 from plow_twin.solve.loads import combined
 from plow_twin.solve.motion import accelerate, to_body, to_world
@@ -84,7 +92,7 @@ def stiffest(p, state, w):
             damping = w.lanes[DAMPS, pair]
             if p.viscous == 0.0:
                 damping *= max(w.gap[0, pair], 0.0) ** p.exponent
-            arm = combined(p.arm, pair, y[5], y[6], y[0], y[1])
+            arm = combined(p.arm, pair, y[COS], y[SIN], y[X], y[Y])
             largest = max(largest, damping * (p.inverse_mass + arm * arm * p.inverse_inertia))
     return largest
 
@@ -235,7 +243,7 @@ def _write_series(p, state, h, w, implicit) -> float:
         scale /= h
     for k in range(s + 1):
         y = w.series[k]
-        depth = row(p.gap, 0) * y[5] + row(p.gap, 1) * y[6] + (row(p.gap, 2) * y[0] + row(p.gap, 3) * y[1])
+        depth = row(p.gap, 0) * y[COS] + row(p.gap, 1) * y[SIN] + (row(p.gap, 2) * y[X] + row(p.gap, 3) * y[Y])
         if k == 0:
             depth = depth + row(p.gap, 4) - row(state.depth, 0)
         else:
@@ -246,9 +254,9 @@ def _write_series(p, state, h, w, implicit) -> float:
         for pair in range(8):
             forces[i, pair] = 0.0
             if state.mode[pair] == ON:
-                c, sn, om = y[5], y[6], y[4]
-                d = combined(p.gap, pair, c, sn, y[0], y[1]) + p.gap[4, pair] - state.depth[pair]
-                r = combined(p.gap, pair, -om * sn, om * c, y[2] + om * y[1], y[3] - om * y[0])
+                c, sn, om = y[COS], y[SIN], y[OMEGA]
+                d = combined(p.gap, pair, c, sn, y[X], y[Y]) + p.gap[4, pair] - state.depth[pair]
+                r = combined(p.gap, pair, -om * sn, om * c, y[VX] + om * y[Y], y[VY] - om * y[X])
                 forces[i, pair] = free_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)
     scale = 1.0
     for k in range(s):
@@ -258,8 +266,8 @@ def _write_series(p, state, h, w, implicit) -> float:
         set_row(w.force, k, value * scale)
         scale /= h
     last = w.series[s]
-    size = abs(last[2]) + abs(last[3]) + p.radius * abs(last[4])
-    size += p.velocity_tolerance / p.position_tolerance * (abs(last[0]) + abs(last[1]) + p.radius * abs(last[7]))
+    size = abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA])
+    size += p.velocity_tolerance / p.position_tolerance * (abs(last[X]) + abs(last[Y]) + p.radius * abs(last[THETA]))
     # its share on [0, h] that polynomials of lower degree cannot take over
     return size * h**s * 2.0 ** (1 - 2 * s)
 
