@@ -170,6 +170,22 @@ def test_what_is_no_scene_is_a_scene_error(text: str) -> None:
         loads_scene(text)
 
 
+def test_a_machine_of_one_s_own_has_the_exact_restitution_unless_it_says_otherwise() -> None:
+    text = """
+version: 1
+head: {mass_kg: 10, inertia_kg_m2: 1}
+frame: {width_m: 0.3, height_m: 0.3}
+clearance: {horizontal_m: 0.01, vertical_m: 0.01}
+"""
+    scene = loads_scene(text + "contact: {stiffness: 1.0e8, restitution: 0.4}", Path())
+    assert scene.contact == Contact(stiffness=1e8, restitution=0.4)
+    assert scene.contact == Contact("exact_restitution", 1e8, restitution=0.4)
+    with pytest.raises(SceneError, match=r"contact\.stiffness: got nothing"):
+        loads_scene(text + "contact: {restitution: 0.4}", Path())
+    with pytest.raises(SceneError, match=r"contact\.stiffness: got nan"):
+        replace(scene, contact=Contact(restitution=0.4))
+
+
 def test_texts_are_no_numbers() -> None:
     with pytest.raises(SceneError, match=r"head.mass_kg: got '2430'"):
         loads_scene(MINIMAL.replace("2430", "'2430'"))

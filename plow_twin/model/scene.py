@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final
@@ -92,11 +92,13 @@ class Clearance:
 class Contact:
     """Normal contact of every pair: one law and one uniform set of parameters.
 
-    Exactly one of `damping` and `restitution` is given, or neither for a law without damping.
+    Exactly one of `damping` and `restitution` is given, or neither for a law without damping. The default law returns
+    exactly the restitution asked for.
     """
 
-    law: str = _choice("contact law", LAWS)
-    stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", gt=0.0)
+    law: str = _choice("contact law", LAWS, "exact_restitution")
+    # must be given; a field after one with a default needs one too
+    stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
         "N s/m or s/m",
@@ -312,6 +314,13 @@ def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
     for item in values:
         if item not in choices:
             yield Problem(key, item, f"one of {', '.join(choices)}")
+
+
+def must_be_given(spec: Field[Any]) -> bool:
+    """Tell whether a field has no default that a scene could have."""
+    if spec.default is MISSING:
+        return spec.default_factory is MISSING
+    return isinstance(spec.default, float) and math.isnan(spec.default)
 
 
 def describe(spec: Field[Any]) -> str:

@@ -24,6 +24,7 @@ from plow_twin.model.scene import (
     Scene,
     Table,
     describe,
+    must_be_given,
 )
 
 Schema = dict[str, Any]
@@ -79,7 +80,7 @@ def _object(part: type, without: tuple[str, ...] = ()) -> Schema:
         "type": "object",
         "description": f"a mapping with {', '.join(spec.name for spec in specs)}",
         "properties": {spec.name: _property(spec) for spec in specs},
-        "required": [spec.name for spec in specs if spec.default is MISSING and spec.default_factory is MISSING],
+        "required": [spec.name for spec in specs if must_be_given(spec)],
         "additionalProperties": False,
     }
 
