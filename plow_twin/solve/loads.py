@@ -1,4 +1,4 @@
-"""The loads as values at one time, and rows of `model.geometry` for one pair: what evaluates forces directly."""
+"""The loads as values at one time, and rows of `model.geometry` applied to a state."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from plow_twin.model.kernel import kernel
+from plow_twin.model.lanes import row
 
 
 @kernel()
@@ -41,3 +42,9 @@ def _add_harmonics(p, harmonics, second, t, out) -> None:
 def combined(rows, pair, c, s, x, y):
     """Return rows . (c, s, x, y) of one pair."""
     return rows[0, pair] * c + rows[1, pair] * s + rows[2, pair] * x + rows[3, pair] * y
+
+
+@kernel(fast=True)
+def combine(rows, c, s, x, y):
+    """Return rows . (c, s, x, y) of all pairs side by side."""
+    return (row(rows, 0) * c + row(rows, 1) * s) + (row(rows, 2) * x + row(rows, 3) * y)

@@ -21,7 +21,10 @@ from plow_twin.solve.layout import (
     THETA,
     VX,
     VY,
+    X,
+    Y,
 )
+from plow_twin.solve.loads import combine
 
 
 @kernel(inline=True)
@@ -71,14 +74,14 @@ def pose_of(y, offset, q, v) -> None:
     v[0], v[1], v[2] = c * vx - s * vy, s * vx + c * vy, om
 
 
-@kernel()
+@kernel(fast=True)
 def pair_outputs(p, state, depth, y, penetration, rate, force) -> None:
     """Write penetration, rate and force of the eight pairs in body coordinates y, worn by `depth`; shape (8,) each."""
-    A = p.gap
     c, s, om = y[COS], y[SIN], y[OMEGA]
+    set_row(penetration, 0, combine(p.gap, c, s, y[X], y[Y]) + (row(p.gap, 4) - row(depth, 0)))
+    set_row(rate, 0, combine(p.gap, -om * s, om * c, y[VX] + om * y[Y], y[VY] - om * y[X]))
     for pair in range(8):
-        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair] - depth[pair]
-        r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
-        penetration[pair], rate[pair], force[pair] = d, r, 0.0
+        force[pair] = 0.0
         if state.mode[pair] == ON:
+            d, r = penetration[pair], rate[pair]
             force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)

@@ -35,6 +35,7 @@ from plow_twin.solve.layout import (
     X,
     Y,
 )
+from plow_twin.solve.loads import combine
 
 
 @kernel(fast=True)
@@ -87,12 +88,6 @@ def _multiply(a, b, k):
     if k == 0:
         return row(a, 0) * row(b, 0)
     return _multiply_older(a, b, k) + (row(a, 0) * row(b, k) + row(a, k) * row(b, 0))
-
-
-@kernel(fast=True)
-def _combine(rows, c, s, x, y):
-    """Return rows . (c, s, x, y)."""
-    return (row(rows, 0) * c + row(rows, 1) * s) + (row(rows, 2) * x + row(rows, 3) * y)
 
 
 @kernel(fast=True, inline=True)
@@ -230,9 +225,9 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy, slip):
     With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
     """
     weighted, tau, rest, drag, arm = w.slip[1], w.slip[2], w.slip[3], w.slip[4], w.slip[5]
-    rate = _combine(slip.rows, dc, ds, dx, dy) * (1.0 / slip.speed)
+    rate = combine(slip.rows, dc, ds, dx, dy) * (1.0 / slip.speed)
     set_row(w.slip[0], k, rate)
-    set_row(arm, k, _combine(slip.arm, c, s, x, y))
+    set_row(arm, k, combine(slip.arm, c, s, x, y))
     if k == 0:
         for pair in range(8):
             tau[0, pair] = math.tanh(lane(rate, pair))
@@ -295,7 +290,7 @@ def expand(
     small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, limit
     for k in range(order + 1):
         set_row(w.series, k, pack(x, yy, vx, vy, om, c, s, theta))
-        depth = _combine(p.gap, c, s, x, yy)
+        depth = combine(p.gap, c, s, x, yy)
         if k == 0:
             depth = depth + row(p.gap, 4) - row(state.depth, 0)
         else:
@@ -326,8 +321,8 @@ def expand(
             # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
             moment -= (offset[0] * (fy + p.gravity * c) - offset[1] * (fx + p.gravity * s)) * ii / im
         if penetrating:
-            set_row(w.rate, k, _combine(p.gap, dc, ds, dx, dy))
-            set_row(w.arm, k, _combine(p.arm, c, s, x, yy))
+            set_row(w.rate, k, combine(p.gap, dc, ds, dx, dy))
+            set_row(w.arm, k, combine(p.arm, c, s, x, yy))
             force = _push(state, w, k, viscous, factor, integer, fraction, ramp)
             set_row(w.force, k, force)
             push_x, push_y, torque = _resultant(p, w, k, force)

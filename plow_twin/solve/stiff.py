@@ -36,7 +36,7 @@ from plow_twin.solve.layout import (
     X,
     Y,
 )
-from plow_twin.solve.loads import combined
+from plow_twin.solve.loads import combine, combined
 from plow_twin.solve.motion import accelerate, to_body, to_world
 
 #: Stages: the polynomials' degree. The order is 2 s - 1.
@@ -243,7 +243,7 @@ def _write_series(p, state, h, w, implicit) -> float:
         scale /= h
     for k in range(s + 1):
         y = w.series[k]
-        depth = row(p.gap, 0) * y[COS] + row(p.gap, 1) * y[SIN] + (row(p.gap, 2) * y[X] + row(p.gap, 3) * y[Y])
+        depth = combine(p.gap, y[COS], y[SIN], y[X], y[Y])
         if k == 0:
             depth = depth + row(p.gap, 4) - row(state.depth, 0)
         else:
