@@ -239,7 +239,7 @@ class Twin:
         """Set the speed along the face from here on; only wear depends on it."""
         if not np.isfinite(speed_m_s):
             raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
-        if self._parts.wear is not None:
+        if self._parts.terms.wear is not None:
             self._end_step()
             self._set_wear_rate(abs(float(speed_m_s)))
 
@@ -316,8 +316,8 @@ class Twin:
     def _set_wear_rate(self, speed: float) -> None:
         self._travel_speed = speed
         wear = self.scene.wear
-        if wear is not None and self._parts.wear is not None:
-            self._parts.wear[:] = wear.coefficient_m2_n * speed / wear.pad_area_m2
+        if wear is not None and self._parts.terms.wear is not None:
+            self._compiled.params.wear[:] = wear.coefficient_m2_n * speed / wear.pad_area_m2
 
 
 def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None]:

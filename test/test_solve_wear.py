@@ -60,6 +60,6 @@ def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None
 
 def test_without_wear_its_code_is_not_compiled() -> None:
     without, with_wear = Twin(preset("paper")), Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
-    assert without._parts.wear is None and with_wear._parts.wear is not None
+    assert without._parts.terms.wear is None and with_wear._parts.terms.wear is not None
     assert not without.advance(2.0).wear_depth.any()
     assert with_wear.advance(2.0).wear_depth.any()

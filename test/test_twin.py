@@ -143,9 +143,9 @@ def test_a_scene_compiles_only_what_it_needs() -> None:
     twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
     twin.advance(0.01)
     compiled = [str(signature[1]) for signature in drive.advance_times.signatures]  # type: ignore[attr-defined]
-    # harmonics, second, segments, law (viscous, factor, integer, fraction, ramp), wear, offset, free, slip, implicit
-    law = "Law(float64, none, none, none, none)"
-    bare = f"Parts(none, none, none, {law}, none, none, array(float64, 1d, C), none, none)"
+    # harmonics, second, segments, viscous, factor, integer, fraction, ramp, wear, offset, free, slip
+    terms = "Terms(none, none, none, int64, none, none, none, none, none, none, int64, none)"
+    bare = f"Parts({terms}, none, none, none)"
     assert bare in compiled, compiled
 
 

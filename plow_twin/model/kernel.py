@@ -41,6 +41,8 @@ def kernel(*, fast: bool = False, inline: bool = False) -> Callable[[Callable[..
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
+            # read before the rest of an index, which cannot be read once a type that it names is gone
+            cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
         compiled: Callable[..., Any] = dispatcher
         return compiled
 

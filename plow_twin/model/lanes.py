@@ -104,6 +104,20 @@ def pack(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any,
     return lanes(a, b, c, d, e, f, g, h), codegen
 
 
+def permutation(*places: int) -> Callable[..., Any]:
+    """Make an operation that returns the lanes at eight places of its argument, in this order."""
+
+    @_operation
+    def permuted(typingctx: Any, value: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            order = ir.Constant(ir.VectorType(ir.IntType(32), _WIDTH), places)
+            return builder.shuffle_vector(arguments[0], ir.Constant(_VECTOR, ir.Undefined), order)
+
+        return lanes(value), codegen
+
+    return permuted
+
+
 @_operation
 def lane(typingctx: Any, value: Any, index: Any) -> Any:
     """Return one of the eight."""

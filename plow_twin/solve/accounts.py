@@ -18,14 +18,19 @@ from plow_twin.solve.polynomial import maximum, shift_column
 
 @kernel(fast=True)
 def _sums(w, order, h) -> None:
-    """Write bound and integrals of each force over [0, h]: sum |f_k| h^k, sum f_k h^k / (k+1), sum f_k h^k / (k+2)."""
-    bound = first = second = splat(0.0)
+    """Write a bound of each force over [0, h] and its integrals: sum f_k h^k / (k+1), sum f_k h^k / (k+2).
+
+    Between its ends a function exceeds them by h^2 / 8 times its largest curvature at most.
+    """
+    end = bend = first = second = splat(0.0)
     for k in range(order, -1, -1):
         force = row(w.force, k)
-        bound = bound * h + magnitude(force)
+        end = end * h + force
+        bend = bend * h + magnitude(force) * (0.125 * k * (k - 1))
         first = first * h + force * w.inverse[k + 1]
         second = second * h + force * w.inverse[k + 2]
-    set_row(w.lanes, SUM, bound)
+    start = row(w.force, 0)
+    set_row(w.lanes, SUM, (start + end + magnitude(start - end)) * 0.5 + bend)
     set_row(w.lanes, FIRST, first)
     set_row(w.lanes, SECOND, second)
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plow_twin.model.friction import friction_force
 from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row
@@ -30,7 +29,8 @@ from plow_twin.solve.layout import (
     Array,
     new_record,
 )
-from plow_twin.solve.loads import combined, load_at
+from plow_twin.solve.loads import load_at
+from plow_twin.solve.motion import about_mass, push
 from plow_twin.solve.readout import evaluate, pair_outputs, worn_depth
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
@@ -74,40 +74,37 @@ def new_audit() -> Audit:
 
 
 @kernel()
-def _powers(p, parts, offset, free, slip, state, depth, y, t, pairs, out) -> None:
+def _powers(p, parts, state, depth, y, t, audit, out) -> None:
     """Write powers and forces at time t in body coordinates y."""
+    terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
+    load_at(p, parts.harmonics, parts.segments, t, load)
+    _powers_under(p, terms.offset, terms.free, terms.slip, state, depth, y, load, audit.pairs, out)
+
+
+@kernel()
+def _powers_under(p, offset, free, slip, state, depth, y, load, pairs, out) -> None:
     c, s, om = math.cos(y[THETA]), math.sin(y[THETA]), y[OMEGA]
     y[COS], y[SIN] = c, s
     out[LOADS] = out[NORMAL] = out[FRICTION] = 0.0
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
-    load = out[LOAD_X : LOAD_M + 1]
-    load_at(p, parts.harmonics, parts.second, parts.segments, t, load)
     if offset is not None:
-        # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
-        across = (c * offset[0] - s * offset[1]) * (load[1] + p.gravity)
-        load[2] -= (across - (s * offset[0] + c * offset[1]) * load[0]) * m / inertia
+        load[2] += about_mass(p, c, s, load)
     load[0], load[1], load[2] = m * load[0], m * load[1], inertia * load[2]
     pair_outputs(p, state, depth, y, pairs[0], pairs[1], pairs[2])
     fx = fy = torque = 0.0
-    dx, dy = y[VX] + om * y[1], y[VY] - om * y[0]
     for pair in range(8):
         force = pairs[2, pair]
-        fx -= p.gap[2, pair] * force
-        fy -= p.gap[3, pair] * force
-        torque += combined(p.arm, pair, c, s, y[0], y[1]) * force
+        push_x, push_y, moment, power = push(p, slip, pair, force, c, s, om, y[0], y[1], y[VX], y[VY])
+        fx += push_x
+        fy += push_y
+        torque += moment
         out[NORMAL] += force * pairs[1, pair]
-        if slip is not None:
-            rate = combined(slip.rows, pair, -om * s, om * c, dx, dy)
-            drag = friction_force(force, rate, slip.coefficient, slip.speed)
-            fx += p.gap[3, pair] * drag
-            fy -= p.gap[2, pair] * drag
-            torque += combined(slip.arm, pair, c, s, y[0], y[1]) * drag
-            out[FRICTION] += drag * rate
+        out[FRICTION] += power
     out[CONTACT_X], out[CONTACT_Y], out[CONTACT_M] = c * fx - s * fy, s * fx + c * fy, torque
     if free is not None:
         for j in range(3):
-            load[j] *= free[j]
-            out[CONTACT_X + j] *= free[j]
+            load[j] *= p.free[j]
+            out[CONTACT_X + j] *= p.free[j]
     out[LOADS] = load[0] * (c * y[VX] - s * y[VY]) + load[1] * (s * y[VX] + c * y[VY]) + load[2] * om
 
 
@@ -137,7 +134,7 @@ def _balance(p, y, audit, start) -> None:
 def audit_start(p, parts, state, y, t, audit) -> None:
     """Take the state that a run starts from."""
     _balance(p, y, audit, True)
-    _powers(p, parts, parts.offset, parts.free, parts.slip, state, state.depth, y, t, audit.pairs, audit.before)
+    _powers(p, parts, state, state.depth, y, t, audit, audit.before)
 
 
 @kernel()
@@ -159,7 +156,7 @@ def audit_step(p, parts, wear, state, w, audit) -> None:
         if wear is not None:
             worn_depth(state, w, sigma, depth)
         t = clock[T0] + clock[ALPHA] * sigma + 0.5 * clock[BETA] * sigma * sigma
-        _powers(p, parts, parts.offset, parts.free, parts.slip, state, depth, y, t, audit.pairs, audit.now)
+        _powers(p, parts, state, depth, y, t, audit, audit.now)
         _add(audit, audit.now, audit.weights[i] * end * (clock[ALPHA] + clock[BETA] * sigma))
     evaluate(state, w, end, y)
     _balance(p, y, audit, False)
@@ -168,7 +165,7 @@ def audit_step(p, parts, wear, state, w, audit) -> None:
 @kernel()
 def audit_fixed(p, parts, state, y, t, dt, audit) -> None:
     """Add a fixed step that ends at body coordinates y and time t."""
-    _powers(p, parts, parts.offset, parts.free, parts.slip, state, state.depth, y, t, audit.pairs, audit.now)
+    _powers(p, parts, state, state.depth, y, t, audit, audit.now)
     _add(audit, audit.before, 0.5 * dt)
     _add(audit, audit.now, 0.5 * dt)
     for i in range(SIZE):

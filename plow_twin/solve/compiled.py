@@ -15,20 +15,21 @@ from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import DOF_NAMES, Contact, Scene
 from plow_twin.solve.contacts import settle_modes
 from plow_twin.solve.layout import (
+    HARMONIC,
     MAX_ORDER,
     NOW,
     PARAMS,
+    SEGMENT,
     STATE,
     T0,
     Array,
     Harmonics,
     Implicit,
-    Law,
     Params,
     Parts,
     Segments,
-    Slip,
     State,
+    Terms,
     new_record,
 )
 from plow_twin.solve.stiff import new_implicit
@@ -45,6 +46,9 @@ MAX_EVENTS_AT_ONCE = 64
 _OVERDAMPED = 200.0
 
 
+_NO_TERMS = Terms(*[None] * len(Terms._fields))
+
+
 @dataclass(frozen=True)
 class Compiled:
     """A scene at one tolerance, ready for the kernels."""
@@ -58,7 +62,7 @@ class Compiled:
         """Return the scene's initial state."""
         state = new_record(STATE)
         state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
-        if self.parts.law.factor is not None:
+        if self.parts.terms.factor is not None:
             state.factor[:] = self.scene.contact.damping or 0.0
         if self.scene.wear is not None:
             state.depth[:] = self.scene.wear.initial_depth_m
@@ -92,11 +96,11 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     constant = per_mass(scene, loads.constant)
     constant[1] -= gravity
     constant[2] -= mass * gravity * scene.gravity.arm_m / inertia
-    direction, harmonics, second = _harmonics(scene, loads)
-    law, factor = law_of(scene.contact)
+    direction, harmonics = _harmonics(scene, loads)
+    terms, factor = law_terms(scene.contact)
     length = geometry.length_scale(scene)
     speed = _velocity_scale(scene, loads, length)
-    admissible = tol * (STEP_SHARE if law.fraction is None else STEP_SHARE_FRACTION)
+    admissible = tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION)
     order, radius = order_for(admissible), geometry.half_diagonal(scene)
     params = new_record(PARAMS)
     values: dict[str, Any] = dict(
@@ -107,34 +111,51 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         inverse_inertia=1.0 / inertia,
         stiffness=float(scene.contact.stiffness),
         exponent=float(scene.contact.exponent),
-        viscous=law.viscous or 0.0,
+        viscous=float(scene.contact.damping or 0.0) if terms.viscous else 0.0,
         damping_factor=factor,
         speed_floor=float(scene.contact.impact_speed_floor_m_s),
-        ramp=law.ramp or 0.0,
+        ramp=float(scene.contact.ramp_m or 0.0) if terms.ramp else 0.0,
         gravity=float(gravity),
         constant=constant,
         direction=direction,
         order=order,
-        lacuna=_lacuna(law),
+        lacuna=_lacuna(scene.contact.exponent),
         threshold=speed * admissible ** (np.arange(MAX_ORDER + 1) / order),
         velocity_tolerance=tol * speed,
         position_tolerance=tol * length,
         weight=radius * speed / length,
         radius=radius,
-        release=0.0 if law.fraction is None else _release(scene, tol * speed, speed, law.fraction),
+        release=0.0 if terms.fraction is None else _release(scene, tol * speed, speed),
+        wear=_wear_rate(scene),
+        offset=scene.head.com_offset_m,
+        free=np.array([float(name not in scene.locked) for name in DOF_NAMES]),
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
+    friction = scene.friction if scene.friction is not None and scene.friction.coefficient != 0.0 else None
+    if friction is not None:
+        values |= dict(
+            slip=geometry.slip_rows(scene),
+            slip_arm=geometry.slip_arm_rows(scene),
+            friction=friction.coefficient,
+            slip_speed=friction.regularisation_speed_m_s,
+        )
     for name, value in values.items():
         params[name] = value
-    offset = np.array(scene.head.com_offset_m, dtype=np.float64) if any(scene.head.com_offset_m) else None
-    free = np.array([float(name not in scene.locked) for name in DOF_NAMES]) if scene.locked else None
-    segments = segments_of(scene, loads.pieces) if loads.pieces is not None else None
+    segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
-        segments = Segments(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
-    parts = Parts(harmonics, second, segments, law, _wear_rate(scene), offset, free, _slip(scene), None)
-    parts = parts._replace(implicit=_implicit(scene, parts, params))
-    return Compiled(scene, params, parts, loads)
+        segments = np.zeros(1, SEGMENT)
+    present = dict(
+        harmonics=harmonics is not None,
+        second=harmonics is not None and bool(harmonics["second"].any()),
+        segments=segments is not None,
+        wear=scene.wear is not None and scene.wear.coefficient_m2_n != 0.0,
+        offset=any(scene.head.com_offset_m),
+        free=bool(scene.locked),
+        slip=friction is not None,
+    )
+    terms = terms._replace(**_flags(present))
+    return Compiled(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
 
 
 def order_for(admissible: float) -> int:
@@ -142,11 +163,11 @@ def order_for(admissible: float) -> int:
     return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
 
 
-def _lacuna(law: Law) -> int:
+def _lacuna(exponent: float) -> int:
     """Return how many orders in a row can vanish: d^n adds n + 1 orders at a time while nothing else acts."""
-    if law.fraction is not None:
+    if not float(exponent).is_integer():
         return 6
-    return 2 if law.integer is None else law.integer + 1
+    return 2 if exponent == 1.0 else int(exponent) + 1
 
 
 def per_mass(scene: Scene, wrench: Array) -> Array:
@@ -155,50 +176,51 @@ def per_mass(scene: Scene, wrench: Array) -> Array:
     return share
 
 
-def segments_of(scene: Scene, pieces: Pieces) -> Segments:
+def _segments(scene: Scene, pieces: Pieces) -> Segments:
     """Return linear pieces per mass and inertia."""
-    return Segments(
-        np.ascontiguousarray(pieces.knots, dtype=np.float64),
-        per_mass(scene, pieces.start),
-        per_mass(scene, pieces.slope),
-    )
+    segments = np.zeros(len(pieces.knots), SEGMENT)
+    segments["knot"] = pieces.knots
+    segments["start"], segments["slope"] = per_mass(scene, pieces.start), per_mass(scene, pieces.slope)
+    return segments
 
 
-def law_of(contact: Contact) -> tuple[Law, float]:
-    """Return which terms the law has, and D where lambda = D / v0 (else -1)."""
-    law = LAWS[contact.law]
-    exponent = contact.exponent
-    viscous = float(contact.damping or 0.0) if law.additive else 0.0
+def law_terms(contact: Contact) -> tuple[Terms, float]:
+    """Return which terms the law has, all others absent, and D where lambda = D / v0 (else -1)."""
+    law, exponent = LAWS[contact.law], float(contact.exponent)
+    viscous = law.additive and bool(contact.damping)
     factor = -1.0 if contact.restitution is None else law.damping_factor(contact.restitution)
     damped = not law.additive and (factor > 0.0 or bool(contact.damping))
-    return (
-        Law(
-            viscous=viscous if viscous > 0.0 else None,
-            factor=1 if damped else None,
-            integer=int(exponent) if exponent != 1.0 and float(exponent).is_integer() else None,
-            fraction=None if float(exponent).is_integer() else float(exponent),
-            ramp=contact.ramp_m if viscous > 0.0 else None,
-        ),
-        factor if damped else -1.0,
+    present = dict(
+        viscous=viscous,
+        factor=damped,
+        integer=exponent != 1.0 and exponent.is_integer(),
+        fraction=not exponent.is_integer(),
+        ramp=viscous and contact.ramp_m is not None,
     )
+    return _NO_TERMS._replace(**_flags(present)), factor if damped else -1.0
 
 
-def _harmonics(scene: Scene, loads: LoadSet) -> tuple[Array, Harmonics | None, Array | None]:
-    """Split harmonic forces into directions: one when all forces are parallel, else x and y."""
+def _flags(present: dict[str, bool]) -> dict[str, int]:
+    return {name: 1 for name, there in present.items() if there}
+
+
+def _harmonics(scene: Scene, loads: LoadSet) -> tuple[Array, Harmonics | None]:
+    """Return directions and harmonic loads: one direction (no S2) when all forces are parallel, else x and y."""
     if loads.omega.size == 0:
-        return np.eye(2), None, None
-    sine, cosine = per_mass(scene, loads.sine), per_mass(scene, loads.cosine)
-    forces = np.concatenate([sine[:, :2], cosine[:, :2]])
+        return np.eye(2), None
+    # (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M
+    amplitudes = np.stack([per_mass(scene, loads.sine), per_mass(scene, loads.cosine)], axis=1)
+    forces = amplitudes[:, :, :2].reshape(-1, 2)
     largest = forces[np.argmax(np.hypot(forces[:, 0], forces[:, 1]))]
     size = float(np.hypot(*largest))
     unit = largest / size if size > 0.0 else np.array([1.0, 0.0])
     across = np.abs(forces @ np.array([-unit[1], unit[0]]))
-    moment = np.stack([sine[:, 2], cosine[:, 2]], axis=1)
-    if across.max() <= 1e-15 * size:
-        first = np.stack([sine[:, :2] @ unit, cosine[:, :2] @ unit], axis=1)
-        return np.array([unit, [0.0, 0.0]]), Harmonics(loads.omega, first, moment), None
-    first, second = (np.stack([sine[:, i], cosine[:, i]], axis=1) for i in range(2))
-    return np.eye(2), Harmonics(loads.omega, first, moment), second
+    directions = np.array([unit, [0.0, 0.0]]) if across.max() <= 1e-15 * size else np.eye(2)
+    harmonics = np.zeros(len(amplitudes), HARMONIC)
+    harmonics["omega"], harmonics["moment"] = loads.omega, amplitudes[:, :, 2]
+    for i, name in enumerate(("first", "second")):
+        harmonics[name] = amplitudes[:, :, :2] @ directions[i]
+    return directions, harmonics
 
 
 def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
@@ -217,48 +239,37 @@ def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
     return max(math.sqrt(length * total), initial, 1e-3 * length)
 
 
-def _release(scene: Scene, velocity_tolerance: float, speed: float, exponent: float) -> float:
+def _release(scene: Scene, velocity_tolerance: float, speed: float) -> float:
     """Return the penetration from which the impulse to separation is below 1e-5 of the velocity tolerance.
 
     integral F dt = K d^(n+1) / ((n+1) v) at the speed v.
     """
+    exponent = scene.contact.exponent
     impulse = 1e-5 * velocity_tolerance * scene.head.mass_kg
     return float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
 
 
-def _implicit(scene: Scene, parts: Parts, params: Params) -> Implicit | None:
+def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     """Return what implicit steps need, where a contact's damping can outweigh its spring far enough to pay."""
-    law, contact = parts.law, scene.contact
-    if law.ramp is not None or parts.slip is not None or parts.wear is not None:
+    contact = scene.contact
+    if terms.ramp is not None or terms.slip is not None or terms.wear is not None:
         return None
     mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
     largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
     depth = (largest_force / contact.stiffness) ** (1.0 / contact.exponent)
     spring = contact.exponent * largest_force / depth
-    if law.viscous is not None:
-        damping = law.viscous
-    elif law.factor is not None:
+    if terms.viscous is not None:
+        damping = params.viscous
+    elif terms.factor is not None:
         damping = largest_force * (contact.damping or params.damping_factor / params.speed_floor)
     else:
         return None
     return new_implicit() if damping * mobility > _OVERDAMPED * math.sqrt(spring * mobility) else None
 
 
-def _slip(scene: Scene) -> Slip | None:
-    friction = scene.friction
-    if friction is None or friction.coefficient == 0.0:
-        return None
-    return Slip(
-        geometry.slip_rows(scene),
-        geometry.slip_arm_rows(scene),
-        float(friction.coefficient),
-        float(friction.regularisation_speed_m_s),
-    )
-
-
-def _wear_rate(scene: Scene) -> Array | None:
+def _wear_rate(scene: Scene) -> Array:
     """Return depth per impulse of each pad, shape (8,), in m/(N s):  dh/dt = k_s F v / A (Archard)."""
     wear = scene.wear
-    if wear is None or wear.coefficient_m2_n == 0.0:
-        return None
+    if wear is None:
+        return np.zeros(PAIR_COUNT)
     return np.full(PAIR_COUNT, wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2)

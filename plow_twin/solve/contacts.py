@@ -29,17 +29,18 @@ from plow_twin.solve.layout import (
     USED,
     VX,
     VY,
+    X,
+    Y,
 )
+from plow_twin.solve.rows import moving, penetration
 
 
 @kernel(inline=True)
 def gap_and_rate(p, state, pair):
     """Return penetration and its rate of one pair at the step's start."""
-    y, A = state.y, p.gap
-    c, s, om = y[COS], y[SIN], y[OMEGA]
-    d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair] - state.depth[pair]
-    r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (y[VX] + om * y[1]) + A[3, pair] * (y[VY] - om * y[0])
-    return d, r
+    y = state.y
+    d = penetration(p, state.depth[pair], pair, y[COS], y[SIN], y[X], y[Y])
+    return d, moving(p.gap, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
 
 
 @kernel()
@@ -77,38 +78,6 @@ def settle_modes(p, state) -> None:
     state.step[STALL] = 0
 
 
-@kernel()
-def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
-    """Write what each pair that acts contributes per order to `w.lanes`; return whether any pair penetrates."""
-    mode, lanes = state.mode, w.lanes
-    inside = 0
-    for pair in range(8):
-        lanes[BASE, pair] = 0.0
-        lanes[RAMPS, pair] = 1.0 - state.beyond[pair]
-        raised = mode[pair] == ON or (ramp is not None and mode[pair] == CLIPPED)
-        if fraction is not None and raised and state.step[TOUCHING] >> pair & 1 == 0:
-            depth = gap_and_rate(p, state, pair)[0]
-            if depth > 1e-3 * p.release:
-                lanes[BASE, pair] = 0.5 / math.sqrt(depth) if fraction == 1.5 else 1.0 / depth
-            else:
-                # interrupted right after its touch: too shallow for a series of its power
-                mode[pair] = RELEASED
-        acts = mode[pair] == ON
-        lanes[ACTS, pair] = p.stiffness if acts else 0.0
-        lanes[DAMPS, pair] = 0.0
-        if acts:
-            lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
-        inside += 0 if mode[pair] == OFF else 1
-    return inside > 0
-
-
-@kernel(inline=True)
-def slow_touch(p) -> float:
-    """Return the speed below which a pair cannot reach the release depth by the speed of its touch alone."""
-    acceleration = p.threshold[0] * p.weight / p.radius
-    return 1e-3 * math.sqrt(2.0 * acceleration * p.release)
-
-
 @kernel(inline=True)
 def any_penetrates(state) -> bool:
     """Tell whether any pair is inside its wall, with or without force."""
@@ -119,12 +88,40 @@ def any_penetrates(state) -> bool:
 
 
 @kernel()
+def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
+    """Write what each pair that acts contributes per order to `w.lanes`; return whether any pair penetrates."""
+    mode, lanes = state.mode, w.lanes
+    for pair in range(8):
+        lanes[BASE, pair] = 0.0
+        lanes[RAMPS, pair] = 1.0 - state.beyond[pair]
+        raised = mode[pair] == ON or (ramp is not None and mode[pair] == CLIPPED)
+        if fraction is not None and raised and state.step[TOUCHING] >> pair & 1 == 0:
+            depth = gap_and_rate(p, state, pair)[0]
+            if depth > 1e-3 * p.release:
+                lanes[BASE, pair] = 0.5 / math.sqrt(depth) if p.exponent == 1.5 else 1.0 / depth
+            else:
+                # interrupted right after its touch: too shallow for a series of its power
+                mode[pair] = RELEASED
+        acts = mode[pair] == ON
+        lanes[ACTS, pair] = p.stiffness if acts else 0.0
+        lanes[DAMPS, pair] = 0.0
+        if acts:
+            lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.factor[pair]
+    return any_penetrates(state)
+
+
+@kernel(inline=True)
+def slow_touch(p) -> float:
+    """Return the speed below which a pair cannot reach the release depth by the speed of its touch alone."""
+    acceleration = p.threshold[0] * p.weight / p.radius
+    return 1e-3 * math.sqrt(2.0 * acceleration * p.release)
+
+
+@kernel()
 def within_range(p, state, y) -> bool:
     """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
     deepest = 0.0
     for pair in range(8):
         if p.enabled[pair] == 1:
-            A = p.gap
-            depth = A[0, pair] * y[COS] + A[1, pair] * y[SIN] + A[2, pair] * y[0] + A[3, pair] * y[1] + A[4, pair]
-            deepest = max(deepest, depth - state.depth[pair])
+            deepest = max(deepest, penetration(p, state.depth[pair], pair, y[COS], y[SIN], y[X], y[Y]))
     return abs(y[THETA]) <= 0.7853981633974483 and deepest <= p.half_cavity

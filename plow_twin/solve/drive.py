@@ -31,6 +31,7 @@ from plow_twin.solve.layout import (
     Status,
 )
 from plow_twin.solve.readout import evaluate, pair_outputs, pose_of, sigma_at, worn_depth
+from plow_twin.solve.series import one_by_one
 from plow_twin.solve.step import begin, finish
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
@@ -39,12 +40,8 @@ _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
 
 @kernel(inline=True)
 def _lay_out(p, parts, state, w, hard_time) -> bool:
-    law = parts.law
-    return begin(
-        p, state, w, hard_time, parts.harmonics, parts.second, parts.segments,
-        law.viscous, law.factor, law.integer, law.fraction, parts.wear, parts.offset, parts.free, law.ramp, parts.slip,
-        parts.implicit, parts,
-    )  # fmt: skip
+    terms = one_by_one(parts.terms)
+    return begin(p, parts, state, w, hard_time, *terms, parts.implicit)
 
 
 @kernel(inline=True)
@@ -85,7 +82,7 @@ def _proceed(p, parts, state, w, totals, target, hard_time, budget) -> int:
             _present(state, w, w.moved)
             return _OK if within_range(p, state, w.moved) else _RANGE
         account(state, w, low, sigma_at(state, state.clock[LENGTH]), totals)
-        finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
+        finish(p, state, w, totals, None, parts.terms.wear, parts.terms.fraction)
 
 
 @kernel()
@@ -149,8 +146,8 @@ def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, pea
     """Write row i: the state at the present time and the totals, which are cleared."""
     y = w.moved
     _present(state, w, y)
-    pose_of(y, parts.offset, q[i], v[i])
-    _worn_now(state, w, parts.wear, depth[i])
+    pose_of(p, y, parts.terms.offset, q[i], v[i])
+    _worn_now(state, w, parts.terms.wear, depth[i])
     pair_outputs(p, state, depth[i], y, penetration[i], rate[i], force[i])
     for pair in range(8):
         peak[i, pair] = max(totals.peak[pair], force[i, pair])
@@ -216,15 +213,15 @@ def advance_samples(
     bound,
 ) -> None:
     """Advance to each time under a wrench that runs straight from wrench[i] to wrench[i + 1]; a sample ends a step."""
-    piece = parts.segments
+    piece = parts.segments[0]
     state.step[PIECE] = 0
     for i in range(times.size):
         before = state.count[STEPS]
         span = times[i] - state.clock[T0]
-        piece.knots[0] = state.clock[T0]
+        piece.knot = state.clock[T0]
         for j in range(3):
-            piece.start[0, j] = wrench[i, j]
-            piece.slope[0, j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
+            piece.start[j] = wrench[i, j]
+            piece.slope[j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
         status[i] = _advance(p, parts, state, w, totals, times[i], times[i], before + budget, bound)
         if bound is not None:
             error_estimate[i] = bound.error[0]
@@ -243,7 +240,7 @@ def end_step(p, parts, state, w, totals) -> None:
     state.step[EVENT_PAIR] = -1
     state.step[AT_HARD_END] = 0
     now = clock[NOW]
-    finish(p, state, w, totals, None, parts.wear, parts.law.fraction)
+    finish(p, state, w, totals, None, parts.terms.wear, parts.terms.fraction)
     clock[T0] = clock[NOW] = now
 
 
@@ -275,7 +272,7 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
 
     `penetration`, `force` and `audit` may be None. The rows' times do not change the steps.
     """
-    rate, y, depth, wear = np.empty(8), np.empty(8), np.empty(8), parts.wear
+    rate, y, depth, wear = np.empty(8), np.empty(8), np.empty(8), parts.terms.wear
     i = first[0]
     if audit is not None and state.count[STEPS] == 0:
         audit_start(p, parts, state, state.y, state.clock[T0], audit)
@@ -292,7 +289,7 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
         while i < t.size and t[i] < end:
             sigma = sigma_at(state, max(t[i] - t0, 0.0))
             evaluate(state, w, sigma, y)
-            pose_of(y, parts.offset, q[i], v[i])
+            pose_of(p, y, parts.terms.offset, q[i], v[i])
             if force is not None:
                 _worn_at(state, w, wear, sigma, depth)
                 pair_outputs(p, state, depth, y, penetration[i], rate, force[i])
@@ -301,11 +298,11 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
         account(state, w, 0.0, sigma_at(state, length), totals)
         if audit is not None:
             audit_step(p, parts, wear, state, w, audit)
-        finish(p, state, w, totals, log, parts.wear, parts.law.fraction)
+        finish(p, state, w, totals, log, parts.terms.wear, parts.terms.fraction)
     if not within_range(p, state, state.y):
         return _RANGE
     while i < t.size:
-        pose_of(state.y, parts.offset, q[i], v[i])
+        pose_of(p, state.y, parts.terms.offset, q[i], v[i])
         if force is not None:
             pair_outputs(p, state, state.depth, state.y, penetration[i], rate, force[i])
         i += 1

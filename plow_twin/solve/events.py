@@ -17,7 +17,7 @@ from plow_twin.solve.layout import (
     RELEASED,
     SIGN,
 )
-from plow_twin.solve.polynomial import first_root
+from plow_twin.solve.polynomial import first_root, first_root_within
 
 
 @kernel(fast=True)
@@ -32,7 +32,7 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
         weights[SIGN, pair] = 0.0 if p.enabled[pair] == 0 else -1.0 if mode == OFF else 1.0
         weights[RATIO, pair] = 0.0
         if viscous is not None and ramp is None and mode == ON:
-            weights[RATIO, pair] = viscous / p.stiffness
+            weights[RATIO, pair] = p.viscous / p.stiffness
     sign, ratio = row(weights, SIGN), row(weights, RATIO)
     for k in range(order + 1):
         set_row(guard, k, row(w.gap, k) * sign)
@@ -63,12 +63,12 @@ def _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, 
             g[k] = -w.gap[k, pair]
         g[0] += p.release
     elif ramp is not None:
-        _pull(p, w, order, pair, mode, viscous, integer, fraction)
+        _pull(p, w, order, pair, mode, integer, fraction)
     elif viscous is not None:
         if mode == ON:
             return False
         for k in range(order):
-            g[k] = -(w.gap[k, pair] + viscous / p.stiffness * w.rate[k, pair])
+            g[k] = -(w.gap[k, pair] + p.viscous / p.stiffness * w.rate[k, pair])
     else:
         if factor is None:
             return False
@@ -81,17 +81,17 @@ def _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, 
 
 
 @kernel()
-def _pull(p, w, order, pair, mode, viscous, integer, fraction) -> None:
+def _pull(p, w, order, pair, mode, integer, fraction) -> None:
     """Write the force of a ramped law, negative for a clipped pair, to `w.column[0]`."""
     g, sign = w.column[0], 1.0 if mode == ON else -1.0
     for k in range(order):
         if integer is not None:
-            elastic = w.power[integer - 2, k, pair]
+            elastic = w.power[int(p.exponent) - 2, k, pair]
         elif fraction is not None:
             elastic = w.power[0, k, pair]
         else:
             elastic = w.gap[k, pair]
-        g[k] = sign * (p.stiffness * elastic + viscous * w.damped[k, pair])
+        g[k] = sign * (p.stiffness * elastic + p.viscous * w.damped[k, pair])
 
 
 @kernel()
@@ -107,12 +107,13 @@ def _ramp_guard(p, state, w, order, pair) -> None:
 def _unsafe_pairs(w, order, h):
     """Return a bit for each guard that is not proved to stay positive on [0, h].
 
-    The first proof is g_0 > sum |g_k| h^k; where it fails, that no Bernstein coefficient is negative.
+    The first proof is g_0 > sum max(-g_k, 0) h^k; where it fails, that no Bernstein coefficient is negative.
     """
     guard, b = w.guard, w.bernstein
-    reach = magnitude(row(guard, order)) * h
-    for k in range(order - 1, 0, -1):
-        reach = (reach + magnitude(row(guard, k))) * h
+    reach = splat(0.0)
+    for k in range(order, 0, -1):
+        term = row(guard, k)
+        reach = (reach + (magnitude(term) - term) * 0.5) * h
     if below(row(guard, 0), reach) == 0:
         return 0
     power = 1.0
@@ -132,10 +133,10 @@ def _unsafe_pairs(w, order, h):
 
 
 @kernel(inline=True)
-def _next_mode(mode, viscous, fraction, ramp):
+def _next_mode(p, mode, viscous, fraction, ramp):
     """Return the mode that follows when a pair's first guard ends it."""
     if mode == OFF:
-        return ON if fraction is None or fraction == 1.5 else RELEASED
+        return ON if fraction is None or p.exponent == 1.5 else RELEASED
     if mode == ON and viscous is not None and ramp is None:
         return CLIPPED
     return RELEASED if mode == ON and fraction is not None else OFF
@@ -146,7 +147,7 @@ def _sooner(state, w, order, best) -> float:
     """Return where the guard in `w.column[0]` first turns negative before `best`, else `best`."""
     column, reach = w.column[0], 0.0
     for k in range(order, 0, -1):
-        reach = (reach + abs(column[k])) * best
+        reach = (reach + max(-column[k], 0.0)) * best
     if column[0] >= reach:
         return best
     state.count[GUARD_ROOTS] += 1
@@ -162,12 +163,18 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer
     column = w.column[0]
     for pair in range(8):
         if unsafe >> pair & 1:
+            reach = 0.0
+            for k in range(order, 0, -1):
+                reach = (reach + max(-w.guard[k, pair], 0.0)) * best
+            if w.guard[0, pair] >= reach:
+                # an event found before is sooner
+                continue
             for k in range(order + 1):
-                column[k] = w.guard[k, pair]
+                column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
             state.count[GUARD_ROOTS] += 1
-            root = first_root(column, order, best, w)
+            root = first_root_within(column, order, sigma, w)
             if root < best:
-                best, event, target = root, pair, _next_mode(state.mode[pair], viscous, fraction, ramp)
+                best, event, target = root, pair, _next_mode(p, state.mode[pair], viscous, fraction, ramp)
     if penetrating:
         for pair in range(8):
             if state.mode[pair] == OFF:

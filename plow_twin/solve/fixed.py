@@ -72,12 +72,12 @@ def _account(state, force_before, force, dt, totals) -> None:
 @kernel()
 def _runge_kutta(p, parts, state, t, dt, z, trial, k, load) -> None:
     """Take one step of the classical Runge-Kutta method; z (6,) in place, the four stages stay in k (4, 6)."""
-    accelerate(p, parts, parts.offset, parts.free, parts.slip, False, state, t, z, load, k[0])
+    accelerate(p, parts, False, state, t, z, load, k[0])
     for stage in range(1, 4):
         part = dt if stage == 3 else 0.5 * dt
         for j in range(6):
             trial[j] = z[j] + part * k[stage - 1, j]
-        accelerate(p, parts, parts.offset, parts.free, parts.slip, False, state, t + part, trial, load, k[stage])
+        accelerate(p, parts, False, state, t + part, trial, load, k[stage])
     for j in range(6):
         z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
     state.count[COEFFICIENTS] += 4
@@ -112,7 +112,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
             return _NON_FINITE
         state.count[STEPS] += 1
         to_body(z, y)
-        _wear(parts.wear, state, now, dt)
+        _wear(p, parts.terms.wear, state, now, dt)
         for pair in range(8):
             before[pair] = now[pair]
         pair_outputs(p, state, state.depth, y, pen, rate, now)
@@ -152,7 +152,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
         if n % stride == 0 or n == steps:
             # the last row may lie closer than the others
             row = (n + stride - 1) // stride
-            pose_of(y, parts.offset, q[row], v[row])
+            pose_of(p, y, parts.terms.offset, q[row], v[row])
             if force is not None:
                 pair_outputs(p, state, state.depth, y, penetration[row], rate, force[row])
         if n >= steps:
@@ -161,7 +161,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
             return _LOG_FULL
         t = n * dt
         if euler:
-            accelerate(p, parts, parts.offset, parts.free, parts.slip, False, state, t, z, load, k[0])
+            accelerate(p, parts, False, state, t, z, load, k[0])
             for j in range(3):
                 z[3 + j] += dt * k[0, 3 + j]
                 z[j] += dt * z[3 + j]
@@ -172,7 +172,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
             return _NON_FINITE
         state.count[STEPS] += 1
         to_body(z, y)
-        _wear(parts.wear, state, now, dt)
+        _wear(p, parts.terms.wear, state, now, dt)
         before[:] = now
         pair_outputs(p, state, state.depth, y, pen, rate, now)
         _switch(p, state, pen, rate, t + dt, totals, log)
@@ -184,7 +184,7 @@ def march(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, pe
 
 
 @kernel()
-def _wear(rate, state, force, dt) -> None:
-    if rate is not None:
+def _wear(p, wear, state, force, dt) -> None:
+    if wear is not None:
         for pair in range(8):
-            state.depth[pair] += rate[pair] * force[pair] * dt
+            state.depth[pair] += p.wear[pair] * force[pair] * dt

@@ -79,6 +79,8 @@ _STATUS_TEXT: Final = {
 
 _ROWS: Final = MAX_ORDER + 1
 _WIDE: Final = (_ROWS, PAIR_COUNT)
+#: Size of a cache line in bytes.
+_LINE: Final = 64
 
 #: Constants of one scene and one tolerance, per mass and inertia where that saves work.
 PARAMS: Final = np.dtype(
@@ -97,6 +99,13 @@ PARAMS: Final = np.dtype(
         ("gravity", "f8"),
         ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
         ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
+        ("wear", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
+        ("offset", "f8", (2,)),  # centre of mass from the cavity's centre
+        ("free", "f8", (3,)),  # 1 free, 0 locked
+        ("slip", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
+        ("slip_arm", "f8", (4, PAIR_COUNT)),  # its arm about G
+        ("friction", "f8"),  # mu
+        ("slip_speed", "f8"),  # regularisation speed in m/s
         ("order", "i8"),
         ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
         ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
@@ -177,31 +186,35 @@ Work: TypeAlias = np.record
 Totals: TypeAlias = np.record
 
 
-class Harmonics(NamedTuple):
-    """Harmonic loads: S1 (and S2) are force per mass along `Params.direction`, M is moment per inertia."""
+#: Harmonic loads, per mass and inertia, sine and cosine amplitudes: forces S1 and S2 along `direction`, moment M.
+HARMONIC: Final = np.dtype([("omega", "f8"), ("first", "f8", (2,)), ("second", "f8", (2,)), ("moment", "f8", (2,))])
 
-    omega: Array  #: (h,)
-    first: Array  #: (h, 2) sine and cosine amplitudes of S1
-    moment: Array  #: (h, 2) of M
+#: Linear pieces of a sampled load, per mass and inertia: value at the knot and slope from there.
+SEGMENT: Final = np.dtype([("knot", "f8"), ("start", "f8", (3,)), ("slope", "f8", (3,))])
 
-
-class Law(NamedTuple):
-    """Which terms of the contact law exist; the type of each is part of the compiled signature."""
-
-    viscous: float | None  #: C of Kelvin-Voigt in N s/m
-    factor: int | None  #: not None: lambda is read from State.factor
-    integer: int | None  #: integer exponent of at least 2
-    fraction: float | None  #: exponent that is not an integer
-    ramp: float | None  #: penetration over which the viscous part grows
+Harmonics: TypeAlias = NDArray[np.void]
+Segments: TypeAlias = NDArray[np.void]
 
 
-class Slip(NamedTuple):
-    """Tangential friction."""
+class Terms(NamedTuple):
+    """Which terms the equations of motion have: 1, or `None` for one that is absent. Their numbers are in `Params`.
 
-    rows: Array  #: (4, 8) place along the wall, for c, s, X, Y
-    arm: Array  #: (4, 8) arm about G
-    coefficient: float  #: mu
-    speed: float  #: regularisation speed in m/s
+    The types are part of the compiled signature. A kernel takes them one by one, since a branch is left out of the
+    compiled code only by an argument of its own that is `None`.
+    """
+
+    harmonics: int | None
+    second: int | None  #: harmonic forces in two directions
+    segments: int | None  #: linear pieces
+    viscous: int | None  #: C d'
+    factor: int | None  #: lambda d', lambda from State.factor
+    integer: int | None  #: an integer exponent of at least 2
+    fraction: int | None  #: an exponent that is not an integer
+    ramp: int | None  #: the viscous part grows with the penetration
+    wear: int | None
+    offset: int | None  #: the centre of mass is not the cavity's
+    free: int | None  #: some degree of freedom is locked
+    slip: int | None  #: friction
 
 
 class Implicit(NamedTuple):
@@ -222,25 +235,12 @@ class Implicit(NamedTuple):
     load: Array  #: (3,)
 
 
-class Segments(NamedTuple):
-    """Linear pieces of a sampled load, per mass and inertia."""
-
-    knots: Array  #: (n,)
-    start: Array  #: (n, 3)
-    slope: Array  #: (n, 3)
-
-
 class Parts(NamedTuple):
-    """The parts that a scene may lack."""
+    """What a scene may lack: terms of the equations, and the data of those whose size differs from scene to scene."""
 
+    terms: Terms
     harmonics: Harmonics | None
-    second: Array | None  #: (h, 2) amplitudes of S2; None when all forces share one direction
     segments: Segments | None
-    law: Law
-    wear: Array | None  #: (8,) depth per impulse, k_s v / A
-    offset: Array | None  #: (2,) centre of mass from the cavity's centre
-    free: Array | None  #: (3,) 1 free, 0 locked
-    slip: Slip | None
     implicit: Implicit | None
 
 
@@ -266,8 +266,10 @@ class Log(NamedTuple):
 
 
 def new_record(dtype: np.dtype[np.void]) -> np.record:
-    """Return a record of zeros."""
-    record: np.record = np.zeros(1, dtype).view(np.recarray)[0]
+    """Return a record of zeros that starts at a cache line: rows of eight numbers then lie in one line each."""
+    memory = np.zeros(dtype.itemsize + _LINE, np.uint8)
+    start = -memory.ctypes.data % _LINE
+    record: np.record = memory[start : start + dtype.itemsize].view(dtype).view(np.recarray)[0]
     return record
 
 

@@ -14,7 +14,7 @@ from plow_twin.solve.layout import (
     ON,
     T0,
 )
-from plow_twin.solve.series import expand, expand_harmonics
+from plow_twin.solve.series import expand, expand_harmonics, one_by_one
 
 #: A pair that would part within so many steps like the last is looked at, by a series of this order.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
@@ -27,13 +27,14 @@ def accurate_length(p, w, order, hard):
     Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
     test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are looked at, since single ones can vanish.
     """
-    length = hard
+    least = np.inf
     for k in range(order, order - max(p.lacuna, 2), -1):
         size = w.size[k]
         if not (size <= 1e300):
             return math.nan
         if size > 0.0:
-            length = min(length, math.exp(math.log(p.threshold[k] / size) / k))
+            least = min(least, math.log(p.threshold[k] / size) / k)
+    length = min(hard, math.exp(least))
     # an error of velocity becomes one of position over a long step
     stretch = length * p.velocity_tolerance / (p.position_tolerance * (order + 1))
     if stretch > 1.0 and length < hard:
@@ -64,15 +65,11 @@ def before_sticking(p, state, w, order, sigma) -> float:
 
 
 @kernel()
-def time_to_part(
-    p, state, w, span, harmonics, second, segments, viscous, factor, integer, fraction, wear, offset, free, ramp, slip
-):
+def time_to_part(p, parts, state, w, span, harmonics):
     """Return the time until the first pair parts, where that is what shortens steps; else 0.
 
     The root of a short series is enough: what it misses is left to the next step.
     """
-    if fraction != 1.5:
-        return 0.0
     near = False
     for pair in range(8):
         if state.mode[pair] == ON:
@@ -82,27 +79,9 @@ def time_to_part(
     if not near:
         return 0.0
     if harmonics is not None:
-        expand_harmonics(harmonics, second, state.clock[T0], 1.0, 0.0, PARTING_ORDER, w)
-    order = expand(
-        p,
-        state,
-        w,
-        PARTING_ORDER,
-        True,
-        span,
-        harmonics,
-        second,
-        segments,
-        viscous,
-        factor,
-        integer,
-        fraction,
-        wear,
-        offset,
-        free,
-        ramp,
-        slip,
-    )
+        expand_harmonics(parts.harmonics, parts.terms.second, state.clock[T0], 1.0, 0.0, PARTING_ORDER, w)
+    terms = one_by_one(parts.terms)
+    order = expand(p, state, w, PARTING_ORDER, True, span, *terms)
     state.count[COEFFICIENTS] += order
     first = np.inf
     for pair in range(8):

@@ -8,51 +8,76 @@ from plow_twin.model.contact import free_force
 from plow_twin.model.friction import friction_force
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.layout import COS, OMEGA, ON, SIN, THETA, VX, VY
-from plow_twin.solve.loads import combined, load_at
+from plow_twin.solve.loads import load_at
+from plow_twin.solve.rows import combined, moving, penetration
 
 
 @kernel()
-def accelerate(p, parts, offset, free, slip, frozen, state, t, z, load, out) -> None:
+def push(p, slip, pair, force, c, s, omega, x, y, vx, vy):
+    """Return what a pair that pushes with `force` does in body axes: its force, its moment, the power of its friction.
+
+    The wall's tangent is its normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal.
+    """
+    fx, fy = -p.gap[2, pair] * force, -p.gap[3, pair] * force
+    torque, power = combined(p.arm, pair, c, s, x, y) * force, 0.0
+    if slip is not None:
+        rate = moving(p.slip, pair, c, s, omega, x, y, vx, vy)
+        drag = friction_force(force, rate, p.friction, p.slip_speed)
+        fx += p.gap[3, pair] * drag
+        fy -= p.gap[2, pair] * drag
+        torque += combined(p.slip_arm, pair, c, s, x, y) * drag
+        power = drag * rate
+    return fx, fy, torque, power
+
+
+@kernel(inline=True)
+def about_mass(p, c, s, load):
+    """Return the angular acceleration that a load through the cavity's centre gives about the centre of mass.
+
+    Gravity, which is part of the load, acts at the centre of mass.
+    """
+    across = (c * p.offset[0] - s * p.offset[1]) * (load[1] + p.gravity)
+    return -(across - (s * p.offset[0] + c * p.offset[1]) * load[0]) * p.inverse_inertia / p.inverse_mass
+
+
+@kernel()
+def accelerate(p, parts, frozen, state, t, z, load, out) -> None:
     """Write the rate of z = (x, y, theta, vx, vy, omega).
 
     `frozen`: the pairs that are on act by their law, also where it would pull; else those that penetrate push.
     """
-    load_at(p, parts.harmonics, parts.second, parts.segments, t, load)
-    A, B = p.gap, p.arm
+    terms = parts.terms
+    load_at(p, parts.harmonics, parts.segments, t, load)
+    _accelerate(p, terms.offset, terms.free, terms.slip, frozen, state, z, load, out)
+
+
+@kernel()
+def _accelerate(p, offset, free, slip, frozen, state, z, load, out) -> None:
     c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
     x, y, vx, vy = c * z[0] + s * z[1], c * z[1] - s * z[0], c * z[3] + s * z[4], c * z[4] - s * z[3]
     fx = fy = torque = 0.0
     for pair in range(8):
         if p.enabled[pair] == 0:
             continue
-        d = A[0, pair] * c + A[1, pair] * s + A[2, pair] * x + A[3, pair] * y + A[4, pair] - state.depth[pair]
+        d = penetration(p, state.depth[pair], pair, c, s, x, y)
         if (frozen and state.mode[pair] == ON) or (not frozen and d > 0.0):
-            r = om * (A[1, pair] * c - A[0, pair] * s) + A[2, pair] * (vx + om * y) + A[3, pair] * (vy - om * x)
+            r = moving(p.gap, pair, c, s, om, x, y, vx, vy)
             f = free_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)
             if not frozen:
                 f = max(f, 0.0)
-            fx -= A[2, pair] * f
-            fy -= A[3, pair] * f
-            torque += (B[0, pair] * c + B[1, pair] * s + B[2, pair] * x + B[3, pair] * y) * f
-            if slip is not None:
-                along = combined(slip.rows, pair, -om * s, om * c, vx + om * y, vy - om * x)
-                drag = friction_force(f, along, slip.coefficient, slip.speed)
-                # t is the normal turned by +90 degrees
-                fx += A[3, pair] * drag
-                fy -= A[2, pair] * drag
-                torque += combined(slip.arm, pair, c, s, x, y) * drag
-    moment = load[2] + torque * p.inverse_inertia
-    if offset is not None:
-        force_x, force_y = load[0], load[1] + p.gravity
-        across = (c * offset[0] - s * offset[1]) * force_y - (s * offset[0] + c * offset[1]) * force_x
-        moment -= across * p.inverse_inertia / p.inverse_mass
+            push_x, push_y, moment, _ = push(p, slip, pair, f, c, s, om, x, y, vx, vy)
+            fx += push_x
+            fy += push_y
+            torque += moment
     out[0], out[1], out[2] = z[3], z[4], z[5]
     out[3] = load[0] + (c * fx - s * fy) * p.inverse_mass
     out[4] = load[1] + (s * fx + c * fy) * p.inverse_mass
-    out[5] = moment
+    out[5] = load[2] + torque * p.inverse_inertia
+    if offset is not None:
+        out[5] += about_mass(p, c, s, load)
     if free is not None:
         for j in range(3):
-            out[3 + j] *= free[j]
+            out[3 + j] *= p.free[j]
 
 
 @kernel()

@@ -37,22 +37,28 @@ def _halve(left: Array, right: Array, n: int) -> None:
     # the sweep above leaves the left half's coefficients in `left`, the right half's in `right`
 
 
-@kernel()
+@kernel(fast=True)
 def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
-    """Return the only root in [low, high], where g >= 0 at `low` side and < 0 at `high`: Newton within the bracket."""
+    """Return the only root in [low, high], where g >= 0 at `low` side and < 0 at `high`: Halley within the bracket."""
     x = min(max(start, low), high)
     for _ in range(80):
-        value, slope = g[n], 0.0
+        value, slope, bend = g[n], 0.0, 0.0
         for k in range(n - 1, -1, -1):
+            bend = bend * x + slope
             slope = slope * x + value
             value = value * x + g[k]
         if value >= 0.0:
             low = x
         else:
             high = x
-        new = x - value / slope if slope < 0.0 else 0.5 * (low + high)
+        steepness = slope * slope - value * bend
+        change = value * slope / steepness if slope < 0.0 and steepness > 0.0 else np.inf
+        new = x - change
         if not (low <= new <= high):
             new = 0.5 * (low + high)
+        elif abs(change) <= 1e-6 * new and abs(bend * change) <= 1e-3 * abs(slope):
+            # the next change would be of the order of its cube
+            return new
         if abs(new - x) <= 2e-16 * high or high - low <= 2e-16 * high:
             return new
         x = new
@@ -61,13 +67,19 @@ def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
 
 @kernel()
 def first_root(g: Array, n: int, h: float, w) -> float:
-    """Return where g first turns negative in [0, h), or infinity; g[0] >= 0.
+    """Return where g first turns negative in [0, h), or infinity; g[0] >= 0."""
+    to_bernstein(g, n, h, w.binomial[n], w.halves[0])
+    return first_root_within(g, n, h, w)
+
+
+@kernel()
+def first_root_within(g: Array, n: int, h: float, w) -> float:
+    """Do the work of `first_root` from the Bernstein coefficients in `w.halves[0]`.
 
     Intervals whose Bernstein coefficients show no negative value are left out, one sign change is one root, the rest is
     halved, left part first.
     """
     b, bounds = w.halves, w.bounds
-    to_bernstein(g, n, h, w.binomial[n], b[0])
     bounds[0, 0], bounds[0, 1] = 0.0, h
     top = 0
     while top >= 0:
@@ -106,6 +118,15 @@ def first_root(g: Array, n: int, h: float, w) -> float:
 @kernel()
 def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
     """Return the larger of `floor` and the maximum of g on [0, h], to 1e-12 of it."""
+    end, steepest, power = g[n], 0.0, 1.0
+    for k in range(n - 1, -1, -1):
+        end = end * h + g[k]
+    for k in range(2, n + 1):
+        power *= h
+        steepest += k * abs(g[k]) * power
+    if abs(g[1]) >= steepest:
+        # monotonic
+        return max(floor, g[0], end)
     b = w.halves
     to_bernstein(g, n, h, w.binomial[n], b[0])
     best = floor

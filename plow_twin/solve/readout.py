@@ -24,7 +24,7 @@ from plow_twin.solve.layout import (
     X,
     Y,
 )
-from plow_twin.solve.loads import combine
+from plow_twin.solve.rows import combine
 
 
 @kernel(inline=True)
@@ -64,12 +64,12 @@ def worn_depth(state, w, sigma, out) -> None:
 
 
 @kernel()
-def pose_of(y, offset, q, v) -> None:
+def pose_of(p, y, offset, q, v) -> None:
     """Write pose and rate of the cavity's centre in world axes from body coordinates; inverse of `body_state`."""
     c, s, x, yy, vx, vy, om = y[COS], y[SIN], y[0], y[1], y[VX], y[VY], y[OMEGA]
     if offset is not None:
-        x, yy = x - offset[0], yy - offset[1]
-        vx, vy = vx + om * offset[1], vy - om * offset[0]
+        x, yy = x - p.offset[0], yy - p.offset[1]
+        vx, vy = vx + om * p.offset[1], vy - om * p.offset[0]
     q[0], q[1], q[2] = c * x - s * yy, s * x + c * yy, y[THETA]
     v[0], v[1], v[2] = c * vx - s * vy, s * vx + c * vy, om
 

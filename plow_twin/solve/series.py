@@ -17,7 +17,7 @@ import math
 
 from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.model.kernel import kernel
-from plow_twin.model.lanes import lane, magnitude, pack, row, set_row, splat, total
+from plow_twin.model.lanes import lane, magnitude, pack, permutation, row, set_row, splat, total
 from plow_twin.solve.layout import (
     ACTS,
     ALPHA,
@@ -28,14 +28,17 @@ from plow_twin.solve.layout import (
     OMEGA,
     RAMPS,
     SIN,
-    THETA,
     TOUCHING,
     VX,
     VY,
     X,
     Y,
 )
-from plow_twin.solve.loads import combine
+from plow_twin.solve.rows import combine
+
+#: Factors of omega (S1 in lanes 4 and 7) in the rates of the state's components, and of the rates that are components.
+_turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
+_rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
 
 @kernel(fast=True)
@@ -47,17 +50,17 @@ def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
     load = w.load
     for k in range(order + 1):
         load[0, k] = load[1, k] = load[2, k] = 0.0
-    for i in range(harmonics.omega.size):
-        omega = harmonics.omega[i]
+    for i in range(harmonics.size):
+        one = harmonics[i]
+        omega = one.omega
         sine, cosine = math.sin(omega * t), math.cos(omega * t)
         sine_before, cosine_before = 0.0, 0.0
-        f0, f1 = harmonics.first[i, 0], harmonics.first[i, 1]
-        m0, m1 = harmonics.moment[i, 0], harmonics.moment[i, 1]
+        f0, f1, m0, m1 = one.first[0], one.first[1], one.moment[0], one.moment[1]
         for k in range(order + 1):
             load[0, k] += f0 * sine + f1 * cosine
             load[2, k] += m0 * sine + m1 * cosine
             if second is not None:
-                load[1, k] += second[i, 0] * sine + second[i, 1] * cosine
+                load[1, k] += one.second[0] * sine + one.second[1] * cosine
             scale = omega * w.inverse[k + 1]
             new_sine = scale * (alpha * cosine + beta * cosine_before)
             new_cosine = -scale * (alpha * sine + beta * sine_before)
@@ -116,11 +119,11 @@ def _raise(w, k, touching, exponent) -> None:
 
 
 @kernel(fast=True, inline=True)
-def _damp(elastic, w, k, viscous, factor, ramp):
+def _damp(p, elastic, w, k, viscous, factor, ramp):
     """Return order k of the force from that of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
     force = row(w.lanes, ACTS) * row(elastic, k)
     if ramp is not None:
-        _ramp(w, k, ramp)
+        _ramp(p, w, k)
         set_row(w.damped, k, _multiply(w.ramp[2], w.rate, k))
         return force + row(w.lanes, DAMPS) * row(w.damped, k)
     if viscous is not None:
@@ -129,56 +132,57 @@ def _damp(elastic, w, k, viscous, factor, ramp):
 
 
 @kernel(fast=True, inline=True)
-def _ramp(w, k, ramp) -> None:
+def _ramp(p, w, k) -> None:
     """Write order k of the share of C that acts to `w.ramp[2]`: constant for pairs beyond the ramp."""
     set_row(w.ramp[0], k, _multiply(w.gap, w.gap, k))
     set_row(w.ramp[1], k, _multiply(w.ramp[0], w.gap, k))
     within = row(w.lanes, RAMPS)
-    share = ramp_terms(w.ramp[0], w.ramp[1], k, ramp) * within
+    share = ramp_terms(w.ramp[0], w.ramp[1], k, p.ramp) * within
     if k == 0:
         share = share + (within * -1.0 + 1.0)
     set_row(w.ramp[2], k, share)
 
 
 @kernel(fast=True, inline=True)
-def _push(state, w, k, viscous, factor, integer, fraction, ramp):
+def _push(p, state, w, k, viscous, factor, integer, fraction, ramp):
     """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
     Row ACTS of `w.lanes` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
     """
     if integer is not None:
         set_row(w.power[0], k, _multiply(w.gap, w.gap, k))
-        for degree in range(1, integer - 1):
-            set_row(w.power[degree], k, _multiply(w.power[degree - 1], w.gap, k))
-        return _damp(w.power[integer - 2], w, k, viscous, factor, ramp)
+        degree = int(p.exponent)
+        for i in range(1, degree - 1):
+            set_row(w.power[i], k, _multiply(w.power[i - 1], w.gap, k))
+        return _damp(p, w.power[degree - 2], w, k, viscous, factor, ramp)
     if fraction is not None:
-        _raise(w, k, state.step[TOUCHING], fraction)
-        return _damp(w.power[0], w, k, viscous, factor, ramp)
-    return _damp(w.gap, w, k, viscous, factor, ramp)
+        _raise(w, k, state.step[TOUCHING], p.exponent)
+        return _damp(p, w.power[0], w, k, viscous, factor, ramp)
+    return _damp(p, w.gap, w, k, viscous, factor, ramp)
 
 
 @kernel(fast=True)
-def _hold(w, k, free, fx, fy):
+def _hold(p, w, k, fx, fy):
     """Return order k of the force per mass in head axes without what acts along a locked world axis."""
     w.world[0, k], w.world[1, k] = fx, fy
     right, world = w.right, w.world
     along_x = along_y = 0.0
     for j in range(k + 1):
-        along_x += right[k - j, 5] * world[0, j] - right[k - j, 4] * world[1, j]
-        along_y += right[k - j, 4] * world[0, j] + right[k - j, 5] * world[1, j]
-    world[2, k], world[3, k] = free[0] * along_x, free[1] * along_y
+        along_x += right[k - j, 4] * world[0, j] - right[k - j, 5] * world[1, j]
+        along_y += right[k - j, 5] * world[0, j] + right[k - j, 4] * world[1, j]
+    world[2, k], world[3, k] = p.free[0] * along_x, p.free[1] * along_y
     fx = fy = 0.0
     for j in range(k + 1):
-        fx += right[k - j, 5] * world[2, j] + right[k - j, 4] * world[3, j]
-        fy += right[k - j, 5] * world[3, j] - right[k - j, 4] * world[2, j]
+        fx += right[k - j, 4] * world[2, j] + right[k - j, 5] * world[3, j]
+        fy += right[k - j, 4] * world[3, j] - right[k - j, 5] * world[2, j]
     return fx, fy
 
 
 @kernel(fast=True)
-def _loads(p, w, k, c, s, c1, s1, c2, s2, older, alpha, beta, harmonics, second, segments):
+def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments):
     """Return order k of the load per mass, turned into head axes, and of its moment per inertia.
 
-    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before; `older` has S1 c and S1 s.
+    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before; `product` has S1 c and S1 s.
     """
     load, right, start, slope = w.load, w.right, w.wrench[0], w.wrench[1]
     fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
@@ -192,11 +196,7 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, older, alpha, beta, harmonics, second,
         elif k == 2:
             moment += 0.5 * beta * slope[2]
     if harmonics is not None:
-        along_c = lane(older, 6) + load[0, 0] * c
-        along_s = lane(older, 7) + load[0, 0] * s
-        if k > 0:
-            along_c += load[0, k] * right[0, 6]
-            along_s += load[0, k] * right[0, 7]
+        along_c, along_s = lane(product, 4), lane(product, 7)
         fx += p.direction[0, 0] * along_c + p.direction[0, 1] * along_s
         fy += p.direction[0, 1] * along_c - p.direction[0, 0] * along_s
         moment += load[2, k]
@@ -219,15 +219,15 @@ def _resultant(p, w, k, force):
 
 
 @kernel(fast=True)
-def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy, slip):
+def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
     """Return order k of the friction forces' sum in head axes and of their moment (`model.friction`).
 
     With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
     """
     weighted, tau, rest, drag, arm = w.slip[1], w.slip[2], w.slip[3], w.slip[4], w.slip[5]
-    rate = combine(slip.rows, dc, ds, dx, dy) * (1.0 / slip.speed)
+    rate = combine(p.slip, dc, ds, dx, dy) * (1.0 / p.slip_speed)
     set_row(w.slip[0], k, rate)
-    set_row(arm, k, combine(slip.arm, c, s, x, y))
+    set_row(arm, k, combine(p.slip_arm, c, s, x, y))
     if k == 0:
         for pair in range(8):
             tau[0, pair] = math.tanh(lane(rate, pair))
@@ -238,19 +238,28 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy, slip):
         older = _multiply_older(weighted, rest, k) + row(weighted, k) * row(rest, 0)
         set_row(tau, k, older * w.inverse[k])
         set_row(rest, k, _multiply(tau, tau, k) * -1.0)
-    force = _multiply(w.force, tau, k) * slip.coefficient
+    force = _multiply(w.force, tau, k) * p.friction
     set_row(drag, k, force)
     # t is the wall's normal turned by +90 degrees, the gap's rows for X and Y are minus the normals
     return total(row(p.gap, 3) * force), -total(row(p.gap, 2) * force), total(_multiply(arm, drag, k))
 
 
 @kernel(fast=True)
-def _wear(w, k, wear, alpha, beta) -> None:
+def _wear(p, w, k, alpha, beta) -> None:
     """Write order k + 1 of the growth of each pad's depth:  dh/dt = k_s F v / A (Archard)."""
     growth = row(w.force, k) * alpha
     if k > 0:
         growth = growth + row(w.force, k - 1) * beta
-    set_row(w.worn, k + 1, growth * row(wear, 0) * w.inverse[k + 1])
+    set_row(w.worn, k + 1, growth * row(p.wear, 0) * w.inverse[k + 1])
+
+
+@kernel(inline=True)
+def one_by_one(terms):
+    """Return the terms as a plain tuple, to be passed on with a star."""
+    return (
+        terms.harmonics, terms.second, terms.segments, terms.viscous, terms.factor, terms.integer, terms.fraction,
+        terms.ramp, terms.wear, terms.offset, terms.free, terms.slip,
+    )  # fmt: skip
 
 
 @kernel(fast=True)
@@ -268,10 +277,10 @@ def expand(
     factor,
     integer,
     fraction,
+    ramp,
     wear,
     offset,
     free,
-    ramp,
     slip,
 ):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
@@ -279,17 +288,16 @@ def expand(
     Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. `hard` is the longest
     sigma of interest: orders whose terms vanish there are not computed.
     """
-    y, alpha, beta = state.y, state.clock[ALPHA], state.clock[BETA]
+    alpha, beta = state.clock[ALPHA], state.clock[BETA]
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
     im, ii = p.inverse_mass, p.inverse_inertia
-    x, yy, vx, vy, om, c, s, theta = y[X], y[Y], y[VX], y[VY], y[OMEGA], y[COS], y[SIN], y[THETA]
-    x0, y0, vx0, vy0, om0, c0, s0 = x, yy, vx, vy, om, c, s
-    # rates of the order before, for the sigma term of the time map
-    px = py = pvx = pvy = pom = pc = ps = pth = 0.0
+    here, before = row(state.y, 0), splat(0.0)
     c1 = s1 = c2 = s2 = 0.0
     small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, limit
     for k in range(order + 1):
-        set_row(w.series, k, pack(x, yy, vx, vy, om, c, s, theta))
+        set_row(w.series, k, here)
+        x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
+        om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
         depth = combine(p.gap, c, s, x, yy)
         if k == 0:
             depth = depth + row(p.gap, 4) - row(state.depth, 0)
@@ -307,48 +315,37 @@ def expand(
         if k == order:
             break
         s1_k = 0.0 if harmonics is None else load[0, k]
-        set_row(right, k, pack(yy, x, vy, vx, s, c, c, s))
-        set_row(left, k, pack(om, om, om, om, om, om, s1_k, s1_k))
-        older = _multiply_older(left, right, k)
-        # omega times the others: the terms of order k itself, and those between
-        om_k = 0.0 if k == 0 else om
-        dx = vx + (lane(older, 0) + om0 * yy + om_k * y0)
-        dy = vy - (lane(older, 1) + om0 * x + om_k * x0)
-        dc = -(lane(older, 4) + om0 * s + om_k * s0)
-        ds = lane(older, 5) + om0 * c + om_k * c0
-        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, older, alpha, beta, harmonics, second, segments)
+        set_row(right, k, _turned(here))
+        set_row(left, k, pack(om, om, om, om, s1_k, om, om, s1_k))
+        product = _multiply(left, right, k)
+        turning = product * pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
+        turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        dx, dy, dc, ds = lane(turning, X), lane(turning, Y), lane(turning, COS), lane(turning, SIN)
+        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments)
         if offset is not None:
             # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
-            moment -= (offset[0] * (fy + p.gravity * c) - offset[1] * (fx + p.gravity * s)) * ii / im
+            moment -= (p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)) * ii / im
         if penetrating:
             set_row(w.rate, k, combine(p.gap, dc, ds, dx, dy))
             set_row(w.arm, k, combine(p.arm, c, s, x, yy))
-            force = _push(state, w, k, viscous, factor, integer, fraction, ramp)
+            force = _push(p, state, w, k, viscous, factor, integer, fraction, ramp)
             set_row(w.force, k, force)
             push_x, push_y, torque = _resultant(p, w, k, force)
             fx += push_x * im
             fy += push_y * im
             moment += torque * ii
             if slip is not None:
-                push_x, push_y, torque = _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy, slip)
+                push_x, push_y, torque = _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
                 fx += push_x * im
                 fy += push_y * im
                 moment += torque * ii
             if wear is not None:
-                _wear(w, k, wear, alpha, beta)
+                _wear(p, w, k, alpha, beta)
         if free is not None:
-            moment *= free[2]
-            fx, fy = _hold(w, k, free, fx, fy)
-        dvx = fx + (lane(older, 2) + om0 * vy + om_k * vy0)
-        dvy = fy - (lane(older, 3) + om0 * vx + om_k * vx0)
+            moment *= p.free[2]
+            fx, fy = _hold(p, w, k, fx, fy)
         c2, s2, c1, s1 = c1, s1, c, s
-        q = inverse[k + 1]
-        x, px = (alpha * dx + beta * px) * q, dx
-        yy, py = (alpha * dy + beta * py) * q, dy
-        theta, pth = (alpha * om + beta * pth) * q, om
-        vx, pvx = (alpha * dvx + beta * pvx) * q, dvx
-        vy, pvy = (alpha * dvy + beta * pvy) * q, dvy
-        om, pom = (alpha * moment + beta * pom) * q, moment
-        c, pc = (alpha * dc + beta * pc) * q, dc
-        s, ps = (alpha * ds + beta * ps) * q, ds
+        rates = turning + pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
+        here = (rates * alpha + before * beta) * inverse[k + 1]
+        before = rates
     return order

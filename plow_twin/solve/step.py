@@ -51,7 +51,7 @@ from plow_twin.solve.layout import (
 )
 from plow_twin.solve.length import accurate_length, before_sticking, time_to_part
 from plow_twin.solve.readout import evaluate, worn_depth
-from plow_twin.solve.series import expand, expand_harmonics
+from plow_twin.solve.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.stiff import PATIENCE, STAGES, collocate, note_explicit
 
 #: Longest step in s; keeps every power of it finite.
@@ -64,23 +64,25 @@ _TOUCH_REACH = 2.5
 def _linear_load(segments, step, t0, w):
     """Add the linear load at t0 to `w.wrench` and return the time up to which it is linear."""
     piece = step[PIECE]
-    while piece + 1 < segments.knots.size and segments.knots[piece + 1] <= t0:
+    while piece + 1 < segments.size and segments[piece + 1].knot <= t0:
         piece += 1
     step[PIECE] = piece
-    if t0 < segments.knots[piece]:
+    here = segments[piece]
+    if t0 < here.knot:
         for j in range(3):
-            w.wrench[0, j] += segments.start[piece, j]
+            w.wrench[0, j] += here.start[j]
             w.wrench[1, j] = 0.0
-        return segments.knots[piece]
+        return here.knot
     for j in range(3):
-        w.wrench[1, j] = segments.slope[piece, j]
-        w.wrench[0, j] += segments.start[piece, j] + segments.slope[piece, j] * (t0 - segments.knots[piece])
-    return segments.knots[piece + 1] if piece + 1 < segments.knots.size else np.inf
+        w.wrench[1, j] = here.slope[j]
+        w.wrench[0, j] += here.start[j] + here.slope[j] * (t0 - here.knot)
+    return segments[piece + 1].knot if piece + 1 < segments.size else np.inf
 
 
 @kernel()
 def begin(
     p,
+    parts,
     state,
     w,
     hard_time,
@@ -91,13 +93,12 @@ def begin(
     factor,
     integer,
     fraction,
+    ramp,
     wear,
     offset,
     free,
-    ramp,
     slip,
     implicit,
-    parts,
 ) -> bool:
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step = state.clock, state.step
@@ -106,7 +107,7 @@ def begin(
     for j in range(3):
         w.wrench[0, j] = p.constant[j]
     if segments is not None:
-        hard_time = min(hard_time, _linear_load(segments, step, t0, w))
+        hard_time = min(hard_time, _linear_load(parts.segments, step, t0, w))
     clock[HARD_END] = hard_time
     span = min(hard_time - t0, LONGEST_STEP)
     limited = span < LONGEST_STEP
@@ -126,57 +127,22 @@ def begin(
             clock[ALPHA], clock[BETA] = 0.0, 2.0
             hard = math.sqrt(span)
         elif fraction is not None and penetrating:
-            parting = time_to_part(
-                p,
-                state,
-                w,
-                span,
-                harmonics,
-                second,
-                segments,
-                viscous,
-                factor,
-                integer,
-                fraction,
-                wear,
-                offset,
-                free,
-                ramp,
-                slip,
-            )
+            parting = time_to_part(p, parts, state, w, span, harmonics) if p.exponent == 1.5 else 0.0
             if parting > 0.0:
                 # one that ends like d^1.5 is analytic in the root of the time left
                 root = math.sqrt(parting)
                 clock[ALPHA], clock[BETA] = 2.0 * root, -2.0
                 hard = root if parting <= span else root - math.sqrt(parting - span)
                 limited = limited and parting > span
-            elif fraction == 1.5 and 0.0 < t0 - clock[TOUCHED] < _TOUCH_REACH * clock[LAST_LENGTH]:
+            elif p.exponent == 1.5 and 0.0 < t0 - clock[TOUCHED] < _TOUCH_REACH * clock[LAST_LENGTH]:
                 # and still in the root of the time since its start, some steps on
                 root = math.sqrt(t0 - clock[TOUCHED])
                 clock[ALPHA], clock[BETA] = 2.0 * root, 2.0
                 hard = math.sqrt(t0 - clock[TOUCHED] + span) - root
         if harmonics is not None:
-            expand_harmonics(harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
-        order = expand(
-            p,
-            state,
-            w,
-            p.order,
-            penetrating,
-            hard,
-            harmonics,
-            second,
-            segments,
-            viscous,
-            factor,
-            integer,
-            fraction,
-            wear,
-            offset,
-            free,
-            ramp,
-            slip,
-        )
+            expand_harmonics(parts.harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
+        terms = one_by_one(parts.terms)
+        order = expand(p, state, w, p.order, penetrating, hard, *terms)
         state.count[STEPS] += 1
         state.count[COEFFICIENTS] += order
         sigma = hard if order < p.order else accurate_length(p, w, order, hard)

@@ -9,6 +9,7 @@ other step.
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,8 @@ from plow_twin.solve.layout import (
     X,
     Y,
 )
-from plow_twin.solve.loads import combine, combined
 from plow_twin.solve.motion import accelerate, to_body, to_world
+from plow_twin.solve.rows import combine, combined, moving, penetration
 
 #: Stages: the polynomials' degree. The order is 2 s - 1.
 STAGES = 9
@@ -67,17 +68,24 @@ def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
     return columns
 
 
-def new_implicit() -> Implicit:
-    """Return nodes, weights and scratch space."""
+@cache
+def _rule() -> tuple[NDArray[np.float64], ...]:
+    """Return nodes, weights, and the coefficients from values at the start and the nodes, and at the nodes alone."""
     inner = 0.5 * (roots_jacobi(STAGES - 1, 1.0, 0.0)[0] + 1.0)
     nodes = np.append(np.sort(inner), 1.0).astype(np.longdouble)
     degree = np.arange(1, STAGES + 1)
     from_stages = _coefficients(nodes)
     weights = (nodes[:, None] ** degree / degree) @ from_stages
+    from_values = _coefficients(np.append(np.longdouble(0.0), nodes))
+    return tuple(table.astype(np.float64) for table in (nodes, weights, from_values, from_stages))
+
+
+def new_implicit() -> Implicit:
+    """Return nodes, weights and scratch space."""
+    nodes, weights, from_values, from_stages = _rule()
     size = 3 * STAGES
     return Implicit(
-        nodes.astype(np.float64), weights.astype(np.float64),
-        _coefficients(np.append(np.longdouble(0.0), nodes)).astype(np.float64), from_stages.astype(np.float64),
+        nodes, weights, from_values, from_stages,
         np.zeros((STAGES + 1, 6)), np.zeros((2, 6)), np.zeros((STAGES, 3)), np.zeros((STAGES, 2, 3, 3)),
         np.zeros((size, size)), np.zeros(size), np.zeros((STAGES + 1, 8)), np.zeros((STAGES, 8)), np.zeros(3),
     )  # fmt: skip
@@ -111,21 +119,16 @@ def note_explicit(p, state, w, length, free) -> None:
 
 
 @kernel()
-def _rate(p, parts, offset, free, slip, state, t, z, implicit, out) -> None:
-    accelerate(p, parts, offset, free, slip, True, state, t, z, implicit.load, out)
-
-
-@kernel()
 def _jacobian(p, parts, state, t, z, implicit, base, out) -> None:
     """Write the accelerations at z to `base` (3,), their derivatives by place and by velocity to `out` (2, 3, 3)."""
     rate, moved = implicit.rate[0], implicit.rate[1]
-    _rate(p, parts, parts.offset, parts.free, parts.slip, state, t, z, implicit, rate)
+    accelerate(p, parts, True, state, t, z, implicit.load, rate)
     for j in range(6):
         # where the law is linear any difference will do that rounding does not spoil
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
-        _rate(p, parts, parts.offset, parts.free, parts.slip, state, t, z, implicit, moved)
+        accelerate(p, parts, True, state, t, z, implicit.load, moved)
         z[j] = saved
         for i in range(3):
             out[j // 3, i, j % 3] = (moved[3 + i] - rate[3 + i]) / delta
@@ -229,18 +232,24 @@ def _solve(p, parts, state, t, h, implicit) -> bool:
 
 
 @kernel()
+def _interpolate(values, coefficients, h, out) -> None:
+    """Write the series of the polynomials of a step of length h that take eight values at each node."""
+    scale = 1.0
+    for k in range(len(coefficients)):
+        value = splat(0.0)
+        for i in range(len(coefficients)):
+            value = value + row(values, i) * coefficients[k, i]
+        set_row(out, k, value * scale)
+        scale /= h
+
+
+@kernel()
 def _write_series(p, state, h, w, implicit) -> float:
     """Write the collocation polynomial of state, penetration, rate and force as series; return its last term's size."""
     s, body, forces = implicit.nodes.size, implicit.body, implicit.forces
     for i in range(s + 1):
         to_body(implicit.z[i], body[i])
-    scale = 1.0
-    for k in range(s + 1):
-        value = splat(0.0)
-        for i in range(s + 1):
-            value = value + row(body, i) * implicit.from_values[k, i]
-        set_row(w.series, k, value * scale)
-        scale /= h
+    _interpolate(body, implicit.from_values, h, w.series)
     for k in range(s + 1):
         y = w.series[k]
         depth = combine(p.gap, y[COS], y[SIN], y[X], y[Y])
@@ -254,17 +263,10 @@ def _write_series(p, state, h, w, implicit) -> float:
         for pair in range(8):
             forces[i, pair] = 0.0
             if state.mode[pair] == ON:
-                c, sn, om = y[COS], y[SIN], y[OMEGA]
-                d = combined(p.gap, pair, c, sn, y[X], y[Y]) + p.gap[4, pair] - state.depth[pair]
-                r = combined(p.gap, pair, -om * sn, om * c, y[VX] + om * y[Y], y[VY] - om * y[X])
+                d = penetration(p, state.depth[pair], pair, y[COS], y[SIN], y[X], y[Y])
+                r = moving(p.gap, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
                 forces[i, pair] = free_force(d, r, p.stiffness, p.exponent, state.factor[pair], p.viscous, p.ramp)
-    scale = 1.0
-    for k in range(s):
-        value = splat(0.0)
-        for i in range(s):
-            value = value + row(forces, i) * implicit.from_stages[k, i]
-        set_row(w.force, k, value * scale)
-        scale /= h
+    _interpolate(forces, implicit.from_stages, h, w.force)
     last = w.series[s]
     size = abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA])
     size += p.velocity_tolerance / p.position_tolerance * (abs(last[X]) + abs(last[Y]) + p.radius * abs(last[THETA]))
