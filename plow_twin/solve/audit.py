@@ -15,10 +15,12 @@ import numpy as np
 from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row
+from plow_twin.solve.flight import fastest
 from plow_twin.solve.layout import (
     ALPHA,
     BETA,
     COS,
+    FLYING,
     OMEGA,
     SIGMA,
     SIN,
@@ -35,6 +37,8 @@ from plow_twin.solve.readout import evaluate, pair_outputs, worn_depth
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
 _NODES = 24
+#: Radians of the fastest harmonic in one panel of a flight.
+_PANEL_PHASE = 8.0
 # indices into the powers and impulses at one instant
 LOADS, NORMAL, FRICTION, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(10)
 
@@ -146,19 +150,24 @@ def _add(audit, powers, weight) -> None:
 
 
 @kernel()
-def audit_step(p, parts, wear, state, w, audit) -> None:
+def audit_step(p, parts, wear, flight, state, w, audit) -> None:
     """Add the step under way, before it is finished."""
     clock, y, depth, end = state.clock, audit.body, audit.depth, state.clock[SIGMA]
     set_row(depth, 0, row(state.depth, 0))
-    for i in range(audit.nodes.size):
-        sigma = end * audit.nodes[i]
-        evaluate(state, w, sigma, y)
-        if wear is not None:
-            worn_depth(state, w, sigma, depth)
-        t = clock[T0] + clock[ALPHA] * sigma + 0.5 * clock[BETA] * sigma * sigma
-        _powers(p, parts, state, depth, y, t, audit, audit.now)
-        _add(audit, audit.now, audit.weights[i] * end * (clock[ALPHA] + clock[BETA] * sigma))
-    evaluate(state, w, end, y)
+    panels = 1
+    if flight is not None and state.step[FLYING] == 1:
+        panels += int(end * fastest(parts.harmonics) / _PANEL_PHASE)
+    width = end / panels
+    for panel in range(panels):
+        for i in range(audit.nodes.size):
+            sigma = width * (panel + audit.nodes[i])
+            evaluate(p, parts, state, w, sigma, y)
+            if wear is not None:
+                worn_depth(state, w, sigma, depth)
+            t = clock[T0] + clock[ALPHA] * sigma + 0.5 * clock[BETA] * sigma * sigma
+            _powers(p, parts, state, depth, y, t, audit, audit.now)
+            _add(audit, audit.now, audit.weights[i] * width * (clock[ALPHA] + clock[BETA] * sigma))
+    evaluate(p, parts, state, w, end, y)
     _balance(p, y, audit, False)
 
 

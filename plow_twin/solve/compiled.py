@@ -102,9 +102,9 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     speed = _velocity_scale(scene, loads, length)
     admissible = tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION)
     order, radius = order_for(admissible), geometry.half_diagonal(scene)
-    params = new_record(PARAMS)
+    params, rows = new_record(PARAMS), geometry.penetration_rows(scene)
     values: dict[str, Any] = dict(
-        gap=geometry.penetration_rows(scene),
+        gap=rows,
         arm=geometry.arm_rows(scene),
         enabled=np.array([name in scene.pairs for name in PAIR_NAMES], dtype=np.int64),
         inverse_mass=1.0 / mass,
@@ -129,6 +129,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         wear=_wear_rate(scene),
         offset=scene.head.com_offset_m,
         free=np.array([float(name not in scene.locked) for name in DOF_NAMES]),
+        leverage=float(np.hypot(rows[0], rows[1]).max()),
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
@@ -154,6 +155,9 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         free=bool(scene.locked),
         slip=friction is not None,
     )
+    # with the loads' moment about another point than the centre of mass the flight has no elementary integral
+    present["flight"] = present["harmonics"] and not present["offset"]
+    present["rest"] = not (present["harmonics"] or present["wear"] or present["slip"])
     terms = terms._replace(**_flags(present))
     return Compiled(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
 

@@ -10,15 +10,18 @@ from plow_twin.solve.accounts import account
 from plow_twin.solve.audit import audit_start, audit_step
 from plow_twin.solve.contacts import within_range
 from plow_twin.solve.fixed import end_coarsely
+from plow_twin.solve.flight import fly
 from plow_twin.solve.layout import (
     AT_HARD_END,
     EVENT_PAIR,
     EXPLICIT_LENGTH,
+    FLYING,
     IMPLICIT_LENGTH,
     LENGTH,
     NOW,
     OVERDAMPED,
     PIECE,
+    RESTING,
     SIGMA,
     STALL,
     STEPS,
@@ -30,7 +33,8 @@ from plow_twin.solve.layout import (
     WAS_OVERDAMPED,
     Status,
 )
-from plow_twin.solve.readout import evaluate, pair_outputs, pose_of, sigma_at, worn_depth
+from plow_twin.solve.readout import evaluate, pair_outputs, pose_of, sigma_at, sum_up, worn_depth
+from plow_twin.solve.rest import write_rest
 from plow_twin.solve.series import one_by_one
 from plow_twin.solve.step import begin, finish
 
@@ -41,7 +45,13 @@ _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
 @kernel(inline=True)
 def _lay_out(p, parts, state, w, hard_time) -> bool:
     terms = one_by_one(parts.terms)
-    return begin(p, parts, state, w, hard_time, *terms, parts.implicit)
+    return begin(p, parts, state, w, hard_time, *terms, parts.implicit, parts.terms.flight, parts.terms.rest)
+
+
+@kernel(inline=True)
+def _end(p, parts, state, w, totals, log) -> None:
+    terms = parts.terms
+    finish(p, parts, state, w, totals, log, terms.wear, terms.fraction)
 
 
 @kernel(inline=True)
@@ -57,10 +67,10 @@ def _next(p, parts, state, w, hard_time, budget) -> int:
 
 
 @kernel()
-def _present(state, w, y) -> None:
+def _present(p, parts, state, w, y) -> None:
     """Write the body coordinates at the present time to y, also within a step."""
     if state.clock[LENGTH] >= 0.0:
-        evaluate(state, w, sigma_at(state, state.clock[USED]), y)
+        evaluate(p, parts, state, w, sigma_at(state, state.clock[USED]), y)
     else:
         set_row(y, 0, row(state.y, 0))
 
@@ -79,10 +89,10 @@ def _proceed(p, parts, state, w, totals, target, hard_time, budget) -> int:
         if target < t0 + state.clock[LENGTH]:
             account(state, w, low, sigma_at(state, target - t0), totals)
             state.clock[USED], state.clock[NOW] = target - t0, target
-            _present(state, w, w.moved)
+            _present(p, parts, state, w, w.moved)
             return _OK if within_range(p, state, w.moved) else _RANGE
         account(state, w, low, sigma_at(state, state.clock[LENGTH]), totals)
-        finish(p, state, w, totals, None, parts.terms.wear, parts.terms.fraction)
+        _end(p, parts, state, w, totals, None)
 
 
 @kernel()
@@ -119,7 +129,7 @@ def _advance(p, parts, state, w, totals, target, hard_time, budget, bound) -> in
     With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
     """
     saved = w.saved
-    _present(state, w, saved[0])
+    _present(p, parts, state, w, saved[0])
     set_row(saved, 1, row(state.factor, 0))
     set_row(saved, 2, row(state.depth, 0))
     for pair in range(8):
@@ -145,7 +155,7 @@ def _advance(p, parts, state, w, totals, target, hard_time, budget, bound) -> in
 def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth) -> None:
     """Write row i: the state at the present time and the totals, which are cleared."""
     y = w.moved
-    _present(state, w, y)
+    _present(p, parts, state, w, y)
     pose_of(p, y, parts.terms.offset, q[i], v[i])
     _worn_now(state, w, parts.terms.wear, depth[i])
     pair_outputs(p, state, depth[i], y, penetration[i], rate[i], force[i])
@@ -240,7 +250,7 @@ def end_step(p, parts, state, w, totals) -> None:
     state.step[EVENT_PAIR] = -1
     state.step[AT_HARD_END] = 0
     now = clock[NOW]
-    finish(p, state, w, totals, None, parts.terms.wear, parts.terms.fraction)
+    _end(p, parts, state, w, totals, None)
     clock[T0] = clock[NOW] = now
 
 
@@ -250,6 +260,9 @@ def lay_out_again(p, parts, state, w) -> None:
 
     Only the scene's own loads leave a step under way, and there it has no hard end.
     """
+    if state.step[RESTING] == 1:
+        write_rest(p, state, w)
+        return
     used, implicit = state.clock[USED], parts.implicit
     if implicit is not None:
         # what laying it out has changed
@@ -264,6 +277,20 @@ def lay_out_again(p, parts, state, w) -> None:
     for i in range(state.count.size):
         state.count[i] = w.counted[i]
     state.clock[USED] = used
+
+
+@kernel()
+def _rows_in_flight(p, parts, flight, state, w, t, i, q, v, penetration, force):
+    """Fill the rows within a step of free flight from row i on; return the first row after it."""
+    if flight is not None:
+        t0, y, rate = state.clock[T0], np.empty(8), np.empty(8)
+        while i < t.size and t[i] < t0 + state.clock[LENGTH]:
+            fly(p, parts.harmonics, flight, state, w, max(t[i] - t0, 0.0), y)
+            pose_of(p, y, None, q[i], v[i])
+            if force is not None:
+                pair_outputs(p, state, state.depth, y, penetration[i], rate, force[i])
+            i += 1
+    return i
 
 
 @kernel()
@@ -286,19 +313,21 @@ def record(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penet
             return code
         t0, length = state.clock[T0], state.clock[LENGTH]
         end = t0 + length
+        if state.step[FLYING] == 1:
+            i = _rows_in_flight(p, parts, parts.terms.flight, state, w, t, i, q, v, penetration, force)
         while i < t.size and t[i] < end:
             sigma = sigma_at(state, max(t[i] - t0, 0.0))
-            evaluate(state, w, sigma, y)
+            sum_up(state, w, sigma, y)
             pose_of(p, y, parts.terms.offset, q[i], v[i])
             if force is not None:
                 _worn_at(state, w, wear, sigma, depth)
                 pair_outputs(p, state, depth, y, penetration[i], rate, force[i])
             i += 1
-            first[0] = i
+        first[0] = i
         account(state, w, 0.0, sigma_at(state, length), totals)
         if audit is not None:
-            audit_step(p, parts, wear, state, w, audit)
-        finish(p, state, w, totals, log, parts.terms.wear, parts.terms.fraction)
+            audit_step(p, parts, wear, parts.terms.flight, state, w, audit)
+        _end(p, parts, state, w, totals, log)
     if not within_range(p, state, state.y):
         return _RANGE
     while i < t.size:

@@ -44,7 +44,9 @@ X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
 T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW = range(10)
 IMPLICIT_LENGTH, EXPLICIT_LENGTH, WAS_IMPLICIT, WAS_EXPLICIT = range(10, 14)
 # indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
-ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END, OVERDAMPED, WAS_OVERDAMPED = range(9)
+ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END, OVERDAMPED, WAS_OVERDAMPED, FLYING, RESTING = range(
+    11
+)
 # indices into State.count
 STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES, BOUNDED, IMPLICIT = range(7)
 
@@ -114,6 +116,7 @@ PARAMS: Final = np.dtype(
         ("weight", "f8"),  # turns cos and sin into velocities
         ("radius", "f8"),  # turns angles into lengths
         ("release", "f8"),  # penetration below which the force is negligible
+        ("leverage", "f8"),  # distance of a corner of the frame from its centre
         ("half_cavity", "f8"),  # penetration that ends the model's range
         ("max_events", "i8"),  # events at one instant before recovery
     ]
@@ -128,7 +131,7 @@ STATE: Final = np.dtype(
         ("mode", "i8", (PAIR_COUNT,)),
         ("beyond", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
         ("clock", "f8", (14,)),
-        ("step", "i8", (9,)),
+        ("step", "i8", (11,)),
         ("count", "i8", (7,)),
     ]
 )
@@ -159,6 +162,9 @@ WORK: Final = np.dtype(
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
         ("lanes", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
+        ("flight", "f8", (6, 6)),  # start of a flight, what bounds it, scratch (`solve.flight`)
+        ("rest", "f8", (4, 6)),  # place, rates and load at rest (`solve.rest`)
+        ("hessian", "f8", (3, 3)),
         ("size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
         ("saved", "f8", (3, PAIR_COUNT)),  # y, factor and depth before an advance
@@ -215,6 +221,8 @@ class Terms(NamedTuple):
     offset: int | None  #: the centre of mass is not the cavity's
     free: int | None  #: some degree of freedom is locked
     slip: int | None  #: friction
+    flight: int | None  #: free flight in closed form (`solve.flight`)
+    rest: int | None  #: rest can be recognised (`solve.rest`)
 
 
 class Implicit(NamedTuple):

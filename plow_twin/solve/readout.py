@@ -8,10 +8,12 @@ from plow_twin.model.contact import normal_force
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row
 from plow_twin.solve.contacts import any_penetrates
+from plow_twin.solve.flight import fly
 from plow_twin.solve.layout import (
     ALPHA,
     BETA,
     COS,
+    FLYING,
     LENGTH,
     OMEGA,
     ON,
@@ -40,13 +42,22 @@ def sigma_at(state, used):
 
 
 @kernel(fast=True)
-def evaluate(state, w, sigma, out) -> None:
-    """Write the body-coordinate state at sigma to `out`, shape (8,)."""
+def sum_up(state, w, sigma, out) -> None:
+    """Write the sum of the state's series at sigma to `out`, shape (8,)."""
     order, series = state.step[ORDER], w.series
     value = row(series, order)
     for k in range(order - 1, -1, -1):
         value = value * sigma + row(series, k)
     set_row(out, 0, value)
+
+
+@kernel(inline=True)
+def evaluate(p, parts, state, w, sigma, out) -> None:
+    """Write the body-coordinate state at sigma to `out`, shape (8,)."""
+    if state.step[FLYING] == 1:
+        fly(p, parts.harmonics, parts.terms.flight, state, w, sigma, out)
+    else:
+        sum_up(state, w, sigma, out)
 
 
 @kernel(fast=True)

@@ -13,6 +13,7 @@ import numpy as np
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.contacts import gap_and_rate, slow_touch, touch, weigh_pairs
 from plow_twin.solve.events import first_event
+from plow_twin.solve.flight import take_off
 from plow_twin.solve.layout import (
     ALPHA,
     AT_HARD_END,
@@ -24,6 +25,7 @@ from plow_twin.solve.layout import (
     EVENT_TO,
     EVENTS,
     EXPLICIT_LENGTH,
+    FLYING,
     HARD_END,
     IMPLICIT_LENGTH,
     LAST_LENGTH,
@@ -36,6 +38,7 @@ from plow_twin.solve.layout import (
     PIECE,
     RECOVERIES,
     RELEASED,
+    RESTING,
     SIGMA,
     SIN,
     STALL,
@@ -51,6 +54,7 @@ from plow_twin.solve.layout import (
 )
 from plow_twin.solve.length import accurate_length, before_sticking, time_to_part
 from plow_twin.solve.readout import evaluate, worn_depth
+from plow_twin.solve.rest import settle
 from plow_twin.solve.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.stiff import PATIENCE, STAGES, collocate, note_explicit
 
@@ -79,6 +83,15 @@ def _linear_load(segments, step, t0, w):
     return segments[piece + 1].knot if piece + 1 < segments.size else np.inf
 
 
+@kernel(inline=True)
+def _note(state, sigma, length, order, pair, target, at_hard_end) -> None:
+    """Note the step that has been laid out."""
+    clock, step = state.clock, state.step
+    clock[SIGMA], clock[LENGTH], clock[USED] = sigma, length, 0.0
+    step[ORDER], step[EVENT_PAIR], step[EVENT_TO] = order, pair, target
+    step[AT_HARD_END] = 1 if at_hard_end else 0
+
+
 @kernel()
 def begin(
     p,
@@ -99,6 +112,8 @@ def begin(
     free,
     slip,
     implicit,
+    flight,
+    rest,
 ) -> bool:
     """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
     clock, step = state.clock, state.step
@@ -113,6 +128,17 @@ def begin(
     limited = span < LONGEST_STEP
     clock[ALPHA], clock[BETA] = 1.0, 0.0
     hard, length = span, 0.0
+    state.count[STEPS] += 1
+    if flight is not None:
+        length = 0.0 if penetrating else take_off(p, parts.harmonics, state, w, span)
+        step[FLYING] = 1 if length > 0.0 else 0
+    if rest is not None:
+        steady = penetrating and w.wrench[1, 0] == 0.0 and w.wrench[1, 1] == 0.0 and w.wrench[1, 2] == 0.0
+        step[RESTING] = 1 if steady and settle(p, parts, state, w) else 0
+        length = span if step[RESTING] == 1 else 0.0
+    if (flight is not None or rest is not None) and length > 0.0:
+        _note(state, length, length, 1, -1, 0, limited and length == span)
+        return True
     if implicit is not None:
         clock[WAS_IMPLICIT], clock[WAS_EXPLICIT] = clock[IMPLICIT_LENGTH], clock[EXPLICIT_LENGTH]
         step[WAS_OVERDAMPED] = step[OVERDAMPED]
@@ -120,7 +146,6 @@ def begin(
         length = collocate(p, parts, state, w, span, implicit)
     if length > 0.0:
         order, sigma = STAGES, length
-        state.count[STEPS] += 1
     else:
         if step[TOUCHING] != 0:
             # a force that starts like d^1.5 is analytic in the square root of time
@@ -143,7 +168,6 @@ def begin(
             expand_harmonics(parts.harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
         terms = one_by_one(parts.terms)
         order = expand(p, state, w, p.order, penetrating, hard, *terms)
-        state.count[STEPS] += 1
         state.count[COEFFICIENTS] += order
         sigma = hard if order < p.order else accurate_length(p, w, order, hard)
         if not math.isfinite(sigma):
@@ -159,24 +183,20 @@ def begin(
         state.count[RECOVERIES] += 1
         end, pair = max(end, min(sigma, 1e-9)), -1
         limited = limited and end == sigma
-    clock[SIGMA] = end
-    clock[LENGTH] = clock[ALPHA] * end + 0.5 * clock[BETA] * end * end
-    if limited and pair < 0:
-        clock[LENGTH] = span
-    clock[USED] = 0.0
-    step[ORDER], step[EVENT_PAIR], step[EVENT_TO] = order, pair, target
-    step[AT_HARD_END] = 1 if limited and pair < 0 else 0
+    limited = limited and pair < 0
+    length = span if limited else clock[ALPHA] * end + 0.5 * clock[BETA] * end * end
+    _note(state, end, length, order, pair, target, limited)
     return True
 
 
 @kernel()
-def finish(p, state, w, totals, log, wear, fraction) -> None:
+def finish(p, parts, state, w, totals, log, wear, fraction) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
     clock, step, y = state.clock, state.step, state.y
     sigma = clock[SIGMA]
     if wear is not None:
         worn_depth(state, w, sigma, state.depth)
-    evaluate(state, w, sigma, y)
+    evaluate(p, parts, state, w, sigma, y)
     y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
     before = clock[T0]
     clock[T0] = before + clock[LENGTH]
