@@ -1,5 +1,8 @@
 """Digital twin of a mechanism with clearance: the coal plough's head in its guide."""
 
+from plow_twin.advance import Advance as Advance
+from plow_twin.advance import AdvanceSeries as AdvanceSeries
+from plow_twin.advance import AdvanceTogether as AdvanceTogether
 from plow_twin.ensemble import Ensemble as Ensemble
 from plow_twin.ensemble import simulate_many as simulate_many
 from plow_twin.errors import PlowTwinError as PlowTwinError
@@ -26,7 +29,6 @@ from plow_twin.model.scene import Table as Table
 from plow_twin.model.scene import Wear as Wear
 from plow_twin.simulate import Result as Result
 from plow_twin.simulate import simulate as simulate
-from plow_twin.twin import Advance as Advance
-from plow_twin.twin import AdvanceSeries as AdvanceSeries
 from plow_twin.twin import Status as Status
 from plow_twin.twin import Twin as Twin
+from plow_twin.twins import Twins as Twins

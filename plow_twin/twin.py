@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import time as _time
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from plow_twin.advance import Advance, AdvanceSeries, check_times, columns, empty_series
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive
@@ -19,12 +20,16 @@ from plow_twin.solve.layout import (
     COEFFICIENTS,
     LENGTH,
     NOW,
+    PARAMS,
     STATE,
     STEPS,
     TOTALS,
+    WORK,
     Bound,
+    State,
     Status,
-    new_record,
+    first_of,
+    new_records,
     new_work,
 )
 from plow_twin.solve.length import PARTING_ORDER
@@ -35,82 +40,6 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 DEFAULT_BUDGET = 50_000_000
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
-
-
-@dataclass(frozen=True)
-class Advance:
-    """What the head does at a time, and what happened since the advance before.
-
-    Attributes
-    ----------
-    t : float
-        Model time in s.
-    q, v : ndarray, shape (3,)
-        Pose x, y [m], theta [rad] of the cavity's centre, and its rate.
-    penetration, rate, force : ndarray, shape (8,)
-        Signed penetration [m], its rate [m/s] and normal force [N] of each pair at `t`.
-    peak, impulse : ndarray, shape (8,)
-        Largest force [N] and impulse [N s] since the advance before.
-    makes : ndarray of int64, shape (8,)
-        Touches since the advance before.
-    wear_depth : ndarray, shape (8,)
-        Wear depth of each pad in m, in total.
-    steps : int
-        Steps the solver took.
-    status : Status
-        Anything but `OK` means that the state is the last good one.
-    error_estimate_m : float
-        Estimated error of the pose in m where `max_evaluations` did not suffice for the tolerance, else 0.
-    """
-
-    t: float
-    q: NDArray[np.float64]
-    v: NDArray[np.float64]
-    penetration: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    force: NDArray[np.float64]
-    peak: NDArray[np.float64]
-    impulse: NDArray[np.float64]
-    makes: NDArray[np.int64]
-    wear_depth: NDArray[np.float64]
-    steps: int
-    status: Status
-    error_estimate_m: float
-
-
-@dataclass(frozen=True)
-class AdvanceSeries:
-    """Many advances at once: the fields of `Advance`, each with a leading axis of length n."""
-
-    t: NDArray[np.float64]
-    q: NDArray[np.float64]
-    v: NDArray[np.float64]
-    penetration: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    force: NDArray[np.float64]
-    peak: NDArray[np.float64]
-    impulse: NDArray[np.float64]
-    makes: NDArray[np.int64]
-    wear_depth: NDArray[np.float64]
-    steps: NDArray[np.int64]
-    status: NDArray[np.int64]
-    error_estimate_m: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def __getitem__(self, index: int) -> Advance:
-        fields = {name: getattr(self, name)[index] for name in _ROW_FIELDS}
-        return Advance(
-            t=float(self.t[index]),
-            steps=int(self.steps[index]),
-            status=Status(int(self.status[index])),
-            error_estimate_m=float(self.error_estimate_m[index]),
-            **fields,
-        )
-
-
-_ROW_FIELDS = ("q", "v", "penetration", "rate", "force", "peak", "impulse", "makes", "wear_depth")
 
 
 class Twin:
@@ -151,12 +80,17 @@ class Twin:
         self.scene = scene
         self.tol = tol
         self.excitation = excitation
-        self._compiled: Compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
+        compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
+        self._params, self._states = new_records(PARAMS, 1), new_records(STATE, 1)
+        self._params[0] = compiled.params
+        self._state: State = first_of(self._states)
+        self._compiled: Compiled = replace(compiled, params=first_of(self._params))
         self._parts = self._compiled.parts
         self._budget, self._bound = _bounded(max_evaluations, int(self._compiled.params.order))
-        self._work = new_work()
-        self._totals = new_record(TOTALS)
-        self._state = self._compiled.initial_state(start)
+        self._works, self._all_totals = new_records(WORK, 1), new_records(TOTALS, 1)
+        self._works[0] = new_work()
+        self._work, self._totals = first_of(self._works), first_of(self._all_totals)
+        self._states[0] = compiled.initial_state(start)
         self._wrench = np.zeros(3)
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
@@ -216,14 +150,14 @@ class Twin:
         if self.excitation != "sampled":
             raise ValueError("advance_samples: got excitation='scene', expected excitation='sampled'")
         times, samples = np.asarray(t, dtype=np.float64), np.ascontiguousarray(wrench, dtype=np.float64)
-        self._check_times(times)
+        check_times(self.time, times)
         if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
             raise ValueError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
-        out = _empty_series(times)
+        out = empty_series(times)
         ends = np.concatenate([self._wrench[None], samples])
-        drive.advance_samples(
-            self._compiled.params, self._parts, self._state, self._work, self._totals, times,
-            per_mass(self.scene, ends), self._budget, *_columns(out), self._bound,
+        drive.advance_together(
+            self._params, self._parts, self._states, self._works, self._all_totals, 0, 1, times,
+            per_mass(self.scene, ends)[None], self._budget, *(rows[None] for rows in columns(out)), self._bound,
         )  # fmt: skip
         self._wrench = samples[-1].copy() if len(samples) else self._wrench
         return out
@@ -232,7 +166,7 @@ class Twin:
         """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
         if not np.isfinite(t):
             raise ValueError(f"t: got {t!r}, expected a finite time in s")
-        self._state = self._compiled.initial_state(t)
+        self._states[0] = self._compiled.initial_state(t)
         self._wrench = np.zeros(3)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
@@ -286,8 +220,8 @@ class Twin:
         return int(self._state.count[BOUNDED])
 
     def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
-        self._check_times(times)
-        out = _empty_series(times)
+        check_times(self.time, times)
+        out = empty_series(times)
         drive.advance_times(
             self._compiled.params,
             self._parts,
@@ -296,19 +230,10 @@ class Twin:
             self._totals,
             times,
             self._budget,
-            *_columns(out),
+            *columns(out),
             self._bound,
         )
         return out
-
-    def _check_times(self, times: NDArray[np.float64]) -> None:
-        if times.ndim != 1 or not np.isfinite(times).all():
-            raise ValueError(f"t: got {times!r}, expected finite times in s, shape (n,)")
-        before = np.concatenate([[self.time], times[:-1]]) if len(times) else times
-        late = np.flatnonzero(times < before)
-        if late.size:
-            index = int(late[0])
-            raise ValueError(f"t: got {times[index]!r} s, expected a time not before {before[index]!r} s")
 
     def _end_step(self) -> None:
         drive.end_step(self._compiled.params, self._parts, self._state, self._work, self._totals)
@@ -329,30 +254,3 @@ def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None
     coarse = max(LEAST_EVALUATIONS // 4, max_evaluations // 16)
     budget = (int(max_evaluations) - 4 * coarse) // (order + PARTING_ORDER)
     return budget, Bound(coarse, np.zeros(1), np.zeros((6, 6)), np.zeros(3), np.zeros((4, PAIR_COUNT)))
-
-
-def _empty_series(times: NDArray[np.float64]) -> AdvanceSeries:
-    n = len(times)
-
-    def rows(width: int) -> NDArray[np.float64]:
-        return np.zeros((n, width))
-
-    return AdvanceSeries(
-        t=times,
-        q=rows(3),
-        v=rows(3),
-        penetration=rows(8),
-        rate=rows(8),
-        force=rows(8),
-        peak=rows(8),
-        impulse=rows(8),
-        makes=np.zeros((n, 8), np.int64),
-        wear_depth=rows(8),
-        steps=np.zeros(n, np.int64),
-        status=np.zeros(n, np.int64),
-        error_estimate_m=np.zeros(n),
-    )
-
-
-def _columns(out: AdvanceSeries) -> tuple[NDArray[np.float64] | NDArray[np.int64], ...]:
-    return tuple(getattr(out, name) for name in (*_ROW_FIELDS, "steps", "status", "error_estimate_m"))

@@ -12,14 +12,16 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
-CORE = {"errors", "model", "solve", "twin", "books", "simulate", "ensemble"}
+CORE = {"errors", "model", "solve", "advance", "twin", "twins", "books", "simulate", "ensemble"}
 #: For each room of the package, the rooms it may import.
 ROOMS = {
     "errors": set(),
     "presets": set(),
     "model": {"errors"},
     "solve": {"errors", "model"},
-    "twin": {"errors", "model", "solve"},
+    "advance": {"model", "solve"},
+    "twin": {"errors", "model", "solve", "advance"},
+    "twins": {"errors", "model", "solve", "advance", "twin"},
     "books": {"errors", "model", "solve"},
     "simulate": {"errors", "model", "solve", "books"},
     "ensemble": {"errors", "model", "solve", "simulate"},

@@ -143,8 +143,8 @@ def test_a_scene_compiles_only_what_it_needs() -> None:
     twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
     twin.advance(0.01)
     compiled = [str(signature[1]) for signature in drive.advance_times.signatures]  # type: ignore[attr-defined]
-    # harmonics, second, segments, viscous, factor, integer, fraction, ramp, wear, offset, free, slip
-    terms = "Terms(none, none, none, int64, none, none, none, none, none, none, int64, none)"
+    # harmonics, second, segments, viscous, factor, integer, fraction, ramp, wear, offset, free, slip, flight, rest
+    terms = "Terms(none, none, none, int64, none, none, none, none, none, none, int64, none, none, int64)"
     bare = f"Parts({terms}, none, none, none)"
     assert bare in compiled, compiled
 
@@ -183,7 +183,8 @@ def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:
         assert most <= bound
         series = Twin(scene, excitation="sampled", max_evaluations=bound).advance_samples(t, wrench)
         error, estimate = np.abs(series.q - exact.q).max(), series.error_estimate_m.sum()
-        assert (twin.bounded == 0) == (estimate == 0.0) == (error == 0.0)
+        # without the bound's code another kernel runs: the same up to rounding
+        assert (twin.bounded == 0) == (estimate == 0.0) == (error < 1e-14)
         assert error <= 10.0 * estimate and error < 1e-4
     assert twin.bounded == 0
     with pytest.raises(ValueError, match="max_evaluations: got 15, expected an integer >= 16"):

@@ -30,9 +30,9 @@ from plow_twin.stream.session import Session
 from plow_twin.twin import Twin
 
 if TYPE_CHECKING:
+    from plow_twin.advance import Advance
     from plow_twin.ros.diagnostics import Part
     from plow_twin.ros.recording import Recording
-    from plow_twin.twin import Advance
 
 _CATCH_UP_S: Final = 0.002
 

@@ -199,7 +199,7 @@ def advance_times(
 
 
 @kernel()
-def advance_samples(
+def _advance_samples(
     p,
     parts,
     state,
@@ -237,6 +237,43 @@ def advance_samples(
             error_estimate[i] = bound.error[0]
         steps[i] = state.count[STEPS] - before
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
+
+
+@kernel()
+def advance_together(
+    params,
+    parts,
+    states,
+    work,
+    totals,
+    first,
+    last,
+    times,
+    wrench,
+    budget,
+    q,
+    v,
+    penetration,
+    rate,
+    force,
+    peak,
+    impulse,
+    makes,
+    depth,
+    steps,
+    status,
+    error_estimate,
+    bound,
+) -> None:
+    """Advance members `first` to `last` - 1 under sampled loads: arrays but times have an axis of members in front.
+
+    One twin is a member too: it has the same bits alone. `work` and `totals` are arrays of one.
+    """
+    for m in range(first, last):
+        _advance_samples(
+            params[m], parts, states[m], work[0], totals[0], times, wrench[m], budget, q[m], v[m], penetration[m],
+            rate[m], force[m], peak[m], impulse[m], makes[m], depth[m], steps[m], status[m], error_estimate[m], bound,
+        )  # fmt: skip
 
 
 @kernel()

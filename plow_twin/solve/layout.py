@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,11 +84,30 @@ _WIDE: Final = (_ROWS, PAIR_COUNT)
 #: Size of a cache line in bytes.
 _LINE: Final = 64
 
+
+def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
+    """Return a record type that fills whole cache lines, so that each of many begins at one."""
+    packed = np.dtype(fields)
+    names = packed.names or ()
+    parts: Any = packed.fields
+    return np.dtype(
+        {
+            "names": names,
+            "formats": [parts[name][0] for name in names],
+            "offsets": [parts[name][1] for name in names],
+            "itemsize": -(-packed.itemsize // _LINE) * _LINE,
+        }
+    )
+
+
 #: Constants of one scene and one tolerance, per mass and inertia where that saves work.
-PARAMS: Final = np.dtype(
+PARAMS: Final = _in_lines(
     [
         ("gap", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
         ("arm", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
+        ("slip", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
+        ("slip_arm", "f8", (4, PAIR_COUNT)),  # its arm about G
+        ("wear", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
         ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
         ("inverse_mass", "f8"),
         ("inverse_inertia", "f8"),
@@ -101,11 +120,8 @@ PARAMS: Final = np.dtype(
         ("gravity", "f8"),
         ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
         ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
-        ("wear", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
         ("offset", "f8", (2,)),  # centre of mass from the cavity's centre
         ("free", "f8", (3,)),  # 1 free, 0 locked
-        ("slip", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
-        ("slip_arm", "f8", (4, PAIR_COUNT)),  # its arm about G
         ("friction", "f8"),  # mu
         ("slip_speed", "f8"),  # regularisation speed in m/s
         ("order", "i8"),
@@ -123,7 +139,7 @@ PARAMS: Final = np.dtype(
 )
 
 #: Everything that the future depends on, and the step under way.
-STATE: Final = np.dtype(
+STATE: Final = _in_lines(
     [
         ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
         ("factor", "f8", (PAIR_COUNT,)),  # lambda of each pair
@@ -274,11 +290,22 @@ class Log(NamedTuple):
 
 
 def new_record(dtype: np.dtype[np.void]) -> np.record:
-    """Return a record of zeros that starts at a cache line: rows of eight numbers then lie in one line each."""
-    memory = np.zeros(dtype.itemsize + _LINE, np.uint8)
-    start = -memory.ctypes.data % _LINE
-    record: np.record = memory[start : start + dtype.itemsize].view(dtype).view(np.recarray)[0]
+    """Return a record of zeros."""
+    return first_of(new_records(dtype, 1))
+
+
+def first_of(records: NDArray[np.void]) -> np.record:
+    """Return the first of some records, in place."""
+    record: np.record = records.view(np.recarray)[0]
     return record
+
+
+def new_records(dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
+    """Return records of zeros that start at a cache line: rows of eight numbers then lie in one line each."""
+    memory = np.zeros(count * dtype.itemsize + _LINE, np.uint8)
+    start = -memory.ctypes.data % _LINE
+    records: NDArray[np.void] = memory[start : start + count * dtype.itemsize].view(dtype)
+    return records
 
 
 def new_work() -> Work:

@@ -12,7 +12,7 @@ from plow_twin.stream.journal import Entry, Hold, Parameter, ParameterValue, Res
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
-    from plow_twin.twin import Advance
+    from plow_twin.advance import Advance
 
 #: Most model time that one call may catch up when the excitation is silent [ns]: the work of a call stays bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S

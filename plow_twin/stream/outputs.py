@@ -16,7 +16,7 @@ from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 
 if TYPE_CHECKING:
-    from plow_twin.twin import Advance
+    from plow_twin.advance import Advance
 
 Array = NDArray[np.float64]
 

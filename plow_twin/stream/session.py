@@ -10,7 +10,8 @@ from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset
 from plow_twin.stream.outputs import Outputs
 
 if TYPE_CHECKING:
-    from plow_twin.twin import Advance, Twin
+    from plow_twin.advance import Advance
+    from plow_twin.twin import Twin
 
 #: A digest follows each so many advances.
 DIGEST_INTERVAL: Final = 100

@@ -1,0 +1,97 @@
+"""Free flight in closed form: against the formula, against the series, and not a wall passed."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scenes import preset
+
+from plow_twin import Gravity, Harmonic, Initial, Scene, Table, Twin, simulate
+from plow_twin.simulate import Motion, output_times, run_events
+from plow_twin.solve.compiled import Compiled, compile_scene
+from plow_twin.solve.layout import FLYING, STEPS, new_work
+
+
+def swaying(drift: tuple[float, float, float] = (0.0, 0.0, 0.0), amplitude: float = 1e-3, omega: float = 20.0) -> Scene:
+    """A weightless head that a load swings by `amplitude` metres, and that drifts."""
+    scene = preset("bench_kv")
+    m, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
+    force, moment = np.array([m, 0.5 * m]) * amplitude * omega**2, inertia * amplitude * omega**2
+    load = Harmonic("swing", tuple(force), omega, 0.0, moment)
+    v = np.array(drift) - np.array([*force / m, moment / inertia]) / omega
+    return dataclasses.replace(scene, gravity=Gravity(0.0), loads=(load,), initial=Initial(v=tuple(v)))
+
+
+def without_flight(scene: Scene, tol: float) -> Compiled:
+    compiled = compile_scene(scene, tol)
+    return dataclasses.replace(
+        compiled, parts=compiled.parts._replace(terms=compiled.parts.terms._replace(flight=None))
+    )
+
+
+def run(compiled: Compiled, t_end: float, output_dt: float) -> Motion:
+    times = output_times(t_end, output_dt)
+    motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)), outputs=True)
+    assert run_events(compiled, motion, times, t_end, new_work(), 10**7) == (0, len(times))
+    return motion
+
+
+def test_an_hour_of_swinging_costs_36_steps_and_is_exact() -> None:
+    scene, amplitude, omega = swaying(), 1e-3, 20.0
+    result = simulate(scene, 3600.0, 3.7, audit=True)
+    assert result.solver["steps"] == 36 and len(result.events) == 0
+    # phases of 72,000 rad are rounded to 1e-11
+    shape = np.array([1.0, 0.5, 1.0]) * amplitude
+    assert np.abs(result.q + shape * np.sin(omega * result.t)[:, None]).max() < 1e-13
+    assert np.abs(result.v + shape * omega * np.cos(omega * result.t)[:, None]).max() < 2e-12
+    assert result.audit is not None and result.audit.imbalance_j < 1e-12 * result.audit.turnover_j
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_drifting_head_meets_the_same_walls_as_the_series_find(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drift = rng.uniform(-3e-3, 3e-3, 3)
+    scene = swaying(tuple(drift), 10.0 ** rng.uniform(-5, -3), 10.0 ** rng.uniform(1.0, 2.5))
+    flown, expanded = run(compile_scene(scene, 1e-10), 20.0, 0.01), run(without_flight(scene, 1e-10), 20.0, 0.01)
+    assert flown.state.count[STEPS] < expanded.state.count[STEPS]
+    first = np.flatnonzero(expanded.force.any(axis=1))
+    until = int(first[0]) + 1 if len(first) else len(flown.q)
+    assert until < len(flown.q), "the head should meet a wall"
+    assert np.abs(flown.q - expanded.q)[:until].max() < 1e-11
+    assert flown.log.pair[0] == expanded.log.pair[0]
+    assert flown.log.time[0] == pytest.approx(expanded.log.time[0], rel=1e-9)
+    assert flown.log.rate[0] == pytest.approx(expanded.log.rate[0], rel=1e-6)
+
+
+def test_long_linear_pieces_and_harmonics_are_flown_together() -> None:
+    scene = swaying()
+    knots = np.array([0.0, 7.0, 31.0, 40.0])
+    force = np.array([[0.0, 0.0, 0.0], [0.02, -0.01, 0.0], [-0.02, 0.01, 0.005], [0.0, 0.0, 0.0]])
+    scene = dataclasses.replace(scene, loads=(*scene.loads, Table("drift", knots, force)))
+    flown, expanded = run(compile_scene(scene, 1e-11), 40.0, 0.1), run(without_flight(scene, 1e-11), 40.0, 0.1)
+    assert flown.state.count[STEPS] < 0.1 * expanded.state.count[STEPS]
+    assert np.abs(flown.q - expanded.q).max() < 1e-11 and np.abs(flown.v - expanded.v).max() < 1e-10
+
+
+def test_a_twin_in_flight_is_asked_saved_and_restored_without_a_trace() -> None:
+    scene = swaying((2e-4, 0.0, 0.0))
+    twin, other = Twin(scene), Twin(scene)
+    asked = [twin.advance(t) for t in np.linspace(0.1, 40.0, 700)]
+    assert twin._state.step[FLYING] == 1
+    assert other.advance(40.0).q.tolist() == asked[-1].q.tolist()
+    restored = Twin(scene)
+    restored.restore(twin.snapshot())
+    for t in (41.0, 130.0):
+        assert restored.advance(t).q.tolist() == twin.advance(t).q.tolist()
+    assert restored.digest() == twin.digest()
+
+
+def test_without_harmonics_or_with_an_offset_mass_flight_is_not_compiled() -> None:
+    scene = swaying()
+    still = dataclasses.replace(scene, loads=())
+    offset = dataclasses.replace(
+        scene, head=dataclasses.replace(scene.head, rotation="consistent", com_offset_m=(0.01, 0.0))
+    )
+    assert [compile_scene(one, 1e-9).parts.terms.flight for one in (scene, still, offset)] == [1, None, None]

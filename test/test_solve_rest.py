@@ -1,0 +1,125 @@
+"""Rest: recognised where the contacts hold the head for good, and nowhere else; a load that changes wakes it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scenes import preset, wall_and_point
+from scipy.optimize import fsolve
+
+from plow_twin import Gravity, Harmonic, Initial, Scene, Twin, Wear, simulate
+from plow_twin.model.geometry import arm_rows, body_state, penetration_rows
+from plow_twin.solve.compiled import compile_scene
+from plow_twin.solve.layout import RESTING
+
+LAWS = ("kelvin_voigt", "exact_restitution")
+
+
+def fallen(law: str = "kelvin_voigt") -> Scene:
+    """The head falls on the frame and comes to rest on three pairs."""
+    scene = dataclasses.replace(preset("bench_kv"), loads=())
+    if law != "kelvin_voigt":
+        contact = dataclasses.replace(preset("bench_hc").contact, law=law, damping=None, restitution=0.2)
+        scene = dataclasses.replace(scene, contact=contact)
+    return scene
+
+
+def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
+    """Solve the balance of weight and springs by another way: scipy, forces in head axes."""
+    mass, g, arm = scene.head.mass_kg, scene.gravity.acceleration_m_s2, scene.gravity.arm_m
+    rows, arms, contact = penetration_rows(scene), arm_rows(scene), scene.contact
+
+    def balance(q: np.ndarray) -> np.ndarray:
+        y = body_state(q, (0.0, 0.0, 0.0), (0.0, 0.0))
+        x, yy, c, s = y[0], y[1], np.cos(q[2]), np.sin(q[2])
+        at = np.array([c, s, x, yy])
+        force = contact.stiffness * np.maximum(at @ rows[:4] + rows[4], 0.0) ** contact.exponent
+        weight = np.array([-mass * g * s, -mass * g * c])
+        return np.array([*(weight - rows[2:4] @ force), (at @ arms * force).sum() - mass * g * arm])
+
+    return np.asarray(fsolve(balance, guess, xtol=1e-14))
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> None:
+    scene = fallen(law)
+    result = simulate(scene, 3600.0, 360.0, audit=True)
+    settled = simulate(scene, 120.0, 1.0)
+    assert result.solver["steps"] < settled.solver["steps"] + 40
+    assert np.array_equal(result.q[1], result.q[-1]) and not result.v[-1].any()
+    assert np.abs(result.q[-1] - static_pose(scene, result.q[-1])).max() < 1e-12
+    weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
+    assert result.audit is not None and result.audit.imbalance_j < 1e-12 * result.audit.turnover_j
+    assert np.abs(result.audit.momentum_imbalance).max() < 1e-12 * weight * 3600.0
+    # the pads carry the weight meanwhile: the totals go on
+    carried = sum(row["impulse"] for row in result.statistics.values())
+    before = sum(row["impulse"] for row in settled.statistics.values())
+    assert carried == pytest.approx(before + result.force[-1].sum() * (3600.0 - 120.0), rel=1e-9)
+
+
+def test_a_load_that_changes_wakes_the_head() -> None:
+    """Under samples: at rest for 50 s, then a push; the same motion as at a tolerance at which rest comes later."""
+    t = np.concatenate([np.arange(1, 51) * 1.0, 50.0 + np.arange(1, 501) * 1e-3])
+    wrench = np.where(t[:, None] > 50.0, [4e4, 1e4, 2e3], [0.0, 0.0, 0.0])
+    twins = [Twin(fallen(), tol=tol, excitation="sampled") for tol in (1e-6, 1e-12)]
+    rows = [twin.advance_samples(t, wrench) for twin in twins]
+    assert rows[0].steps[45:50].max() <= 1
+    assert np.abs(rows[0].q[50:] - rows[1].q[50:]).max() < 1e-8
+    assert np.ptp(rows[0].q[50:], axis=0).max() > 1e-3 and twins[0]._state.step[RESTING] == 0
+
+
+def test_what_slides_is_not_at_rest() -> None:
+    sliding = dataclasses.replace(
+        fallen(), locked=("theta",), gravity=Gravity(9.81), pairs=("top_left_top", "top_right_top"),
+        initial=Initial((0.0, 0.0, 0.0), (1e-9, 0.0, 0.0)),
+    )  # fmt: skip
+    result = simulate(sliding, 300.0, 30.0)
+    assert np.abs(np.diff(result.q[:, 0]) - 3e-8).max() < 1e-15
+
+
+@pytest.mark.parametrize("corners", [("left", "right"), ("left",)])
+def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
+    """On two upper corners the head rests; on one, its weight right below, the least tilt grows."""
+    scene, stable = fallen(), len(corners) == 2
+    sunk = scene.head.mass_kg * 9.81 / len(corners) / scene.contact.stiffness + 0.5 * scene.clearance.vertical_m
+    arm = 0.0 if stable else -0.5 * scene.frame.width_m
+    scene = dataclasses.replace(
+        scene, gravity=Gravity(9.81, arm), pairs=tuple(f"top_{corner}_top" for corner in corners), locked=("x",),
+        initial=Initial((0.0, -sunk, 0.0)),
+    )  # fmt: skip
+    twin = Twin(scene, tol=1e-6)
+    twin.advance(1e-3)
+    assert bool(twin._state.step[RESTING]) == stable
+    nudged = dataclasses.replace(scene, initial=Initial((0.0, -sunk, 1e-9)))
+    theta = np.abs(simulate(nudged, 9.0, 0.01, tol=1e-9).q[:, 2])
+    assert theta.max() < 2e-9 if stable else theta.max() > 1e-3
+
+
+def test_a_twin_at_rest_is_asked_saved_and_restored_without_a_trace() -> None:
+    twin, other = Twin(fallen()), Twin(fallen())
+    rows = [twin.advance(t) for t in np.linspace(0.5, 77.7, 300)]
+    assert twin._state.step[RESTING] == 1 and not rows[-1].v.any()
+    assert other.advance(77.7).q.tolist() == rows[-1].q.tolist()
+    restored = Twin(fallen())
+    restored.restore(twin.snapshot())
+    for t in (78.0, 300.0):
+        a, b = restored.advance(t), twin.advance(t)
+        assert a.q.tolist() == b.q.tolist() and a.impulse.tolist() == b.impulse.tolist()
+    assert restored.digest() == twin.digest()
+
+
+def test_rest_is_compiled_only_where_it_can_be() -> None:
+    scene = fallen()
+    driven = dataclasses.replace(scene, loads=(Harmonic("shake", (1.0, 0.0), 5.0),))
+    worn = dataclasses.replace(scene, wear=Wear(1e-12, 0.015, 2.0))
+    assert [compile_scene(one, 1e-9).parts.terms.rest for one in (scene, driven, worn)] == [1, None, None]
+
+
+def test_a_spring_that_nothing_damps_goes_on_ringing() -> None:
+    contact = dataclasses.replace(preset("bench_kv").contact, law="hertz", damping=None, stiffness=2e5)
+    scene = wall_and_point(contact, speed=0.0, gravity=9.81)
+    result = simulate(scene, 60.0, 0.01, tol=1e-9)
+    late = result.q[result.t > 50.0, 1]
+    assert np.ptp(late) > 1e-3
