@@ -84,7 +84,7 @@ def _raise(base, power, n, inverse, half_root) -> None:  # type: ignore[no-untyp
         power[0, lane] = base[0, lane] ** n
     for k in range(1, base.shape[0]):
         if n == 0.5:
-            set_row(power, k, root_terms(base, power, k) * row(half_root, 0))
+            set_row(power, k, root_terms(row(base, k), power, k) * row(half_root, 0))
         else:
             set_row(power, k, power_terms(base, power, k, n) * row(inverse, 0))
 

@@ -89,12 +89,12 @@ def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, e
 
 
 @kernel(fast=True, inline=True)
-def root_terms(base: NDArray[np.float64], root: NDArray[np.float64], k: int) -> Any:
-    """Return coefficient k >= 1 of the square root of the eight columns of base, times 2 root[0].
+def root_terms(newest: Any, root: NDArray[np.float64], k: int) -> Any:
+    """Return coefficient k >= 1 of the square roots of eight series, times 2 root[0]; `newest` are the series' own.
 
     Recurrence  2 r_0 r_k = b_k - sum_{j=1}^{k-1} r_j r_{k-j},  half of whose terms are equal in pairs.
     """
-    rest, products = row(base, k), splat(0.0)
+    rest, products = newest, splat(0.0)
     half = k // 2
     if k == 2 * half:
         rest = rest - row(root, half) * row(root, half)

@@ -17,7 +17,7 @@ import math
 
 from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.model.kernel import kernel
-from plow_twin.model.lanes import lane, magnitude, pack, permutation, row, set_row, splat, total
+from plow_twin.model.lanes import lane, magnitude, pack, permutation, row, set_row, splat, spread_total, total
 from plow_twin.solve.layout import (
     ACTS,
     ALPHA,
@@ -86,16 +86,25 @@ def _multiply_older(a, b, k):
 
 
 @kernel(fast=True)
+def _join(a, b, k, a_k, b_k):
+    """Return order k of the eight products of the columns of a and b; a_k and b_k are their rows k.
+
+    What has just been written is taken as a value: read back, it would be waited for.
+    """
+    if k == 0:
+        return a_k * b_k
+    return _multiply_older(a, b, k) + (row(a, 0) * b_k + a_k * row(b, 0))
+
+
+@kernel(fast=True)
 def _multiply(a, b, k):
     """Return order k of the eight products of the columns of a and b."""
-    if k == 0:
-        return row(a, 0) * row(b, 0)
-    return _multiply_older(a, b, k) + (row(a, 0) * row(b, k) + row(a, k) * row(b, 0))
+    return _join(a, b, k, row(a, k), row(b, k))
 
 
 @kernel(fast=True, inline=True)
-def _raise(w, k, touching, exponent) -> None:
-    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`.
+def _raise(w, k, depth, touching, exponent):
+    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`, and return it.
 
     Row BASE of `w.lanes` is 1 / d, for the exponent 1.5 half its root; it is zero for the other pairs.
     """
@@ -104,31 +113,37 @@ def _raise(w, k, touching, exponent) -> None:
         if k == 0:
             for pair in range(8):
                 w.power[1, 0, pair] = math.sqrt(w.gap[0, pair]) if w.lanes[BASE, pair] != 0.0 else 0.0
+            root = row(w.power[1], 0)
         else:
-            set_row(w.power[1], k, root_terms(w.gap, w.power[1], k) * row(w.lanes, BASE))
-        set_row(w.power[0], k, _multiply(w.gap, w.power[1], k))
+            root = root_terms(depth, w.power[1], k) * row(w.lanes, BASE)
+            set_row(w.power[1], k, root)
+        power = _join(w.gap, w.power[1], k, depth, root)
     elif k == 0:
         for pair in range(8):
             w.power[0, 0, pair] = w.gap[0, pair] ** exponent if w.lanes[BASE, pair] != 0.0 else 0.0
+        power = row(w.power[0], 0)
     else:
-        set_row(w.power[0], k, power_terms(w.gap, w.power[0], k, exponent) * row(w.lanes, BASE))
+        power = power_terms(w.gap, w.power[0], k, exponent) * row(w.lanes, BASE)
+    set_row(w.power[0], k, power)
     if touching != 0:
         for pair in range(8):
             if touching >> pair & 1:
                 w.power[0, k, pair] = power_term(w.gap, w.power[0], pair, k, exponent, 2)
+        power = row(w.power[0], k)
+    return power
 
 
 @kernel(fast=True, inline=True)
-def _damp(p, elastic, w, k, viscous, factor, ramp):
+def _damp(p, elastic, w, k, elastic_k, rate, viscous, factor, ramp):
     """Return order k of the force from that of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
-    force = row(w.lanes, ACTS) * row(elastic, k)
+    force = row(w.lanes, ACTS) * elastic_k
     if ramp is not None:
         _ramp(p, w, k)
         set_row(w.damped, k, _multiply(w.ramp[2], w.rate, k))
         return force + row(w.lanes, DAMPS) * row(w.damped, k)
     if viscous is not None:
-        return force + row(w.lanes, DAMPS) * row(w.rate, k)
-    return force if factor is None else force + row(w.lanes, DAMPS) * _multiply(elastic, w.rate, k)
+        return force + row(w.lanes, DAMPS) * rate
+    return force if factor is None else force + row(w.lanes, DAMPS) * _join(elastic, w.rate, k, elastic_k, rate)
 
 
 @kernel(fast=True, inline=True)
@@ -144,7 +159,7 @@ def _ramp(p, w, k) -> None:
 
 
 @kernel(fast=True, inline=True)
-def _push(p, state, w, k, viscous, factor, integer, fraction, ramp):
+def _push(p, state, w, k, depth, rate, viscous, factor, integer, fraction, ramp):
     """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
     Row ACTS of `w.lanes` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
@@ -154,11 +169,12 @@ def _push(p, state, w, k, viscous, factor, integer, fraction, ramp):
         degree = int(p.exponent)
         for i in range(1, degree - 1):
             set_row(w.power[i], k, _multiply(w.power[i - 1], w.gap, k))
-        return _damp(p, w.power[degree - 2], w, k, viscous, factor, ramp)
+        elastic = w.power[degree - 2]
+        return _damp(p, elastic, w, k, row(elastic, k), rate, viscous, factor, ramp)
     if fraction is not None:
-        _raise(w, k, state.step[TOUCHING], p.exponent)
-        return _damp(p, w.power[0], w, k, viscous, factor, ramp)
-    return _damp(p, w.gap, w, k, viscous, factor, ramp)
+        power = _raise(w, k, depth, state.step[TOUCHING], p.exponent)
+        return _damp(p, w.power[0], w, k, power, rate, viscous, factor, ramp)
+    return _damp(p, w.gap, w, k, depth, rate, viscous, factor, ramp)
 
 
 @kernel(fast=True)
@@ -211,16 +227,17 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
 
 
 @kernel(fast=True, inline=True)
-def _resultant(p, w, k, force):
-    """Return order k of the sum of the contact forces in head axes, and of their moment about the centre of mass."""
-    torque = row(w.arm, 0) * force if k == 0 else _multiply(w.arm, w.force, k)
-    # the rows for X and Y are the walls' inward normals
-    return -total(row(p.gap, 2) * force), -total(row(p.gap, 3) * force), total(torque)
+def _applied(p, along_x, along_y, torque):
+    """Return the accelerations that forces in head axes and moments of the pairs give, in the lanes of the rates."""
+    mass, inertia = p.inverse_mass, p.inverse_inertia
+    pushed = spread_total(along_x) * pack(0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0, 0.0)
+    pushed = pushed + spread_total(along_y) * pack(0.0, 0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0)
+    return pushed + spread_total(torque) * pack(0.0, 0.0, 0.0, 0.0, inertia, 0.0, 0.0, 0.0)
 
 
 @kernel(fast=True)
 def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
-    """Return order k of the friction forces' sum in head axes and of their moment (`model.friction`).
+    """Return order k of what the friction forces give (`_applied`, `model.friction`).
 
     With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
     """
@@ -241,7 +258,7 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
     force = _multiply(w.force, tau, k) * p.friction
     set_row(drag, k, force)
     # t is the wall's normal turned by +90 degrees, the gap's rows for X and Y are minus the normals
-    return total(row(p.gap, 3) * force), -total(row(p.gap, 2) * force), total(_multiply(arm, drag, k))
+    return _applied(p, row(p.gap, 3) * force, row(p.gap, 2) * force * -1.0, _multiply(arm, drag, k))
 
 
 @kernel(fast=True)
@@ -290,18 +307,18 @@ def expand(
     """
     alpha, beta = state.clock[ALPHA], state.clock[BETA]
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
-    im, ii = p.inverse_mass, p.inverse_inertia
-    here, before = row(state.y, 0), splat(0.0)
+    here, before, closing, depth = row(state.y, 0), splat(0.0), splat(0.0), splat(0.0)
     c1 = s1 = c2 = s2 = 0.0
     small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, limit
     for k in range(order + 1):
         set_row(w.series, k, here)
         x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
         om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
-        depth = combine(p.gap, c, s, x, yy)
         if k == 0:
-            depth = depth + row(p.gap, 4) - row(state.depth, 0)
+            depth = combine(p.gap, c, s, x, yy) + row(p.gap, 4) - row(state.depth, 0)
         else:
+            if not penetrating:
+                depth = combine(p.gap, c, s, x, yy)
             size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
             if wear is not None and penetrating:
                 depth = depth - row(w.worn, k)
@@ -315,37 +332,42 @@ def expand(
         if k == order:
             break
         s1_k = 0.0 if harmonics is None else load[0, k]
-        set_row(right, k, _turned(here))
-        set_row(left, k, pack(om, om, om, om, s1_k, om, om, s1_k))
-        product = _multiply(left, right, k)
+        turned, turning_by = _turned(here), pack(om, om, om, om, s1_k, om, om, s1_k)
+        set_row(right, k, turned)
+        set_row(left, k, turning_by)
+        product = _join(left, right, k, turning_by, turned)
         turning = product * pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
         turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-        dx, dy, dc, ds = lane(turning, X), lane(turning, Y), lane(turning, COS), lane(turning, SIN)
         fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments)
         if offset is not None:
             # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
-            moment -= (p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)) * ii / im
+            across = p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)
+            moment -= across * p.inverse_inertia / p.inverse_mass
+        applied = pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
+        steady, bent = alpha * inverse[k + 1], beta * inverse[k + 1]
         if penetrating:
-            set_row(w.rate, k, combine(p.gap, dc, ds, dx, dy))
-            set_row(w.arm, k, combine(p.arm, c, s, x, yy))
-            force = _push(p, state, w, k, viscous, factor, integer, fraction, ramp)
+            dx, dy, dc, ds = lane(turning, X), lane(turning, Y), lane(turning, COS), lane(turning, SIN)
+            rate = combine(p.gap, dc, ds, dx, dy)
+            set_row(w.rate, k, rate)
+            arm = combine(p.arm, c, s, x, yy)
+            set_row(w.arm, k, arm)
+            force = _push(p, state, w, k, depth, rate, viscous, factor, integer, fraction, ramp)
             set_row(w.force, k, force)
-            push_x, push_y, torque = _resultant(p, w, k, force)
-            fx += push_x * im
-            fy += push_y * im
-            moment += torque * ii
+            # the rows for X and Y are minus the walls' inward normals
+            torque = _join(w.arm, w.force, k, arm, force)
+            applied = applied + _applied(p, row(p.gap, 2) * force * -1.0, row(p.gap, 3) * force * -1.0, torque)
             if slip is not None:
-                push_x, push_y, torque = _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
-                fx += push_x * im
-                fy += push_y * im
-                moment += torque * ii
+                applied = applied + _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
             if wear is not None:
                 _wear(p, w, k, alpha, beta)
+            # of the next order, and sooner there than the state, which waits for the forces
+            depth = rate * steady + closing * bent
+            closing = rate
         if free is not None:
-            moment *= p.free[2]
-            fx, fy = _hold(p, w, k, fx, fy)
+            fx, fy = _hold(p, w, k, lane(applied, VX), lane(applied, VY))
+            applied = pack(0.0, 0.0, fx, fy, lane(applied, OMEGA) * p.free[2], 0.0, 0.0, 0.0)
         c2, s2, c1, s1 = c1, s1, c, s
-        rates = turning + pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
-        here = (rates * alpha + before * beta) * inverse[k + 1]
+        rates = turning + applied
+        here = rates * steady + before * bent
         before = rates
     return order
