@@ -15,7 +15,7 @@ scene without friction has the paths of `friction` too: setting one switches it 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -82,10 +82,14 @@ def check_path(scene: Scene, path: str) -> str:
     """
     known = parameter_paths(scene)
     if path not in known:
-        near = get_close_matches(path, known, n=3, cutoff=0.6)
-        hint = f"; nearest: {', '.join(near)}" if near else ""
-        raise StudyError(f"parameter: got {path!r}, expected one of {', '.join(known)}{hint}")
+        raise StudyError(f"parameter: got {path!r}, expected one of {', '.join(known)}{nearest_of(path, known)}")
     return path
+
+
+def nearest_of(path: str, known: Iterable[str]) -> str:
+    """Return a hint with the known paths that are nearest, or an empty text."""
+    near = get_close_matches(path, known, n=3, cutoff=0.6)
+    return f"; nearest: {', '.join(near)}" if near else ""
 
 
 def parameter_of(scene: Scene, path: str) -> Value | None:

@@ -16,7 +16,6 @@ means follow from those sums. Corners by the scene's letters or by their names; 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from difflib import get_close_matches
 from functools import partial
 from itertools import combinations
 from typing import Final
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES, STOPS_COUNTER_CLOCKWISE
 from plow_twin.model.scene import Scene
 from plow_twin.study.members import Members
-from plow_twin.study.parameters import StudyError
+from plow_twin.study.parameters import StudyError, nearest_of
 
 Array = NDArray[np.float64]
 #: From m runs to the statistic of each, shape (m,).
@@ -132,12 +131,10 @@ def statistic(scene: Scene, path: str) -> Statistic:
     head, _, last = path.rpartition(".")
     key = path if path in known else f"{head}.{''.join(sorted(last))}"
     if key not in known:
-        near = get_close_matches(path, known, n=3, cutoff=0.6)
-        hint = f"; nearest: {', '.join(near)}" if near else ""
         kinds = ", ".join(f"{name}.ccw.{_labels(scene)[0]}" for name in _OF_PAIRS)
         raise StudyError(
             f"statistic: got {path!r}, expected e.g. {kinds}, max.{PAIR_NAMES[0]}, contact_sets.ccw.<corners>, "
-            f"contact_set_time.ccw.<corners>, contact_points.ccw.2, events, steps{hint}"
+            f"contact_set_time.ccw.<corners>, contact_points.ccw.2, events, steps{nearest_of(path, known)}"
         )
     return known[key]
 

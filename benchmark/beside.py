@@ -1,0 +1,110 @@
+"""Measure this checkout beside an earlier commit, in one run: the same work in turn, one process after the other.
+
+    python benchmark/beside.py COMMIT [--rounds 5]
+
+Each round starts one process in a worktree of the commit and one in this checkout; a process warms up, repeats each
+case and reports its fastest time. The table (medians over the rounds, and their ratio) goes to docs/benchmark.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = ROOT / "docs" / "benchmark.md"
+BEGIN, END = "<!-- beside: begin -->", "<!-- beside: end -->"
+#: Only what both commits offer: runs as in README.
+_WORK = """
+import json, sys, time
+import numpy as np
+from plow_twin import Twin, simulate
+from plow_twin.scene_file import load_scene
+from plow_twin.model.loads import compile_loads
+
+def fastest(run, times=7):
+    run()
+    return min(run() for _ in range(times))
+
+def sampled(scene, tol):
+    t = np.arange(1, 20001) * 1e-3
+    wrench = compile_loads(scene.loads).at(t)
+    def run():
+        twin = Twin(scene, excitation="sampled", tol=tol)
+        begin = time.perf_counter()
+        twin.advance_samples(t, wrench)
+        return time.perf_counter() - begin
+    return fastest(run, 3)
+
+found = {}
+for name in ("bench_kv", "bench_hc", "paper"):
+    scene = load_scene(f"{sys.argv[1]}/config/{name}.yaml")
+    for tol in (1e-3, 1e-6, 1e-9):
+        found[f"{name}, 20 s, tolerance {tol:g}, output each 0.1 s"] = fastest(
+            lambda: simulate(scene, 20.0, 0.1, tol=tol).wall_s
+        )
+    found[f"{name}, 20 s, tolerance 1e-6, output each 1 ms"] = fastest(
+        lambda: simulate(scene, 20.0, 1e-3, tol=1e-6).wall_s
+    )
+    found[f"{name}, 20 s of samples at 1 kHz, tolerance 1e-6"] = sampled(scene, 1e-6)
+print(json.dumps(found))
+"""
+
+
+def measure(tree: Path, cache: str) -> dict[str, float]:
+    """Return the times in s of each case, by a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(tree), "NUMBA_CACHE_DIR": cache}
+    done = subprocess.run(
+        [sys.executable, "-c", _WORK, str(tree)], cwd=tree, env=environment, capture_output=True, text=True, check=True
+    )
+    times: dict[str, float] = json.loads(done.stdout)
+    return times
+
+
+def table(commit: str, now: list[dict[str, float]], before: list[dict[str, float]]) -> str:
+    """Return the medians and their ratio as a table."""
+    lines = [f"Beside commit `{commit}`, {len(now)} rounds in turn:", ""]
+    lines += [f"| work | `{commit}` | this | ratio |", "|---|---|---|---|"]
+    for case in now[0]:
+        old, new = (1e3 * statistics.median(times[case] for times in rounds) for rounds in (before, now))
+        lines.append(f"| {case} | {old:.3g} ms | {new:.3g} ms | {old / new:.2f} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure and rewrite the table of the page."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("commit")
+    arguments.add_argument("--rounds", type=int, default=5)
+    chosen = arguments.parse_args()
+    commit = _git("rev-parse", "--short", chosen.commit)
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder) / "tree"
+        _git("worktree", "add", "--detach", str(tree), commit)
+        try:
+            before, now = [], []
+            for number in range(chosen.rounds):
+                print(f"round {number + 1} of {chosen.rounds}", file=sys.stderr)
+                before.append(measure(tree, f"{folder}/before"))
+                now.append(measure(ROOT, f"{folder}/now"))
+        finally:
+            _git("worktree", "remove", "--force", str(tree))
+    text = table(commit, now, before)
+    print(text)
+    page = PAGE.read_text(encoding="utf-8")
+    head, _, rest = page.partition(BEGIN)
+    PAGE.write_text(f"{head}{BEGIN}\n\n{text}\n\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, check=True, capture_output=True, text=True).stdout.strip()
+
+
+if __name__ == "__main__":
+    main()
