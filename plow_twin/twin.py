@@ -33,6 +33,7 @@ from plow_twin.solve.layout import (
     new_work,
 )
 from plow_twin.solve.length import PARTING_ORDER
+from plow_twin.solve.rest import AT_REST
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
@@ -86,7 +87,7 @@ class Twin:
         self._state: State = first_of(self._states)
         self._compiled: Compiled = replace(compiled, params=first_of(self._params))
         self._parts = self._compiled.parts
-        self._budget, self._bound = _bounded(max_evaluations, int(self._compiled.params.order))
+        self._budget, self._bound = _bounded(max_evaluations, int(compiled.params.order))
         self._works, self._all_totals = new_records(WORK, 1), new_records(TOTALS, 1)
         self._works[0] = new_work()
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
@@ -252,5 +253,5 @@ def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None
     if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:
         raise ValueError(f"max_evaluations: got {max_evaluations!r}, expected an integer >= {LEAST_EVALUATIONS}")
     coarse = max(LEAST_EVALUATIONS // 4, max_evaluations // 16)
-    budget = (int(max_evaluations) - 4 * coarse) // (order + PARTING_ORDER)
+    budget = (int(max_evaluations) - 4 * coarse) // (order + PARTING_ORDER + AT_REST)
     return budget, Bound(coarse, np.zeros(1), np.zeros((6, 6)), np.zeros(3), np.zeros((4, PAIR_COUNT)))

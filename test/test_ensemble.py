@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Clearance, Scene, Status, simulate, simulate_many
+from plow_twin import Clearance, Gravity, Harmonic, Scene, Status, Table, simulate, simulate_many
 
 
 def members() -> list[Scene]:
@@ -35,6 +35,18 @@ def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
         for sense, shares in zip(ensemble.set_time[index], single.contact_sets.values(), strict=True):
             assert sorted(sense[sense > 0.0] / sense.sum()) == sorted(shares.values())
         assert ensemble.steps[index] == single.solver["steps"]
+
+
+def test_members_with_other_terms_leave_nothing_behind() -> None:
+    """The thread's scratch space goes from one to the next: a sampled load, a flight, a rest."""
+    scene = preset("bench_kv")
+    table = Table("ramp", np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0], [4e4, -1e4, 2e3]]))
+    swing = Harmonic("swing", (200.0, 50.0), 20.0)
+    swinging = dataclasses.replace(scene, gravity=Gravity(0.0), loads=(swing,))
+    scenes = [dataclasses.replace(scene, loads=(table,)), swinging, dataclasses.replace(scene, loads=()), swinging]
+    together = simulate_many(scenes, 0.9, 0.1, workers=1)
+    for index, one in enumerate(scenes):
+        assert np.array_equal(together.q[index], simulate(one, 0.9, 0.1).q)
 
 
 def test_a_member_that_fails_does_not_stop_the_others() -> None:

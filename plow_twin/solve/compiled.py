@@ -134,6 +134,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         max_events=MAX_EVENTS_AT_ONCE,
     )
     friction = scene.friction if scene.friction is not None and scene.friction.coefficient != 0.0 else None
+    # no 0 / 0 where a scene without friction runs together with others that have it
     params.slip_speed = 1.0
     if friction is not None:
         values |= dict(

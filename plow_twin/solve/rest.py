@@ -24,6 +24,8 @@ _SHARE = 1e-3
 _MARGIN = 100.0
 #: And at least so deep in m, for the differences that give the stiffness.
 _DEEP = 1e-7
+#: Evaluations of the equations of motion that it takes to tell, at most.
+AT_REST = 5
 
 
 @kernel()
@@ -100,7 +102,7 @@ def _still(p, parts, state, w) -> bool:
     gyration = math.sqrt(p.inverse_mass / p.inverse_inertia)
     speed = math.hypot(math.hypot(y[VX], y[VY]), gyration * y[OMEGA])
     way, fast = _SHARE * p.position_tolerance, _SHARE * p.velocity_tolerance
-    if speed > fast or not _held(p, state, y, max(_MARGIN * way, _DEEP)):
+    if speed > 0.5 * fast or not _held(p, state, y, max(_MARGIN * way, _DEEP)):
         return False
     to_world(y, z)
     z[3] = z[4] = z[5] = 0.0
@@ -108,7 +110,7 @@ def _still(p, parts, state, w) -> bool:
     push = math.hypot(math.hypot(rate[3], rate[4]), gyration * rate[5])
     # energy bounds the distance from the equilibrium by v / sqrt(least) + 2 a / least, the speed by v + a / sqrt(least)
     least = max((2.0 * speed / way) ** 2, 4.0 * push / way, (2.0 * push / fast) ** 2)
-    if speed > 0.5 * fast or not _stiffer_than(w.hessian, least):
+    if not _stiffer_than(w.hessian, least):
         return False
     _to_equilibrium(w.hessian, rate, z, gyration)
     return True

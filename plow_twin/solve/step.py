@@ -75,7 +75,6 @@ def _linear_load(segments, step, t0, w):
     if t0 < here.knot:
         for j in range(3):
             w.wrench[0, j] += here.start[j]
-            w.wrench[1, j] = 0.0
         return here.knot
     for j in range(3):
         w.wrench[1, j] = here.slope[j]
@@ -120,7 +119,7 @@ def begin(
     t0 = clock[T0]
     penetrating = weigh_pairs(p, state, w, viscous, fraction, ramp)
     for j in range(3):
-        w.wrench[0, j] = p.constant[j]
+        w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
     if segments is not None:
         hard_time = min(hard_time, _linear_load(parts.segments, step, t0, w))
     clock[HARD_END] = hard_time
