@@ -199,47 +199,6 @@ def advance_times(
 
 
 @kernel()
-def _advance_samples(
-    p,
-    parts,
-    state,
-    w,
-    totals,
-    times,
-    wrench,
-    budget,
-    q,
-    v,
-    penetration,
-    rate,
-    force,
-    peak,
-    impulse,
-    makes,
-    depth,
-    steps,
-    status,
-    error_estimate,
-    bound,
-) -> None:
-    """Advance to each time under a wrench that runs straight from wrench[i] to wrench[i + 1]; a sample ends a step."""
-    piece = parts.segments[0]
-    state.step[PIECE] = 0
-    for i in range(times.size):
-        before = state.count[STEPS]
-        span = times[i] - state.clock[T0]
-        piece.knot = state.clock[T0]
-        for j in range(3):
-            piece.start[j] = wrench[i, j]
-            piece.slope[j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
-        status[i] = _advance(p, parts, state, w, totals, times[i], times[i], before + budget, bound)
-        if bound is not None:
-            error_estimate[i] = bound.error[0]
-        steps[i] = state.count[STEPS] - before
-        _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, depth)
-
-
-@kernel()
 def advance_together(
     params,
     parts,
@@ -265,15 +224,30 @@ def advance_together(
     error_estimate,
     bound,
 ) -> None:
-    """Advance members `first` to `last` - 1 under sampled loads: arrays but times have an axis of members in front.
+    """Advance members `first` to `last` - 1 to each time: arrays but times have an axis of members in front.
 
-    One twin is a member too: it has the same bits alone. `work` and `totals` are arrays of one.
+    A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
+    bits alone. `work` and `totals` are arrays of one.
     """
+    w, sums, piece = work[0], totals[0], parts.segments[0]
     for m in range(first, last):
-        _advance_samples(
-            params[m], parts, states[m], work[0], totals[0], times, wrench[m], budget, q[m], v[m], penetration[m],
-            rate[m], force[m], peak[m], impulse[m], makes[m], depth[m], steps[m], status[m], error_estimate[m], bound,
-        )  # fmt: skip
+        p, state = params[m], states[m]
+        state.step[PIECE] = 0
+        for i in range(times.size):
+            before = state.count[STEPS]
+            span = times[i] - state.clock[T0]
+            piece.knot = state.clock[T0]
+            for j in range(3):
+                piece.start[j] = wrench[m, i, j]
+                piece.slope[j] = (wrench[m, i + 1, j] - wrench[m, i, j]) / span if span > 1e-100 else 0.0
+            status[m, i] = _advance(p, parts, state, w, sums, times[i], times[i], before + budget, bound)
+            if bound is not None:
+                error_estimate[m, i] = bound.error[0]
+            steps[m, i] = state.count[STEPS] - before
+            _read_row(
+                p, parts, state, w, sums, i, q[m], v[m], penetration[m], rate[m], force[m], peak[m], impulse[m],
+                makes[m], depth[m],
+            )  # fmt: skip
 
 
 @kernel()
