@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import pose_error, preset, wall_and_point
 
-from plow_twin import Contact, Scene, Twin, simulate
+from plow_twin import Contact, Friction, Scene, Twin, simulate
 from plow_twin.solve import compiled
 from plow_twin.solve.layout import IMPLICIT, Implicit
 
@@ -22,9 +22,11 @@ def implicit_of(scene: Scene, tol: float = 1e-9) -> Implicit | None:
     return compiled.compile_scene(scene, tol).parts.implicit
 
 
-@pytest.mark.parametrize("damping", [1e8, 1e9])
-def test_implicit_and_explicit_steps_agree(damping: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene = damped(damping)
+@pytest.mark.parametrize(("damping", "friction"), [(1e8, None), (1e9, None), (1e9, Friction(0.2, 0.02))])
+def test_implicit_and_explicit_steps_agree(
+    damping: float, friction: Friction | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = replace(damped(damping), friction=friction)
     implicit = simulate(scene, 0.5, output_dt=0.01, audit=True)
     monkeypatch.setattr(compiled, "_implicit", lambda *arguments: None)
     explicit = simulate(scene, 0.5, output_dt=0.01)

@@ -258,7 +258,7 @@ def _release(scene: Scene, velocity_tolerance: float, speed: float) -> float:
 def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     """Return what implicit steps need, where a contact's damping can outweigh its spring far enough to pay."""
     contact = scene.contact
-    if terms.ramp is not None or terms.slip is not None or terms.wear is not None:
+    if terms.ramp is not None or terms.wear is not None:
         return None
     mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
     largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
