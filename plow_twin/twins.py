@@ -195,7 +195,8 @@ class _Worker(NamedTuple):
 
     @staticmethod
     def of(terms: Terms, compiled: Sequence[Compiled]) -> _Worker:
-        stiff = any(one.parts.implicit is not None for one in compiled)
+        # implicit steps do not follow wear
+        stiff = terms.wear is None and any(one.parts.implicit is not None for one in compiled)
         parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit() if stiff else None)
         work = new_records(WORK, 1)
         work[0] = new_work()

@@ -117,12 +117,13 @@ class Probe:
         self.until(lambda: any(name in report for report in self.reports[count:]), f"diagnostics {part}")
         return {item.key: item.value for item in self.reports[-1][name].values}
 
-    def until_figure(self, part: str, key: str, *expected: str) -> None:
+    def until_figure(self, part: str, key: str, *expected: str, timeout_s: float = WAIT_S) -> None:
         """Wait until a figure of the diagnostics has one of the values."""
         name = f"plow_twin: {part}"
         self.until(
             lambda: self.reports and name in self.reports[-1] and value(self.reports[-1][name], key) in expected,
             f"{part} {key} = {expected}",
+            timeout_s,
         )
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 1000) -> Any:

@@ -181,7 +181,14 @@ def test_quality_of_service_of_an_input_can_be_overridden(tmp_path: Path) -> Non
     overrides = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
     with bench(tmp_path, **overrides) as running:
         offered = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        running.probe.node.create_publisher(WrenchStamped, "excitation", offered)
-        # one publisher; the middleware may report it again
-        running.probe.until_figure("input", "refused_publishers", "1", "2")
+        # the middleware may report a publisher twice, or, on a busy machine, lose what a side should discover: offer again
+        counts = tuple(str(count) for count in range(1, 9))
+        for attempt in range(4):
+            running.probe.node.create_publisher(WrenchStamped, "excitation", offered)
+            try:
+                running.probe.until_figure("input", "refused_publishers", *counts, timeout_s=15.0)
+                break
+            except AssertionError:
+                if attempt == 3:
+                    raise
         assert "incompatible quality of service" in running.twin.output()

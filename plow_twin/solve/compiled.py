@@ -133,21 +133,17 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
-    friction = scene.friction if scene.friction is not None and scene.friction.coefficient != 0.0 else None
-    # no 0 / 0 where a scene without friction runs together with others that have it
-    params.slip_speed = 1.0
-    if friction is not None:
-        values |= dict(
-            slip=geometry.slip_rows(scene),
-            slip_arm=geometry.slip_arm_rows(scene),
-            friction=friction.coefficient,
-            slip_speed=friction.regularisation_speed_m_s,
-        )
-    for name, value in values.items():
+    for name, value in (values | _slip(scene)).items():
         params[name] = value
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
         segments = np.zeros(1, SEGMENT)
+    terms = _scene_terms(scene, terms, harmonics, segments)
+    return Compiled(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
+
+
+def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments: Segments | None) -> Terms:
+    """Return the terms of the law together with those of the rest of the scene."""
     present = dict(
         harmonics=harmonics is not None,
         second=harmonics is not None and bool(harmonics["second"].any()),
@@ -155,13 +151,12 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         wear=scene.wear is not None and scene.wear.coefficient_m2_n != 0.0,
         offset=any(scene.head.com_offset_m),
         free=bool(scene.locked),
-        slip=friction is not None,
+        slip=scene.friction is not None and scene.friction.coefficient != 0.0,
     )
     # with the loads' moment about another point than the centre of mass the flight has no elementary integral
     present["flight"] = present["harmonics"] and not present["offset"]
     present["rest"] = not (present["harmonics"] or present["wear"] or present["slip"])
-    terms = terms._replace(**_flags(present))
-    return Compiled(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
+    return law._replace(**_flags(present))
 
 
 def order_for(admissible: float) -> int:
@@ -271,6 +266,19 @@ def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     else:
         return None
     return new_implicit() if damping * mobility > _OVERDAMPED * math.sqrt(spring * mobility) else None
+
+
+def _slip(scene: Scene) -> dict[str, Any]:
+    """Return what friction needs; without it nothing but a speed to divide by, for scenes that run together."""
+    friction = scene.friction
+    if friction is None:
+        return {"slip_speed": 1.0}
+    return dict(
+        slip=geometry.slip_rows(scene),
+        slip_arm=geometry.slip_arm_rows(scene),
+        friction=friction.coefficient,
+        slip_speed=friction.regularisation_speed_m_s,
+    )
 
 
 def _wear_rate(scene: Scene) -> Array:
