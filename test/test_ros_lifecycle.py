@@ -181,7 +181,7 @@ def test_quality_of_service_of_an_input_can_be_overridden(tmp_path: Path) -> Non
     overrides = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
     with bench(tmp_path, **overrides) as running:
         offered = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-        # the middleware may report a publisher twice, or, on a busy machine, lose what a side should discover: offer again
+        # the middleware may report a publisher twice, or on a busy machine lose what a side should discover
         counts = tuple(str(count) for count in range(1, 9))
         for attempt in range(4):
             running.probe.node.create_publisher(WrenchStamped, "excitation", offered)
