@@ -14,7 +14,7 @@ from plow_twin.advance import Advance, AdvanceSeries, check_times, columns, empt
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive
-from plow_twin.solve.compiled import Compiled, compile_scene, per_mass
+from plow_twin.solve.compiled import Compiled, compile_scene, per_mass, wear_rate
 from plow_twin.solve.layout import (
     BOUNDED,
     COEFFICIENTS,
@@ -243,7 +243,7 @@ class Twin:
         self._travel_speed = speed
         wear = self.scene.wear
         if wear is not None and self._parts.terms.wear is not None:
-            self._compiled.params.wear[:] = wear.coefficient_m2_n * speed / wear.pad_area_m2
+            self._compiled.params.wear[:] = wear_rate(wear, speed)
 
 
 def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None]:

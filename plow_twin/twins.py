@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from plow_twin.advance import AdvanceTogether, check_times, columns, empty_together
 from plow_twin.model.scene import Scene
 from plow_twin.solve import drive
-from plow_twin.solve.compiled import Compiled, compile_scene
+from plow_twin.solve.compiled import Compiled, compile_scene, inertias, wear_rate
 from plow_twin.solve.layout import (
     NOW,
     PARAMS,
@@ -73,7 +73,7 @@ class Twins:
             self._params[index] = compiled.params
         self._states = new_records(STATE, len(scenes))
         self._wrench = np.zeros((len(scenes), 3))
-        self._masses = np.array([[s.head.mass_kg, s.head.mass_kg, s.head.inertia_kg_m2] for s in scenes])[:, None]
+        self._masses = np.array([inertias(scene) for scene in scenes])[:, None]
         terms = _merge(self._compiled)
         self._workers = [_Worker.of(terms, self._compiled) for _ in range(max(1, min(workers, os.cpu_count() or 1)))]
         self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
@@ -145,7 +145,7 @@ class Twins:
             raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected finite speeds in m/s")
         for index, (scene, speed) in enumerate(zip(self.scenes, speeds, strict=True)):
             if scene.wear is not None:
-                self._params["wear"][index] = scene.wear.coefficient_m2_n * speed / scene.wear.pad_area_m2
+                self._params["wear"][index] = wear_rate(scene.wear, speed)
 
     def snapshot(self) -> bytes:
         """Return the exact state as bytes, to be restored by twins of the same scenes and tolerance."""

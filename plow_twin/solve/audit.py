@@ -15,7 +15,6 @@ import numpy as np
 from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.kernel import kernel
 from plow_twin.model.lanes import row, set_row
-from plow_twin.solve.flight import fastest
 from plow_twin.solve.layout import (
     ALPHA,
     BETA,
@@ -156,7 +155,7 @@ def audit_step(p, parts, wear, flight, state, w, audit) -> None:
     set_row(depth, 0, row(state.depth, 0))
     panels = 1
     if flight is not None and state.step[FLYING] == 1:
-        panels += int(end * fastest(parts.harmonics) / _PANEL_PHASE)
+        panels += int(end * p.fastest / _PANEL_PHASE)
     width = end / panels
     for panel in range(panels):
         for i in range(audit.nodes.size):

@@ -11,8 +11,8 @@ import numpy as np
 from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
-from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
-from plow_twin.model.scene import DOF_NAMES, Contact, Scene
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import DOF_NAMES, Contact, Scene, Wear
 from plow_twin.solve.contacts import settle_modes
 from plow_twin.solve.layout import (
     HARMONIC,
@@ -126,9 +126,10 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         weight=radius * speed / length,
         radius=radius,
         release=0.0 if terms.fraction is None else _release(scene, tol * speed, speed),
-        wear=_wear_rate(scene),
+        wear=0.0 if scene.wear is None else wear_rate(scene.wear, scene.wear.travel_speed_m_s),
         offset=scene.head.com_offset_m,
         free=np.array([float(name not in scene.locked) for name in DOF_NAMES]),
+        fastest=float(loads.omega.max(initial=0.0)),
         leverage=float(np.hypot(rows[0], rows[1]).max()),
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
@@ -173,8 +174,13 @@ def _lacuna(exponent: float) -> int:
 
 def per_mass(scene: Scene, wrench: Array) -> Array:
     """Divide wrenches, shape (..., 3), by mass and inertia."""
-    share: Array = np.asarray(wrench) / np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
+    share: Array = np.asarray(wrench) / inertias(scene)
     return share
+
+
+def inertias(scene: Scene) -> Array:
+    """Return mass, mass and inertia, shape (3,)."""
+    return np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
 
 
 def _segments(scene: Scene, pieces: Pieces) -> Segments:
@@ -281,9 +287,6 @@ def _slip(scene: Scene) -> dict[str, Any]:
     )
 
 
-def _wear_rate(scene: Scene) -> Array:
-    """Return depth per impulse of each pad, shape (8,), in m/(N s):  dh/dt = k_s F v / A (Archard)."""
-    wear = scene.wear
-    if wear is None:
-        return np.zeros(PAIR_COUNT)
-    return np.full(PAIR_COUNT, wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2)
+def wear_rate(wear: Wear, speed: float) -> float:
+    """Return the depth per impulse of a pad in m/(N s) at a speed along the face:  dh/dt = k_s F v / A (Archard)."""
+    return wear.coefficient_m2_n * speed / wear.pad_area_m2

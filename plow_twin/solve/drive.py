@@ -292,7 +292,10 @@ def lay_out_again(p, parts, state, w) -> None:
 
 @kernel()
 def _rows_in_flight(p, parts, flight, state, w, t, i, q, v, penetration, force):
-    """Fill the rows within a step of free flight from row i on; return the first row after it."""
+    """Fill the rows within a step of free flight from row i on; return the first row after it.
+
+    Apart from `record`, whose loop over rows is a tenth faster without the choice.
+    """
     if flight is not None:
         t0, y, rate = state.clock[T0], np.empty(8), np.empty(8)
         while i < t.size and t[i] < t0 + state.clock[LENGTH]:

@@ -143,12 +143,19 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 
 @kernel()
+def _stays(column, order, h) -> bool:
+    """Tell whether g_0 > sum max(-g_k, 0) h^k proves that a guard does not turn negative on [0, h]."""
+    reach = 0.0
+    for k in range(order, 0, -1):
+        reach = (reach + max(-column[k], 0.0)) * h
+    return column[0] >= reach
+
+
+@kernel()
 def _sooner(state, w, order, best) -> float:
     """Return where the guard in `w.column[0]` first turns negative before `best`, else `best`."""
-    column, reach = w.column[0], 0.0
-    for k in range(order, 0, -1):
-        reach = (reach + max(-column[k], 0.0)) * best
-    if column[0] >= reach:
+    column = w.column[0]
+    if _stays(column, order, best):
         return best
     state.count[GUARD_ROOTS] += 1
     return min(best, first_root(column, order, best, w))
@@ -163,14 +170,11 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer
     column = w.column[0]
     for pair in range(8):
         if unsafe >> pair & 1:
-            reach = 0.0
-            for k in range(order, 0, -1):
-                reach = (reach + max(-w.guard[k, pair], 0.0)) * best
-            if w.guard[0, pair] >= reach:
-                # an event found before is sooner
-                continue
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
+            if _stays(column, order, best):
+                # an event found before is sooner
+                continue
             state.count[GUARD_ROOTS] += 1
             root = first_root_within(column, order, sigma, w)
             if root < best:

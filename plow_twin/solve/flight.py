@@ -31,15 +31,6 @@ def _amplitudes(p, one, j):
     return sine, p.direction[0, j] * one.first[1] + p.direction[1, j] * one.second[1]
 
 
-@kernel(inline=True)
-def fastest(harmonics) -> float:
-    """Return the largest angular frequency in rad/s."""
-    largest = 0.0
-    for i in range(harmonics.size):
-        largest = max(largest, harmonics[i].omega)
-    return largest
-
-
 @kernel()
 def _clearance(p, state) -> float:
     """Return the distance of the pair that is nearest to touching."""
@@ -85,7 +76,7 @@ def _reach(p, w, time, leverage) -> float:
 @kernel()
 def take_off(p, harmonics, state, w, span) -> float:
     """Lay out a step of free flight of at most `span`; return its length, or 0 where a series serves as well."""
-    least = _LEAST_PHASE / fastest(harmonics)
+    least = _LEAST_PHASE / p.fastest
     if span < least:
         return 0.0
     clearance = _clearance(p, state)

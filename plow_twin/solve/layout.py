@@ -132,6 +132,7 @@ PARAMS: Final = _in_lines(
         ("weight", "f8"),  # turns cos and sin into velocities
         ("radius", "f8"),  # turns angles into lengths
         ("release", "f8"),  # penetration below which the force is negligible
+        ("fastest", "f8"),  # largest angular frequency of the harmonics
         ("leverage", "f8"),  # distance of a corner of the frame from its centre
         ("half_cavity", "f8"),  # penetration that ends the model's range
         ("max_events", "i8"),  # events at one instant before recovery
@@ -158,13 +159,11 @@ WORK: Final = np.dtype(
         ("series", "f8", _WIDE),  # state
         ("left", "f8", _WIDE),  # factors of the Cauchy products
         ("right", "f8", _WIDE),
-        ("product", "f8", _WIDE),
         ("gap", "f8", _WIDE),  # penetration
         ("rate", "f8", _WIDE),  # its rate in time
         ("arm", "f8", _WIDE),
         ("damped", "f8", _WIDE),  # elastic part times rate
         ("force", "f8", _WIDE),
-        ("torque", "f8", _WIDE),
         ("worn", "f8", _WIDE),  # growth of the wear depth
         ("guard", "f8", _WIDE),
         ("bernstein", "f8", _WIDE),
