@@ -36,6 +36,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--check-skips", action="store_true", help="fail when a test is skipped that test/skips.txt does not list"
     )
+    parser.addoption("--golden-update", action="store_true", help="pin the digests of test/golden.py anew")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
