@@ -1,8 +1,14 @@
-"""Motions whose bits are pinned: each in a few lines, hashed by what it tells, not by how the solver keeps its state."""
+"""Motions whose bits are pinned, hashed by what they tell and not by how the solver keeps its state.
+
+    python test/golden.py
+
+computes them all and prints the figures as JSON.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -91,3 +97,7 @@ CASES: dict[str, Callable[[], Figures]] = {
     "samples, bounded": lambda: _stream(preset("bench_kv"), max_evaluations=200),
     "batch": _batch,
 }
+
+
+if __name__ == "__main__":
+    print(json.dumps({name: case() for name, case in CASES.items()}))
