@@ -5,6 +5,7 @@ from plow_twin.advance import AdvanceSeries as AdvanceSeries
 from plow_twin.advance import AdvanceTogether as AdvanceTogether
 from plow_twin.ensemble import Ensemble as Ensemble
 from plow_twin.ensemble import simulate_many as simulate_many
+from plow_twin.errors import ArgumentError as ArgumentError
 from plow_twin.errors import PlowTwinError as PlowTwinError
 from plow_twin.errors import Problem as Problem
 from plow_twin.errors import RecordingError as RecordingError

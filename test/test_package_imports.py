@@ -19,7 +19,7 @@ ROOMS = {
     "presets": set(),
     "model": {"errors"},
     "solve": {"errors", "model"},
-    "advance": {"model", "solve"},
+    "advance": {"errors", "model", "solve"},
     "twin": {"errors", "model", "solve", "advance"},
     "twins": {"errors", "model", "solve", "advance", "twin"},
     "books": {"errors", "model", "solve"},

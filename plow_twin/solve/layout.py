@@ -182,8 +182,7 @@ WORK: Final = np.dtype(
         ("hessian", "f8", (3, 3)),
         ("size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
-        ("saved", "f8", (3, PAIR_COUNT)),  # y, factor and depth before an advance
-        ("modes", "i8", (PAIR_COUNT,)),  # and the modes
+        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
         ("counted", "i8", (7,)),  # counters before a step is laid out again
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
