@@ -15,7 +15,7 @@ EXTRAS = {
         f"ros-jazzy-common-interfaces==5.3.6{ROS_WHEELS}",
     ],
     # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
-    "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18"],
+    "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18", "lz4>=4.3", "zstandard>=0.22", "isal>=1.6"],
     "view": ["rerun-sdk>=0.41"],
     "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1"],
     "dask": ["distributed>=2024.1"],

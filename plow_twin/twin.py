@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time as _time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -34,6 +34,7 @@ from plow_twin.solve.layout import (
     new_work,
 )
 from plow_twin.solve.length import PARTING_ORDER
+from plow_twin.solve.marked import advance_marked
 from plow_twin.solve.rest import AT_REST
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
@@ -164,6 +165,48 @@ class Twin:
         self._wrench = samples[-1].copy() if len(samples) else self._wrench
         return out
 
+    def advance_marked(
+        self, t: NDArray[np.float64], wrench: NDArray[np.float64], marks: NDArray[np.int64], *, rows: bool = True
+    ) -> MarkedAdvance:
+        """Advance through many samples as `advance_samples` does, and tell the digest at some of them.
+
+        Parameters
+        ----------
+        t : ndarray, shape (n,)
+            Model times in s, never falling.
+        wrench : ndarray, shape (n, 3)
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time.
+        marks : ndarray of int64, shape (m,)
+            Rising numbers from 1 to n: a digest is wanted after so many samples.
+        rows : bool
+            Whether the rows are wanted; without them the motion is the same and takes half the time.
+
+        Raises
+        ------
+        ValueError
+            As `advance_samples`; nothing has changed then.
+        """
+        if self.excitation != "sampled" or self._bound is not None:
+            raise ValueError("advance_marked: expected excitation='sampled' without max_evaluations")
+        check_times(self.time, t)
+        if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
+            raise ValueError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
+        out = empty_series(t) if rows else None
+        status = np.zeros(len(t), np.int64) if out is None else out.status
+        saved = np.zeros(len(marks), STATE)
+        per = per_mass(self.scene, np.concatenate([self._wrench[None], wrench]))
+        advance_marked(
+            self._params, self._parts, self._states, self._works, self._all_totals, t, per, self._budget, marks, saved,
+            status, None if out is None else columns(out)[:9],
+        )  # fmt: skip
+        self._wrench = wrench[-1].copy() if len(wrench) else self._wrench
+        speed = np.float64(self._travel_speed).tobytes()
+        digests = [
+            _digest(state.tobytes() + wrench[mark - 1].tobytes() + speed)
+            for state, mark in zip(saved, marks, strict=True)
+        ]
+        return MarkedAdvance(out, status, digests)
+
     def reset(self, t: float) -> None:
         """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
         if not np.isfinite(t):
@@ -204,7 +247,7 @@ class Twin:
 
     def digest(self) -> str:
         """Return 16 hexadecimal digits that stand for the exact state."""
-        return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
+        return _digest(self.snapshot())
 
     @property
     def steps(self) -> int:
@@ -245,6 +288,19 @@ class Twin:
         wear = self.scene.wear
         if wear is not None and self._parts.terms.wear is not None:
             self._compiled.params.wear[:] = wear_rate(wear, speed)
+
+
+@dataclass(frozen=True)
+class MarkedAdvance:
+    """What `Twin.advance_marked` found: the rows or None, the status of each advance, the digests at the marks."""
+
+    rows: AdvanceSeries | None
+    status: NDArray[np.int64]
+    digests: list[str]
+
+
+def _digest(snapshot: bytes) -> str:
+    return hashlib.blake2b(snapshot, digest_size=8).hexdigest()
 
 
 def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None]:

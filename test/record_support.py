@@ -83,9 +83,9 @@ def record_run(
         session.apply(entry)
         frame = session.outputs.take() if index % frame_every == 0 else None
         messages = {} if frame is None else frame_messages(frame, header.frame_id, header.child_frame_id)
-        for name, message in messages.items():
-            run.outputs.append((header.topic(name), message))
-            recorder.output(header.topic(name), message.stamp_ns, message)  # type: ignore[union-attr]
+        run.outputs += [(header.topic(name), message) for name, message in messages.items()]
+        if frame is not None:
+            recorder.frame(frame)
         if recorder.snapshot_wanted:
             journal(session.snapshot())
         if pause_every and index % pause_every == 0:

@@ -44,7 +44,7 @@ LIBRARIES = {
     "simulate": {"scipy", "numba"},
     "ensemble": set(),
     "scene_file": {"yaml", "jsonschema"},
-    "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite"},
+    "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite", "lz4", "zstandard", "isal"},
     "view": {"rerun"},
     "study": {"scipy", "yaml", "jsonschema", "matplotlib", "pyarrow", "distributed", "jinja2", "rerun"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", "rich", *MESSAGES},

@@ -156,7 +156,10 @@ def test_a_file_cut_anywhere_gives_what_lies_before_the_cut(run: Run, tmp_path: 
         cut_file.write_bytes(data[:cut])
         reader = RunReader(cut_file)
         records = list(reader)
-        assert records == whole[: len(records)]
+        # journal and outputs stand in chunks of their own: of each there is a whole beginning
+        for kind in (EntryRecord, OutputRecord):
+            found = [record for record in records if isinstance(record, kind)]
+            assert found == [record for record in whole if isinstance(record, kind)][: len(found)]
         assert reader.status is FileStatus.TRUNCATED, cut
         assert reader.lost == {} and reader.damaged_chunks == 0
 

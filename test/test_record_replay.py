@@ -18,7 +18,7 @@ from plow_twin.record.cdr import decode, encode
 from plow_twin.record.header import HEADER_RECORD
 from plow_twin.record.messages import JointState, WrenchStamped
 from plow_twin.record.outputs import FRAME_TOPICS
-from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.reader import FileStatus, OutputRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import Digest, Sample
 
@@ -175,3 +175,27 @@ def test_a_header_that_lacks_a_key_is_refused(run: Run, tmp_path: Path) -> None:
 
     with pytest.raises(RecordingError, match=f"metadata '{HEADER_RECORD}': tol is missing"):
         replay(rewrite(run.file, tmp_path / "other.mcap", metadata=metadata))
+
+
+def test_a_journal_alone_gives_the_full_recording_again(tmp_path: Path) -> None:
+    bare = record_run(tmp_path / "bare", paper_entries(COUNT), frame_every=10**9)
+    full = record_run(tmp_path / "full", paper_entries(COUNT))
+    report = replay(bare.folder, write=tmp_path / "made")
+    assert (report.exit_code, report.divergences) == (0, 0)
+    made = [(r.topic, r.data) for r in RunReader(tmp_path / "made") if isinstance(r, OutputRecord)]
+    assert made == [(r.topic, r.data) for r in RunReader(full.folder) if isinstance(r, OutputRecord)]
+    again = replay(tmp_path / "made")
+    assert (again.exit_code, again.compared["contact_forces"]) == (0, COUNT + 1)
+
+
+def test_digests_alone_are_compared_without_opening_the_outputs(run: Run, tmp_path: Path) -> None:
+    data = bytearray(run.file.read_bytes())
+    for start, length in chunk_spans(run.file)[1::2]:
+        data[start + length // 2] ^= 0xFF  # the chunks of outputs: nobody looks
+    file = tmp_path / "damaged.mcap"
+    file.write_bytes(data)
+    report = replay(file, digests_only=True)
+    assert (report.exit_code, report.digests_compared, report.messages_compared) == (0, COUNT // 100 + 1, 0)
+    changed = replay(rewrite(run.file, tmp_path / "changed.mcap", flip_sample(1234, 0)), digests_only=True)
+    assert changed.exit_code == 1 and changed.first_divergence is not None
+    assert 1234 <= changed.first_divergence.step < 1300

@@ -18,14 +18,20 @@ if TYPE_CHECKING:
     epilog="Exit codes: 0 the same, bit for bit; 1 diverged or failed; 2 wrong usage; 3 the same, with counted loss."
 )
 @click.argument("recording", type=click.Path(path_type=Path, exists=True))
+@click.option("--digests-only", is_flag=True, help="Compare the digests of the state alone.")
+@click.option(
+    "--write",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="New folder for a full recording made of the journal: all outputs after each advance.",
+)
 @json_option
 @quiet_option
-def replay(recording: Path, as_json: bool, quiet: bool) -> int:
+def replay(recording: Path, digests_only: bool, write: Path | None, as_json: bool, quiet: bool) -> int:
     """Run the model again on the journal of RECORDING and compare with what was recorded; needs no ROS."""
     from plow_twin.record.replay import replay as run
 
     with progress("replaying", quiet) as on_progress:
-        report = run(recording, on_progress)
+        report = run(recording, on_progress, digests_only=digests_only, write=write)
     facts = _facts(report)
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))

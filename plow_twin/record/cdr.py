@@ -5,6 +5,7 @@ The bytes are canonical: padding is zero and equal messages give equal bytes, so
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 _SECOND_NS = 1_000_000_000
+#: Place of the characters in a string message.
+_TEXT_AT = 8
 
 
 @cache
@@ -72,6 +75,8 @@ def decode(data: bytes, message_type: str) -> Message:
     kind = MESSAGE_TYPES.get(message_type)
     if kind is None:
         raise RecordingError(f"message type: got {message_type!r}, expected one of {', '.join(sorted(MESSAGE_TYPES))}")
+    if kind is Text:
+        return _decode_short_text(data)
     try:
         return _DECODERS[kind](typestore().deserialize_cdr(data, message_type))
     except Exception as error:  # rosbags lets index, struct and assertion errors through
@@ -160,12 +165,19 @@ def _decode_wrench(wire: Any) -> WrenchStamped:
     return WrenchStamped(_stamp_ns(wire.header), wire.header.frame_id, _xyz(wrench.force), _xyz(wrench.torque))
 
 
+def _decode_short_text(data: bytes) -> Text:
+    """Return a string without the general decoder: the journal holds many."""
+    (length,) = struct.unpack_from("<I", data, 4) if len(data) >= _TEXT_AT else (0,)
+    if data[:2] != b"\x00\x01" or not 0 < length <= len(data) - _TEXT_AT:
+        raise RecordingError(f"{Text.TYPE}: {len(data)} bytes that do not hold one")
+    try:
+        return Text(data[_TEXT_AT : _TEXT_AT + length - 1].decode())
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{Text.TYPE}: {len(data)} bytes that do not hold one ({error})") from error
+
+
 def _encode_text(types: Any, message: Text) -> Any:
     return types[Text.TYPE](message.data)
-
-
-def _decode_text(wire: Any) -> Text:
-    return Text(wire.data)
 
 
 _ENCODERS: dict[type[Message], Callable[[Any, Any], Any]] = {
@@ -180,5 +192,4 @@ _DECODERS: dict[type[Message], Callable[[Any], Message]] = {
     Odometry: _decode_odometry,
     DiagnosticStatus: _decode_status,
     WrenchStamped: _decode_wrench,
-    Text: _decode_text,
 }

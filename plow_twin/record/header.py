@@ -22,7 +22,12 @@ LOSS_RECORD: Final = "plow_twin_loss"
 #: Key in it of the reason why recording ended before the run; all other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
-LAYOUT_VERSION: Final = 1
+LAYOUT_VERSION: Final = 2
+#: Versions that can be read; in version 1 there is one file, and its keys are fewer.
+READABLE_VERSIONS: Final = ("1", "2")
+
+#: Keys that version 1 lacks; their defaults say what was so then.
+_SINCE_VERSION_2: Final = ("record_outputs", "part")
 
 #: Folders and files whose code decides the bits of a run.
 _NUMERIC_SOURCES: Final = ("model", "solve", "twin.py", "stream/session.py", "stream/outputs.py", "record/outputs.py")
@@ -75,6 +80,7 @@ class RunHeader:
 
     `scene_yaml` is self-contained. `topics` maps the outputs' base names to the names they were sent under. `clock`
     says what the receive times are: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
+    `record_outputs` says which outputs are there: `all`, `decimated` or `none`; `part` counts the files of a run.
     """
 
     scene_yaml: str
@@ -89,6 +95,8 @@ class RunHeader:
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
     build: Mapping[str, str] = field(default_factory=build_fingerprint)
     package_version: str = field(default_factory=package_version)
+    record_outputs: str = "all"
+    part: int = 0
 
     @property
     def samples_topic(self) -> str:
@@ -123,11 +131,14 @@ class RunHeader:
             A key is missing or does not hold what it should; the message names `source`.
         """
         layout = record.get("layout_version", "")
-        if layout != str(LAYOUT_VERSION):
-            raise RecordingError(f"{source}: layout_version: got {layout!r}, expected {str(LAYOUT_VERSION)!r}")
+        if layout not in READABLE_VERSIONS:
+            expected = " or ".join(READABLE_VERSIONS)
+            raise RecordingError(f"{source}: layout_version: got {layout!r}, expected {expected}")
         values: dict[str, Any] = {}
         for spec in fields(cls):
             text = record.get(spec.name)
+            if text is None and spec.name in _SINCE_VERSION_2:
+                continue
             if text is None:
                 raise RecordingError(f"{source}: metadata {HEADER_RECORD!r}: {spec.name} is missing")
             try:

@@ -56,17 +56,32 @@ def dump_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
     return stream.getvalue()
 
 
-def bag_metadata(
-    file_name: str, topics: Sequence[TopicCount], start_ns: int, end_ns: int, custom: Mapping[str, str]
-) -> dict[str, Any]:
-    """Return the content of `metadata.yaml` for one file with receive times from `start_ns` to `end_ns`."""
-    count = sum(topic.count for topic in topics)
+@dataclass(frozen=True)
+class PartFacts:
+    """One file of a recording: first and last receive time [ns], and what it holds."""
 
-    def span() -> dict[str, Any]:
+    name: str
+    start_ns: int
+    end_ns: int
+    topics: Sequence[TopicCount]
+
+
+def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[str, Any]:
+    """Return the content of `metadata.yaml` for the files of a recording, in order."""
+    totals: dict[str, TopicCount] = {}
+    for part in parts:
+        for topic in part.topics:
+            total = totals.setdefault(topic.topic, TopicCount(topic.topic, topic.message_type))
+            total.count += topic.count
+
+    def span(some: Sequence[PartFacts]) -> dict[str, Any]:
+        filled = [part for part in some if any(topic.count for topic in part.topics)]
+        start = min((part.start_ns for part in filled), default=0)
+        end = max((part.end_ns for part in filled), default=0)
         return {
-            "duration": {"nanoseconds": max(0, end_ns - start_ns)},
-            "starting_time": {"nanoseconds_since_epoch": start_ns},
-            "message_count": count,
+            "duration": {"nanoseconds": max(0, end - start)},
+            "starting_time": {"nanoseconds_since_epoch": start},
+            "message_count": sum(topic.count for part in some for topic in part.topics),
         }
 
     listed = [
@@ -80,18 +95,18 @@ def bag_metadata(
             },
             "message_count": topic.count,
         }
-        for topic in topics
+        for topic in totals.values()
     ]
     return {
         "rosbag2_bagfile_information": {
             "version": METADATA_VERSION,
             "storage_identifier": "mcap",
-            **span(),
+            **span(parts),
             "topics_with_message_count": listed,
             "compression_format": "",
             "compression_mode": "",
-            "relative_file_paths": [file_name],
-            "files": [{"path": file_name, **span()}],
+            "relative_file_paths": [part.name for part in parts],
+            "files": [{"path": part.name, **span([part])} for part in parts],
             "custom_data": dict(custom) or None,
             "ros_distro": "jazzy",
         }

@@ -6,16 +6,23 @@ import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.record.messages import JointState, Message, Odometry
+from plow_twin.record.template import Template, compiled
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 
 if TYPE_CHECKING:
-    from plow_twin.stream.outputs import Frame
+    from plow_twin.stream.outputs import Frame, Frames
+
+Array = NDArray[np.float64]
 
 #: Base names of the topics that follow from the journal alone.
 FRAME_TOPICS: Final = ("contact_forces", "contact_peaks", "head_state", "clearance", "wear_rate")
+
+#: Those of them that not every frame has.
+SLOW_TOPICS: Final = frozenset({"clearance", "wear_rate"})
 
 
 def frame_messages(frame: Frame, frame_id: str, child_frame_id: str) -> dict[str, Message]:
@@ -30,6 +37,52 @@ def frame_messages(frame: Frame, frame_id: str, child_frame_id: str) -> dict[str
         messages["clearance"] = JointState(stamp_ns, frame_id, CLEARANCE_NAMES, position=slow.clearance)
         messages["wear_rate"] = JointState(stamp_ns, frame_id, PAD_NAMES, velocity=slow.wear_rate)
     return messages
+
+
+def frame_templates(frame_id: str, child_frame_id: str) -> dict[str, Template]:
+    """Return, by base name of the topic, the template whose numbers are the columns of `frame_numbers`."""
+
+    def joints(values: Array) -> Message:
+        return JointState(0, frame_id, PAIR_NAMES, *values.reshape(3, PAIR_COUNT))
+
+    def odometry(values: Array) -> Message:
+        x, y, z, w, vx, vy, omega = values.tolist()
+        return Odometry(0, frame_id, child_frame_id, (x, y, 0.0), (0.0, 0.0, z, w), (vx, vy, 0.0), (0.0, 0.0, omega))
+
+    return {
+        "contact_forces": Template.of(joints, 3 * PAIR_COUNT),
+        "contact_peaks": Template.of(joints, 3 * PAIR_COUNT),
+        "head_state": Template.of(odometry, 7),
+        "clearance": Template.of(
+            lambda values: JointState(0, frame_id, CLEARANCE_NAMES, position=values), len(CLEARANCE_NAMES)
+        ),
+        "wear_rate": Template.of(lambda values: JointState(0, frame_id, PAD_NAMES, velocity=values), len(PAD_NAMES)),
+    }
+
+
+def frame_numbers(frames: Frames) -> dict[str, tuple[NDArray[np.int64], Array]]:
+    """Return, by base name of the topic, stamps (n,) and numbers (n, k) of the messages of many frames."""
+    stamps, slow = frames.stamp_ns, frames.stamp_ns[frames.slow_index]
+    motion = np.empty((len(frames), 7))
+    head_numbers(frames.q, frames.v, motion)
+    return {
+        "contact_forces": (stamps, np.concatenate((frames.penetration, frames.rate, frames.force), axis=1)),
+        "contact_peaks": (stamps, np.concatenate((frames.touches, frames.impulse, frames.peak), axis=1)),
+        "head_state": (stamps, motion),
+        "clearance": (slow, frames.clearance),
+        "wear_rate": (slow, frames.wear_rate),
+    }
+
+
+@compiled
+def head_numbers(q, v, out):  # type: ignore[no-untyped-def]
+    """Write position, quaternion z and w, and the twist in the head's own axes, (n, 7), as `head_state` does."""
+    for n in range(len(q)):
+        cos, sin = math.cos(q[n, 2]), math.sin(q[n, 2])
+        out[n, 0], out[n, 1] = q[n, 0], q[n, 1]
+        out[n, 2], out[n, 3] = math.sin(0.5 * q[n, 2]), math.cos(0.5 * q[n, 2])
+        out[n, 4], out[n, 5] = cos * v[n, 0] + sin * v[n, 1], cos * v[n, 1] - sin * v[n, 0]
+        out[n, 6] = v[n, 2]
 
 
 def contact_forces(frame: Frame, frame_id: str) -> JointState:

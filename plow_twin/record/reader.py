@@ -1,28 +1,37 @@
-"""Reading a recording from front to back: complete, cut off by a kill, or with damaged chunks.
+"""Reading a recording from front to back: complete, cut off by a kill, or with damaged chunks; one part or many.
 
-Only one chunk is in memory at a time, and no index is needed: a file without its end is read as far as it goes.
+Only some chunks are in memory at a time, and no index is needed: a file without its end is read as far as it goes.
+The journal and what was sent may stand in chunks of their own: they are put in order by their sequence numbers.
 """
 
 from __future__ import annotations
 
-import struct
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode
+from plow_twin.record.chunks import ChunkReader, Messages
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message
-from plow_twin.record.messages import MESSAGE_TYPES, Message
-from plow_twin.stream.journal import Entry
+from plow_twin.record.messages import MESSAGE_TYPES, Message, WrenchStamped
+from plow_twin.record.template import Indexes, Template, read_numbers
+from plow_twin.stream.journal import Entry, Sample
 
-#: A longer record is damage: the recorder's chunks are some 64 KiB [B].
-_RECORD_LIMIT: Final = 256 * 1024 * 1024
-_MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
+#: Journal entries that may wait for the messages sent after them [entries]: bounds the memory.
+_PENDING: Final = 65_536
+#: A batch is made when so many entries, or the eighth part of so many chunks, have come: their cost is shared.
+_LEAST: Final = 4096
+_HALF, _WHOLE = 2**31, 2**32
 
 
 class FileStatus(Enum):
@@ -63,13 +72,106 @@ class OutputRecord:
 Record = EntryRecord | OutputRecord
 
 
+@dataclass(frozen=True)
+class Entries:
+    """Journal entries in order of use, shape (n,) each; those that are no samples (`sample` False) are in `others`.
+
+    Sequence numbers are counted on beyond 2^32.
+    """
+
+    sequence: Indexes
+    log_time_ns: Indexes
+    sample: NDArray[np.bool_]
+    stamp_ns: Indexes
+    wrench: NDArray[np.float64]
+    others: Mapping[int, Entry | Dropped]
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __getitem__(self, chosen: slice) -> Entries:
+        first, last, _ = chosen.indices(len(self))
+        others = {index - first: entry for index, entry in self.others.items() if first <= index < last}
+        return Entries(
+            self.sequence[chosen],
+            self.log_time_ns[chosen],
+            self.sample[chosen],
+            self.stamp_ns[chosen],
+            self.wrench[chosen],
+            others,
+        )
+
+    def record(self, index: int) -> EntryRecord:
+        """Return one entry with its place."""
+        entry: Entry | Dropped
+        if self.sample[index]:
+            fx, fy, moment = self.wrench[index].tolist()
+            entry = Sample(int(self.stamp_ns[index]), (fx, fy, moment))
+        else:
+            entry = self.others[index]
+        return EntryRecord(int(self.sequence[index]) % _WHOLE, int(self.log_time_ns[index]), entry)
+
+    def joined(self, other: Entries) -> Entries:
+        """Return these entries and then those."""
+        moved = {index + len(self): entry for index, entry in other.others.items()}
+        return Entries(
+            np.concatenate((self.sequence, other.sequence)),
+            np.concatenate((self.log_time_ns, other.log_time_ns)),
+            np.concatenate((self.sample, other.sample)),
+            np.concatenate((self.stamp_ns, other.stamp_ns)),
+            np.concatenate((self.wrench, other.wrench)),
+            {**self.others, **moved},
+        )
+
+
+_NO_ENTRIES: Final = Entries(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0, np.int64), np.zeros((0, 3)), {}
+)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Messages that were sent, of one chunk; `sequence` is counted on beyond 2^32, `topics` names the channels."""
+
+    messages: Messages
+    sequence: Indexes
+    topics: Mapping[int, tuple[str, str]]
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def __getitem__(self, chosen: slice) -> Outputs:
+        return Outputs(self.messages[chosen], self.sequence[chosen], self.topics)
+
+    def record(self, index: int) -> OutputRecord:
+        """Return one message with its place."""
+        messages = self.messages
+        topic, message_type = self.topics[int(messages.channel[index])]
+        return OutputRecord(
+            int(self.sequence[index]) % _WHOLE,
+            int(messages.log_time_ns[index]),
+            int(messages.publish_time_ns[index]),
+            topic,
+            message_type,
+            messages.data(index),
+        )
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Entries, and all messages that were sent after one of them and before the next batch."""
+
+    entries: Entries
+    outputs: list[Outputs]
+
+
 @dataclass
 class RunReader:
-    """Iterate over the records of a recording, a folder or its `.mcap` file.
+    """Iterate over the records of a recording, a folder or an `.mcap` file.
 
     `status`, `damaged_chunks`, `lost` (by topic, as the recorder counted), `stop_reason` (why it stopped early, if it
-    did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the file that has
-    been read, 0..1.
+    did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
+    has been read, 0..1. `path` is the first file, `parts` are all.
 
     Raises
     ------
@@ -79,6 +181,7 @@ class RunReader:
 
     path: Path
     header: RunHeader = field(init=False)
+    parts: list[Path] = field(init=False)
     status: FileStatus = field(default=FileStatus.UNREAD, init=False)
     damaged_chunks: int = field(default=0, init=False)
     lost: Mapping[str, int] = field(default_factory=dict, init=False)
@@ -87,119 +190,239 @@ class RunReader:
     position: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
-        self.path = mcap_path(Path(self.path))
-        with _open(self.path) as stream:
-            for record in self._records(stream):
-                if type(record).__name__ == "Metadata" and record.name == HEADER_RECORD:
-                    self.header = RunHeader.from_record(record.metadata, str(self.path))
-                    return
-                if type(record).__name__ == "Chunk":
-                    break
+        self.parts = run_parts(Path(self.path))
+        self.path = self.parts[0]
+        for part in self.parts:
+            header = read_header(part)
+            if header is not None:
+                self.header = header
+                return
         raise RecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
 
     def __iter__(self) -> Iterator[Record]:
+        for batch in self.batches():
+            yield from _in_order(batch)
+
+    def batches(self, *, outputs: bool = True) -> Iterator[Batch]:
+        """Yield the records in order, many at a time; without `outputs` the journal alone, as fast as can be."""
         self.status, self.damaged_chunks, self.lost, self.position = FileStatus.UNREAD, 0, {}, 0.0
         self.stop_reason = None
-        size = self.path.stat().st_size
         self.counts.clear()
-        channels: dict[int, Any] = {}
-        schemas: dict[int, Any] = {}
-        with _open(self.path) as stream:
-            for record in self._records(stream):
-                kind = type(record).__name__
-                self.position = stream.tell() / size
-                if kind == "Chunk":
-                    for inner in self._open_chunk(record, schemas, channels):
-                        yield from self._convert(inner, schemas, channels)
-                elif kind == "Metadata" and record.name == LOSS_RECORD:
-                    counted = dict(record.metadata)
-                    self.stop_reason = counted.pop(STOPPED_EARLY_KEY, None)
-                    self.lost = {topic: int(count) for topic, count in counted.items()}
-                elif kind == "Footer":
-                    self.status = FileStatus.COMPLETE
-        if self.status is FileStatus.UNREAD:
+        merger = _Merger(self, outputs)
+        sizes = [part.stat().st_size for part in self.parts]
+        finished = True
+        for number, part in enumerate(self.parts):
+            reader = ChunkReader(part, self._metadata, None if outputs else partial(merger.is_journal, part))
+            merger.begin(part, reader)
+            for messages in reader:
+                self.position = (sum(sizes[:number]) + reader.position) / max(1, sum(sizes))
+                yield from merger.add(messages)
+            finished = finished and reader.finished
+            self.damaged_chunks += reader.damaged
+        yield from merger.finish()
+        if not finished:
             self.status = FileStatus.TRUNCATED
         elif self.damaged_chunks:
             self.status = FileStatus.DAMAGED
-        elif self.stop_reason is not None:
-            self.status = FileStatus.STOPPED_EARLY
+        else:
+            self.status = FileStatus.COMPLETE if self.stop_reason is None else FileStatus.STOPPED_EARLY
 
-    def _records(self, stream: IO[bytes]) -> Iterator[Any]:
-        """Yield the records outside the chunks up to the footer or to where the file breaks off."""
-        from mcap.exceptions import InvalidMagic, McapError
-        from mcap.stream_reader import StreamReader
-
-        try:
-            yield from StreamReader(stream, emit_chunks=True, record_size_limit=_RECORD_LIMIT).records
-        except InvalidMagic as error:
-            if stream.tell() <= len(_MCAP_MAGIC):
-                raise RecordingError(f"{self.path}: got {error}, expected an MCAP file") from error
-        except (McapError, struct.error, UnicodeDecodeError, MemoryError):
-            return  # cut off here; the missing footer tells
-
-    def _open_chunk(self, chunk: Any, schemas: dict[int, Any], channels: dict[int, Any]) -> list[Any]:
-        from mcap.stream_reader import breakup_chunk
-
-        try:
-            return breakup_chunk(chunk, validate_crc=True)
-        except Exception:  # each decompressor has errors of its own; all mean that the chunk is damaged
-            self.damaged_chunks += 1
-            self._read_summary(schemas, channels)
-            return []
-
-    def _read_summary(self, schemas: dict[int, Any], channels: dict[int, Any]) -> None:
-        """Take channels from the index at the end, for the messages behind a damaged chunk that declared them."""
-        from mcap.reader import make_reader
-
-        try:
-            with self.path.open("rb") as stream:
-                summary = make_reader(stream).get_summary()
-        except Exception:  # no index, no help
+    def _metadata(self, name: str, record: dict[str, str]) -> None:
+        if name != LOSS_RECORD:
             return
-        if summary is not None:
-            schemas.update(summary.schemas)
-            channels.update(summary.channels)
+        self.stop_reason = record.pop(STOPPED_EARLY_KEY, self.stop_reason)
+        try:
+            counted = {topic: int(count) for topic, count in record.items()}
+        except ValueError as error:
+            raise RecordingError(f"{self.path}: metadata {LOSS_RECORD!r}: {error}, expected counts") from error
+        self.lost = counted  # counted over the whole run: the newest part knows all
 
-    def _convert(self, record: Any, schemas: dict[int, Any], channels: dict[int, Any]) -> Iterator[Record]:
-        kind = type(record).__name__
-        if kind == "Schema":
-            schemas[record.id] = record
-        elif kind == "Channel":
-            channels[record.id] = record
-        elif kind == "Message" and record.channel_id in channels:
-            channel = channels[record.channel_id]
-            schema = schemas.get(channel.schema_id)
-            self.counts[channel.topic] += 1
-            if schema is not None and schema.name in MESSAGE_TYPES:
-                yield self._record(record, channel.topic, schema.name)
 
-    def _record(self, record: Any, topic: str, message_type: str) -> Record:
-        if topic in (self.header.samples_topic, self.header.entries_topic):
-            place = f"{self.path}: {topic} number {record.sequence}"
-            entry = from_message(decode(record.data, message_type), place)
-            return EntryRecord(record.sequence, record.log_time, entry)
-        return OutputRecord(record.sequence, record.log_time, record.publish_time, topic, message_type, record.data)
+class _Merger:
+    """Put journal and messages, which stand in any chunks, into one order."""
+
+    def __init__(self, reader: RunReader, outputs: bool) -> None:
+        self._run = reader
+        self._with_outputs = outputs
+        header = reader.header
+        self._journal = (header.samples_topic, header.entries_topic)
+        self._template = sample_template(header.frame_id)
+        self._entries = _NO_ENTRIES
+        self._outputs: list[Outputs] = []
+        self._base = 0
+        self._part = reader.path
+        self._chunks: ChunkReader | None = None
+        self._topics: dict[int, tuple[str, str]] = {}
+
+    def begin(self, part: Path, chunks: ChunkReader) -> None:
+        """Go on with the next part."""
+        self._part, self._chunks = part, chunks
+        self._topics = {}
+
+    def is_journal(self, part: Path, numbers: set[int]) -> bool:
+        """Tell whether one of these channels is the journal's."""
+        assert self._chunks is not None
+        return any(self._chunks.channels[number].topic in self._journal for number in numbers)
+
+    def add(self, messages: Messages) -> Iterator[Batch]:
+        """Take in a chunk and yield what is complete with it."""
+        assert self._chunks is not None
+        counts = np.bincount(messages.channel)
+        journal, sent, samples = [], [], -1
+        for number in np.flatnonzero(counts).tolist():
+            count = int(counts[number])
+            channel = self._chunks.channels.get(number)
+            if channel is None:
+                continue
+            self._run.counts[channel.topic] += count
+            if channel.topic in self._journal:
+                journal.append(number)
+                samples = number if channel.topic == self._journal[0] else samples
+            elif channel.message_type in MESSAGE_TYPES:
+                sent.append(number)
+                self._topics[number] = (channel.topic, channel.message_type)
+        if journal:
+            self._entries = self._entries.joined(self._read(_of(messages, journal), samples))
+        if sent and self._with_outputs:
+            chosen = _of(messages, sent)
+            self._outputs.append(Outputs(chosen, self._unwrap(chosen.sequence), dict(self._topics)))
+        if len(self._entries) < _LEAST and len(self._outputs) < _LEAST // 8:
+            return
+        newest = max((int(part.sequence.max()) for part in self._outputs), default=-1)
+        if not self._with_outputs or len(self._entries) > _PENDING:
+            newest = int(self._entries.sequence.max(initial=newest)) + 1
+        yield from self._take(newest)
+
+    def finish(self) -> Iterator[Batch]:
+        """Yield what is left."""
+        newest = max((int(part.sequence.max()) for part in self._outputs), default=-1)
+        yield from self._take(max(newest, int(self._entries.sequence.max(initial=-1))) + 1)
+
+    def _unwrap(self, sequence: Indexes) -> Indexes:
+        unwrapped: Indexes = self._base + (sequence - self._base + _HALF) % _WHOLE - _HALF
+        return unwrapped
+
+    def _take(self, end: int) -> Iterator[Batch]:
+        """Yield everything with a sequence number below `end`."""
+        ready = np.flatnonzero(self._entries.sequence >= end)
+        count = int(ready[0]) if ready.size else len(self._entries)
+        entries, self._entries = self._entries[:count], self._entries[count:]
+        outputs, kept = [], []
+        for part in self._outputs:
+            later = np.flatnonzero(part.sequence >= end)
+            place = int(later[0]) if later.size else len(part)
+            outputs += [part[:place]] if place else []
+            kept += [part[place:]] if place < len(part) else []
+        self._outputs = kept
+        if len(entries) or outputs:
+            yield Batch(entries, outputs)
+
+    def _read(self, messages: Messages, samples: int) -> Entries:
+        """Return the entries that journal messages stand for."""
+        sequence = self._unwrap(messages.sequence)
+        if len(sequence):
+            self._base = int(sequence[-1])
+        count, template = len(messages), self._template
+        is_sample = messages.channel == samples
+        stamps, numbers, good = np.zeros(count, np.int64), np.zeros((count, 6)), np.zeros(count, bool)
+        read_numbers(
+            messages.buffer, messages.start, messages.length, template.data, template.fixed, template.runs, stamps,
+            numbers, good,
+        )  # fmt: skip
+        wrench = numbers[:, [0, 1, 5]]
+        good &= is_sample & np.isfinite(wrench).all(axis=1)
+        others: dict[int, Entry | Dropped] = {}
+        for index in np.flatnonzero(~good).tolist():
+            topic, kind = self._journal[0 if is_sample[index] else 1], ""
+            assert self._chunks is not None
+            kind = self._chunks.channels[int(messages.channel[index])].message_type
+            place = f"{self._part}: {topic} number {int(messages.sequence[index])}"
+            entry = from_message(decode(messages.data(index), kind), place)
+            if isinstance(entry, Sample):
+                stamps[index], wrench[index], good[index] = entry.stamp_ns, entry.wrench, True
+            else:
+                others[index] = entry
+        return Entries(sequence, messages.log_time_ns, good, stamps, wrench, others)
+
+
+def _of(messages: Messages, channels: list[int]) -> Messages:
+    wanted = np.zeros(int(messages.channel.max(initial=0)) + 1, bool)
+    wanted[channels] = True
+    chosen = wanted[messages.channel]
+    return messages if chosen.all() else messages[np.flatnonzero(chosen)]
+
+
+def _in_order(batch: Batch) -> Iterator[Record]:
+    """Yield each entry and then the messages that were sent after it."""
+    sequences = [part.sequence for part in batch.outputs]
+    owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
+    places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
+    # messages before an entry of a higher number; the running maximum keeps odd files in their own order
+    bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
+    slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
+    order = np.argsort(slots, kind="stable")
+    ends = np.searchsorted(slots[order], np.arange(len(batch.entries) + 1), side="right")
+    begin = 0
+    for slot in range(len(batch.entries) + 1):
+        if slot:
+            yield batch.entries.record(slot - 1)
+        for index in order[begin : ends[slot]].tolist():
+            yield batch.outputs[int(owners[index])].record(int(places[index]))
+        begin = int(ends[slot])
+
+
+def sample_template(frame_id: str) -> Template:
+    """Return the template of the journal's samples: six numbers, force and torque."""
+
+    def build(values: NDArray[np.float64]) -> Message:
+        fx, fy, fz, mx, my, mz = values.tolist()
+        return WrenchStamped(0, frame_id, (fx, fy, fz), (mx, my, mz))
+
+    return Template.of(build, 6)
+
+
+def read_header(path: Path) -> RunHeader | None:
+    """Return the header of a file of ours, or None when it has none.
+
+    Raises
+    ------
+    RecordingError
+        The file is no MCAP file, or its header cannot be understood.
+    """
+    found: list[RunHeader] = []
+
+    def on_metadata(name: str, record: dict[str, str]) -> None:
+        if name == HEADER_RECORD:
+            found.append(RunHeader.from_record(record, str(path)))
+
+    for _ in ChunkReader(path, on_metadata):
+        break
+    return found[0] if found else None
+
+
+def run_parts(path: Path) -> list[Path]:
+    """Return the files of a recording given as its folder or as one file, in order.
+
+    Raises
+    ------
+    RecordingError
+        There are none.
+    """
+    if path.is_dir():
+        files = sorted(path.glob("*.mcap"), key=_part_number)
+        if not files:
+            raise RecordingError(f"{path}: got no .mcap file, expected a recording")
+        return files
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such recording, expected an .mcap file or its folder")
+    return [path]
 
 
 def mcap_path(path: Path) -> Path:
-    """Return the file of a recording given as its folder or as the file itself."""
-    if path.is_dir():
-        files = sorted(path.glob("*.mcap"))
-        if len(files) != 1:
-            raise RecordingError(f"{path}: got {len(files)} .mcap files, expected one")
-        return files[0]
-    if not path.is_file():
-        raise RecordingError(f"{path}: no such recording, expected an .mcap file or its folder")
-    return path
+    """Return the first file of a recording given as its folder or as one file."""
+    return run_parts(path)[0]
 
 
-def _open(path: Path) -> IO[bytes]:
-    try:
-        stream = path.open("rb")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    if stream.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
-        stream.close()
-        raise RecordingError(f"{path}: not an MCAP file (its first bytes are not {_MCAP_MAGIC!r})")
-    stream.seek(0)
-    return stream
+def _part_number(path: Path) -> tuple[int, str]:
+    digits = re.search(r"(\d+)$", path.stem)
+    return (int(digits[1]) if digits else -1, path.name)

@@ -1,7 +1,8 @@
-"""The recorder of a live node: takes entries and messages without ever waiting, writes them in a thread of its own.
+"""The recorder of a live node: takes entries and frames without ever waiting, writes them in a thread of its own.
 
-The caller's cost is a clock reading and an append. When the thread falls behind, what does not fit in the queue is
-dropped, counted by topic, and noted in the file at the place where it is missing.
+The caller's cost is a clock reading and an append. The thread looks at the queue some times a second, lays many
+messages into their chunk in one compiled call and compresses them: both hold no interpreter lock. When it falls behind,
+what does not fit in the queue is dropped, counted by topic, and noted in the file at the place where it is missing.
 """
 
 from __future__ import annotations
@@ -16,10 +17,14 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
+import numpy as np
+
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.stream.journal import Entry, Loss, Snapshot
+from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS
+from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
+from plow_twin.stream.outputs import Frame, Frames
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
@@ -27,10 +32,10 @@ if TYPE_CHECKING:
 #: Key of the journal in the loss counters.
 JOURNAL: Final = "journal"
 #: The thread looks at the queue that often [s].
-_POLL_S: Final = 0.01
-#: The thread sleeps after each so many items, so that a caller that waits for the interpreter gets it then and not
-#: after its switch interval of 5 ms. Releasing it without sleep does not do: the thread would take it back at once.
-_BURST: Final = 4
+_POLL_S: Final = 0.05
+#: So many items are put together in one go, some 0.2 ms of Python; then the thread sleeps, so that a caller that waits
+#: for the interpreter gets it. Releasing it without sleep does not do: the thread would take it back at once.
+_BURST: Final = 64
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,12 @@ class Recorder:
         Bytes [B] in one compressed chunk.
     min_free_bytes
         Recording stops when the disk has less free space [B].
+    part_bytes, part_s
+        A part of the recording is ended when it has that size [B] or spans that time [s]; 0: never.
+    keep_bytes
+        The oldest parts are removed when the ended ones are larger together [B]; 0: all are kept.
+    sync
+        Whether each flush waits for the disk (`fdatasync`): for a loss of power.
     now_ns
         Receive times [ns], read in the caller's thread.
     on_error
@@ -93,16 +104,25 @@ class Recorder:
         *,
         queue_size: int = 20_000,
         flush_period_s: float = 1.0,
-        chunk_size: int = 64 * 1024,
+        chunk_size: int = 1024 * 1024,
         min_free_bytes: int = 64 * 1024 * 1024,
+        part_bytes: int = 0,
+        part_s: float = 0.0,
+        keep_bytes: int = 0,
+        sync: bool = False,
         now_ns: Callable[[], int] = time.time_ns,
         on_error: Callable[[str], None] | None = None,
     ) -> None:
-        from plow_twin.record.writer import RunWriter
+        from plow_twin.record.writer import RunWriter, warm_up_writer
 
-        self._writer = RunWriter(Path(path), header, chunk_size, min_free_bytes)
+        warm_up_writer(header)
+        self._writer = RunWriter(Path(path), header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
-        self._queue: deque[_EntryItem | _OutputItem] = deque()
+        self._frame_topics = {name: header.topic(name) for name in FRAME_TOPICS}
+        self._limits = (part_bytes, part_s, keep_bytes)
+        self._split_due = False
+        self._part_since = time.monotonic()
+        self._queue: deque[_EntryItem | _OutputItem | _FrameItem] = deque()
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
@@ -125,8 +145,9 @@ class Recorder:
 
     @property
     def snapshot_wanted(self) -> bool:
-        """Something was lost and there is room again: journal a `Snapshot` now so that replay can go on from it."""
-        return self._snapshot_due and self._accepting and len(self._queue) < self._queue_size // 2
+        """Something was lost and there is room again, or a part ends: journal a `Snapshot` now to go on from."""
+        due = self._snapshot_due or self._split_due
+        return due and self._accepting and len(self._queue) < self._queue_size // 2
 
     @property
     def counters(self) -> RecorderCounters:
@@ -149,6 +170,7 @@ class Recorder:
                     self._journal_gap = 0
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot
+                self._split_due = self._split_due and not snapshot
                 return True
             self._snapshot_due = True
             if not (self._journal_gap and snapshot):
@@ -170,6 +192,28 @@ class Recorder:
             self._snapshot_due = True
             self._output_gaps[topic] += 1
             self._lost[topic] += 1
+            return False
+
+    def frame(self, frame: Frame) -> bool:
+        """Take all messages of a frame that was sent; False when they were lost."""
+        now = self._now_ns()
+        topics = self._frame_topics
+        with self._lock:
+            if self._room(1 + len(topics), self._queue_size * 3 // 4):
+                for name, topic in topics.items():
+                    gap = (
+                        self._output_gaps
+                        and (frame.slow or name not in SLOW_TOPICS)
+                        and self._output_gaps.pop(topic, 0)
+                    )
+                    if gap:
+                        self._push_entry(now, Dropped(topic, gap))
+                self._queue.append(_FrameItem(self._sequence, now, frame))
+                return True
+            self._snapshot_due = True
+            lost = [topic for name, topic in topics.items() if frame.slow or name not in SLOW_TOPICS]
+            self._output_gaps.update(lost)
+            self._lost.update(lost)
             return False
 
     def _room(self, items: int, limit: int) -> bool:
@@ -232,18 +276,70 @@ class Recorder:
 
     def _drain(self) -> None:
         backlog = len(self._queue)
-        burst = _BURST if backlog < self._queue_size // 10 else 16 * _BURST
-        for index in range(backlog):
-            item = self._queue.popleft()
-            self._unflushed[item.key] += 1
-            item.write(self._writer)
-            self._written += 1
-            if index % burst == 0:
-                time.sleep(1e-6)
+        while backlog > 0:
+            items = [self._queue.popleft() for _ in range(min(backlog, _BURST))]
+            backlog -= len(items)
+            for item in items:
+                self._unflushed.update(item.keys(self._frame_topics))
+            self._write(items)
+            self._written += len(items)
+            time.sleep(1e-6)
+
+    def _write(self, items: list[_EntryItem | _OutputItem | _FrameItem]) -> None:
+        """Write items in order, alike ones that follow each other at once; journal and outputs have orders apart."""
+        samples: list[_EntryItem] = []
+        frames: list[_FrameItem] = []
+        for item in items:
+            if isinstance(item, _FrameItem):
+                frames.append(item)
+            elif isinstance(item, _EntryItem) and isinstance(item.entry, Sample):
+                samples.append(item)
+            elif isinstance(item, _EntryItem):
+                samples = self._write_samples(samples)
+                if isinstance(item.entry, Snapshot) and self._part_is_full():
+                    frames = self._write_frames(frames)
+                    self._split()
+                item.write(self._writer)
+            else:
+                frames = self._write_frames(frames)
+                item.write(self._writer)
+        # samples first: their chunk must not be closed behind that of messages sent after them
+        self._write_samples(samples)
+        self._write_frames(frames)
+
+    def _write_samples(self, items: list[_EntryItem]) -> list[_EntryItem]:
+        if items:
+            sequence = np.array([item.sequence for item in items], np.int64)
+            times = np.array([item.log_time_ns for item in items], np.int64)
+            samples = [item.entry for item in items if isinstance(item.entry, Sample)]
+            stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
+            self._writer.write_samples(sequence, times, stamps, np.array([sample.wrench for sample in samples]))
+        return []
+
+    def _write_frames(self, items: list[_FrameItem]) -> list[_FrameItem]:
+        if items:
+            sequence = np.array([item.sequence for item in items], np.int64)
+            times = np.array([item.log_time_ns for item in items], np.int64)
+            self._writer.write_frames(sequence, times, Frames.of([item.frame for item in items]))
+        return []
+
+    def _part_is_full(self) -> bool:
+        part_bytes, part_s, _ = self._limits
+        full = bool(part_bytes) and self._writer.part_bytes >= part_bytes
+        return full or (part_s > 0.0 and time.monotonic() - self._part_since >= part_s)
+
+    def _split(self) -> None:
+        """Go on in a new part; the snapshot that is written next makes it self-contained."""
+        with self._lock:
+            lost = dict(self._lost)
+        self._writer.split(lost, self._limits[2])
+        self._part_since = time.monotonic()
 
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
+        if self._part_is_full():
+            self._split_due = True
         return self._writer.reason_to_stop()
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
@@ -254,7 +350,8 @@ class Recorder:
             self._error = self._error or f"{self.path}: recording stopped: {reason}"
             unwritten, self._queue = self._queue, deque()
             self._lost.update(unsafe)
-            self._lost.update(item.key for item in unwritten)
+            for item in unwritten:
+                self._lost.update(item.keys(self._frame_topics))
         if first and self._on_error is not None:
             self._on_error(self._error)
 
@@ -267,9 +364,8 @@ class _EntryItem:
     log_time_ns: int
     entry: Entry | Dropped
 
-    @property
-    def key(self) -> str:
-        return JOURNAL
+    def keys(self, frame_topics: Mapping[str, str]) -> list[str]:
+        return [JOURNAL]
 
     def write(self, writer: RunWriter) -> None:
         writer.write_entry(self.sequence, self.log_time_ns, self.entry)
@@ -281,9 +377,24 @@ class _OutputItem:
 
     sequence: int
     log_time_ns: int
-    key: str
+    topic: str
     stamp_ns: int
     message: Message
 
+    def keys(self, frame_topics: Mapping[str, str]) -> list[str]:
+        return [self.topic]
+
     def write(self, writer: RunWriter) -> None:
-        writer.write_output(self.key, self.sequence, self.log_time_ns, self.stamp_ns, self.message)
+        writer.write_output(self.topic, self.sequence, self.log_time_ns, self.stamp_ns, self.message)
+
+
+@dataclass(frozen=True, slots=True)
+class _FrameItem:
+    """A frame, all of whose messages are on their way to the file."""
+
+    sequence: int
+    log_time_ns: int
+    frame: Frame
+
+    def keys(self, frame_topics: Mapping[str, str]) -> list[str]:
+        return [topic for name, topic in frame_topics.items() if self.frame.slow or name not in SLOW_TOPICS]

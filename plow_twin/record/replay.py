@@ -10,28 +10,44 @@ import hashlib
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
+from plow_twin.advance import AdvanceSeries
 from plow_twin.errors import RecordingError
+from plow_twin.model.scene import Scene
 from plow_twin.record.cdr import decode, encode
+from plow_twin.record.chunks import scan
 from plow_twin.record.header import RunHeader, build_fingerprint
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.record.outputs import FRAME_TOPICS, frame_messages
-from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
+from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS, frame_messages, frame_numbers, frame_templates
+from plow_twin.record.reader import (
+    Batch,
+    Entries,
+    EntryRecord,
+    FileStatus,
+    OutputRecord,
+    Outputs,
+    RunReader,
+    sample_template,
+)
+from plow_twin.record.template import Bytes, Indexes, Template, differs, read_numbers
 from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot
+from plow_twin.stream.outputs import Frame, Frames
 from plow_twin.stream.session import Session
 from plow_twin.twin import Twin
+
+if TYPE_CHECKING:
+    from plow_twin.record.writer import RunWriter
 
 #: Topics that depend on the frame before: after a lost message they can be compared again from the next snapshot on.
 _CUMULATIVE: Final = frozenset({"contact_peaks", "clearance", "wear_rate"})
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
-_PROGRESS_EVERY: Final = 500
 
 #: Receives the share of the file that has been replayed, 0..1.
 ProgressCallback = Callable[[float], object]
@@ -95,15 +111,21 @@ class ReplayReport:
         return 1 if self.first_divergence is not None else 3 if self.loss else 0
 
 
-def replay(path: Path, on_progress: ProgressCallback | None = None) -> ReplayReport:
+def replay(
+    path: Path, on_progress: ProgressCallback | None = None, *, digests_only: bool = False, write: Path | None = None
+) -> ReplayReport:
     """Run a recording again and compare each digest and each message that follows from the journal, bit for bit.
 
     Parameters
     ----------
     path
-        The `.mcap` file or its folder.
+        The recording: its folder or one `.mcap` file.
     on_progress
-        Receives the share of the entries' bytes done, 0..1.
+        Receives the share of the recording's bytes done, 0..1.
+    digests_only
+        Compare the digests alone; messages are not even read where they stand in chunks of their own.
+    write
+        Folder for a full recording made of the journal: a frame after each advance. Only digests are compared then.
 
     Raises
     ------
@@ -113,26 +135,35 @@ def replay(path: Path, on_progress: ProgressCallback | None = None) -> ReplayRep
         The scene in the file is not usable.
     """
     reader = RunReader(Path(path))
-    run = _Replay(reader.header, ReplayReport(reader.path))
+    run = _Replay(reader.header, ReplayReport(reader.path), digests_only or write is not None)
+    if write is not None:
+        run.sink = _sink(write, reader.header)
     begin = time.perf_counter()
-    for index, record in enumerate(reader):
-        if isinstance(record, EntryRecord):
-            run.entry(record)
-        else:
-            run.output(record)
-        if on_progress is not None and index % _PROGRESS_EVERY == 0:
+    for batch in reader.batches(outputs=not digests_only):
+        run.batch(batch)
+        if on_progress is not None:
             on_progress(reader.position)
     if on_progress is not None:
         on_progress(1.0)
+    if run.sink is not None:
+        run.sink.close(reader.lost, reader.stop_reason)
     return run.finish(reader, time.perf_counter() - begin)
+
+
+def _sink(folder: Path, header: RunHeader) -> RunWriter:
+    from plow_twin.record.writer import RunWriter
+
+    full = replace(header, record_outputs="all", part=0, build=build_fingerprint())
+    return RunWriter(folder, full, chunk_size=2**20, min_free_bytes=0)
 
 
 class _Replay:
     """The state of one replay: a session, and whether it is where the live one was."""
 
-    def __init__(self, header: RunHeader, report: ReplayReport) -> None:
+    def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
         from plow_twin.scene_file import loads_scene
 
+        self.digests_only = digests_only
         self.header = header
         self.report = report
         here = build_fingerprint()
@@ -143,6 +174,11 @@ class _Replay:
         excitation: Any = "scene" if header.excitation_source == "scene" else "sampled"
         twin = Twin(scene, tol=header.tol, excitation=excitation)
         twin.warm_up()
+        self.templates = frame_templates(header.frame_id, header.child_frame_id)
+        if excitation == "sampled":
+            _warm_up(scene, header.tol, self.templates, rows=not digests_only)
+        self.sink: RunWriter | None = None
+        self.frames: Frames | None = None  # of the last run of samples; its last frame may have messages to come
         self.session = Session(twin, header.origin_ns)
         self.topics = {header.topic(name): name for name in FRAME_TOPICS}
         self.next_sequence = 0
@@ -154,6 +190,185 @@ class _Replay:
         self.gaps = 0
         self.noted: Counter[str] = Counter()  # losses, as noted at their place in the journal
 
+    def batch(self, batch: Batch) -> None:
+        """Apply and compare a batch: runs of samples at once, all else entry by entry."""
+        entries = batch.entries
+        sent = _Sent.of(batch.outputs, self.topics if self.sink is None else _other_topics(batch, self.topics))
+        count = len(entries)
+        breaks = np.ones(count, bool)  # entries that no run goes on into
+        breaks[1:] = np.diff(entries.sequence) != 1
+        breaks |= ~entries.sample
+        for index, entry in entries.others.items():
+            if isinstance(entry, Digest) and index and entries.sequence[index] - entries.sequence[index - 1] == 1:
+                breaks[index] = False
+            elif index + 1 < count:
+                breaks[index + 1] = True
+        ends = np.append(np.flatnonzero(breaks), count)
+        place = begin = 0
+        while place < count:
+            end = int(ends[np.searchsorted(ends, place, side="right")])
+            stop = sent.before(int(entries.sequence[place]))
+            self._messages(sent, begin, stop)
+            begin, stop = stop, sent.before(int(entries.sequence[end - 1]) + 1)
+            if self._is_run(entries, place) and self._run(entries[place:end], sent, begin, stop):
+                place, begin = end, stop
+                continue
+            for place in range(place, end):  # noqa: B020
+                stop = sent.before(int(entries.sequence[place]))
+                self._messages(sent, begin, stop)
+                self.entry(entries.record(place))
+                begin = stop
+            place = end
+        self._messages(sent, begin, len(sent))
+
+    def _is_run(self, entries: Entries, place: int) -> bool:
+        expected = (int(entries.sequence[place]) - self.next_sequence) & _SEQUENCE_MASK == 0
+        return self.synced and expected and bool(entries.sample[place]) and self.session.twin.excitation == "sampled"
+
+    def _messages(self, sent: _Sent, begin: int, end: int) -> None:
+        for index in range(begin, end):
+            self.output(sent.record(index))
+
+    def _run(self, entries: Entries, sent: _Sent, begin: int, end: int) -> bool:
+        """Apply a run of samples and digests at once and compare what was sent; False: nothing was done."""
+        done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
+        digests = sorted(entries.others)
+        stamps = entries.stamp_ns[entries.sample]
+        before = self.session.snapshot(), self.session.outputs.pending, self.session.origin_ns
+        try:
+            found = self.session.apply_samples(
+                stamps,
+                entries.wrench[entries.sample],
+                done[digests],
+                rows=not self.digests_only or self.sink is not None,
+            )
+        except ValueError:  # one by one: the sample that is refused is counted
+            return False
+        if found.status.any():
+            # a failed advance is no part of a frame
+            self.session.restore(*before)
+            return False
+        self.report.entries += len(entries)
+        self.report.samples += len(stamps)
+        self.report.steps += len(stamps)
+        self.resumed = False
+        self.first_ns = int(stamps[0]) if self.first_ns is None else self.first_ns
+        first_step = self.report.steps - len(stamps)
+        differences = [
+            (first_step + int(done[index]) - 1, digest.stamp_ns, "digest", "digest", digest.digest, computed)
+            for index, computed in zip(digests, found.digests, strict=True)
+            if isinstance(digest := entries.others[index], Digest) and digest.digest != computed
+        ]
+        self.report.digests_compared += len(digests)
+        self.next_sequence = (int(entries.sequence[-1]) + 1) & _SEQUENCE_MASK
+        self.messages, self.frames = None, None
+        if self.sink is not None and found.rows is not None:
+            self._write_run(entries, stamps, found.rows)
+            self._messages(sent, begin, end)
+        elif found.rows is not None:
+            differences += self._compare_sent(entries, sent, begin, end, stamps, found.rows, done, first_step)
+        for difference in sorted(differences, key=lambda found: found[0]):
+            self._note(Divergence(*difference))
+        return True
+
+    def _write_run(self, entries: Entries, stamps: Indexes, rows: AdvanceSeries) -> None:
+        """Write a run of samples and digests, and a frame after each sample."""
+        assert self.sink is not None
+        begin = 0
+        for end in (*sorted(entries.others), len(entries)):
+            part = slice(begin, end)
+            if end > begin:
+                self.sink.write_samples(
+                    entries.sequence[part], entries.log_time_ns[part], entries.stamp_ns[part], entries.wrench[part]
+                )
+            if end < len(entries):
+                record = entries.record(end)
+                self.sink.write_entry(record.sequence, record.log_time_ns, record.entry)
+            begin = end + 1
+        frames = self.session.outputs.take_rows(stamps, rows, np.arange(len(stamps)))
+        self.sink.write_frames(entries.sequence[entries.sample], entries.log_time_ns[entries.sample], frames)
+
+    def _write_entry(self, record: EntryRecord) -> None:
+        """Write an entry that has been applied, and the frame after it."""
+        assert self.sink is not None
+        entry = record.entry
+        if isinstance(entry, Snapshot) and self.synced:
+            entry = self.session.snapshot()  # with the windows of the frames that are written
+        self.sink.write_entry(record.sequence, record.log_time_ns, entry)
+        frame = self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold) else None
+        if frame is not None and frame.finite:
+            places = np.array([record.sequence]), np.array([record.log_time_ns])
+            self.sink.write_frames(*places, Frames.of([frame]))
+
+    def _compare_sent(
+        self,
+        entries: Entries,
+        sent: _Sent,
+        begin: int,
+        end: int,
+        stamps: Indexes,
+        rows: AdvanceSeries,
+        done: Indexes,
+        first_step: int,
+    ) -> list[tuple[int, int, str, str, str, str]]:
+        """Form the frames that were sent and compare their messages; return the differences."""
+        after = done[sent.sequence[begin:end] - entries.sequence[0]] - 1  # row after which each was sent
+        changed = np.ones(len(after), bool)
+        changed[1:] = after[1:] != after[:-1]
+        taken, frame = after[changed], np.cumsum(changed) - 1
+        frames = self.session.outputs.take_rows(stamps, rows, taken)
+        if len(taken) and taken[-1] == len(stamps) - 1:
+            self.frames = frames
+        numbers = frame_numbers(frames)
+        different: list[tuple[int, int]] = []
+        for name, indexes, buffer, starts, lengths in sent.by_topic(begin, end):
+            if name in _CUMULATIVE and not self.outputs_synced:
+                self.report.not_compared[name] += len(indexes)
+                continue
+            self.report.compared[name] += len(indexes)
+            row = frame[indexes - begin]
+            if name in SLOW_TOPICS:
+                slow = np.searchsorted(frames.slow_index, row)
+                absent = (
+                    frames.slow_index[np.minimum(slow, len(frames.slow_index) - 1)] != row
+                    if len(frames.slow_index)
+                    else np.ones(len(row), bool)
+                )
+                row = np.where(absent, -1, slow)
+            wrong = np.zeros(len(indexes), bool)
+            template = self.templates[name]
+            stamp, values = numbers[name]
+            present = np.flatnonzero(row >= 0)
+            wrong[row < 0] = True
+            if len(present) == len(row):
+                differs(
+                    buffer, starts, lengths, template.data, template.fixed, template.runs, row, stamp, values, wrong
+                )
+            elif present.size:
+                some = np.zeros(len(present), bool)
+                differs(
+                    buffer, starts[present], lengths[present], template.data, template.fixed, template.runs,
+                    row[present], stamp, values, some,
+                )  # fmt: skip
+                wrong[present] = some
+            different += [(int(index), int(frame[index - begin])) for index in indexes[wrong].tolist()]
+        found = []
+        for index, place in sorted(different):
+            record = sent.record(index)
+            where = self._difference(record, frames[place])
+            if where is not None:
+                step = first_step + int(taken[place])
+                found.append((step, record.publish_time_ns, self.topics[record.topic], *where))
+        return found
+
+    def _difference(self, record: OutputRecord, frame: Frame) -> tuple[str, str, str] | None:
+        """Return what differs between a recorded message and that of a frame, computed as the node does."""
+        name = self.topics[record.topic]
+        computed = frame_messages(frame, self.header.frame_id, self.header.child_frame_id).get(name)
+        if computed is None:
+            return "message", "a message", "none"
+        return None if encode(computed) == record.data else _first_difference(record, computed)
+
     def entry(self, record: EntryRecord) -> None:
         """Apply or compare one entry of the journal."""
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
@@ -164,7 +379,7 @@ class _Replay:
             self.synced = self.outputs_synced = True  # a journal that starts at the scene's own initial state
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one frame
-            self.messages = None
+            self.messages = self.frames = None
         self.report.entries += 1
         match record.entry:
             case Loss(count):
@@ -182,6 +397,8 @@ class _Replay:
             case entry:
                 if self.synced:
                     self._apply(entry)
+        if self.sink is not None:
+            self._write_entry(record)
 
     def _apply(self, entry: Any) -> None:
         self.report.samples += isinstance(entry, Sample)
@@ -207,11 +424,17 @@ class _Replay:
             raise RecordingError(f"{self.report.path}: snapshot at {snapshot.stamp_ns} ns: {error}") from error
         if before is not None:  # only messages were lost: the motion must be the same
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
-        self.synced = self.outputs_synced = self.resumed = True
+        self.synced = self.resumed = True
+        self.outputs_synced = not self.digests_only  # without messages nobody takes the outputs' windows
 
     def output(self, record: OutputRecord) -> None:
         """Compare one recorded message with the one that the model gives at that place."""
         name = self.topics.get(record.topic)
+        if self.sink is not None:
+            if name is None:  # another topic goes over as it is
+                place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
+                self.sink.write_output(*place, record.message())
+            return
         if name is None:
             return
         here = (self.next_sequence - 1) & _SEQUENCE_MASK
@@ -219,7 +442,8 @@ class _Replay:
             self.report.not_compared[name] += 1
             return
         if self.messages is None:  # the first message of a frame
-            frame = self.session.outputs.take()
+            frame = self.frames[len(self.frames) - 1] if self.frames else self.session.outputs.take()
+            self.frames = None
             frames = (self.header.frame_id, self.header.child_frame_id)
             self.messages = {} if frame is None else frame_messages(frame, *frames)
         computed = self.messages.get(name)
@@ -237,10 +461,12 @@ class _Replay:
             self._diverged(topic, stamp_ns, name, recorded, computed)
 
     def _diverged(self, topic: str, stamp_ns: int, name: str, recorded: str, computed: str) -> None:
+        self._note(Divergence(self.report.steps - 1, stamp_ns, topic, name, recorded, computed))
+
+    def _note(self, divergence: Divergence) -> None:
         self.report.divergences += 1
         if self.report.first_divergence is None:
-            step = self.report.steps - 1
-            self.report.first_divergence = Divergence(step, stamp_ns, topic, name, recorded, computed)
+            self.report.first_divergence = divergence
 
     def finish(self, reader: RunReader, wall_s: float) -> ReplayReport:
         """Complete the report once the file has been read."""
@@ -253,6 +479,89 @@ class _Replay:
         if self.first_ns is not None and self.session.stamp_ns is not None:
             report.span_s = (self.session.stamp_ns - self.first_ns) * 1e-9
         return report
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """Messages that follow from the motion, of many chunks, in order: places are indexes into all of them."""
+
+    parts: list[Outputs]
+    sequence: Indexes
+    part: Indexes
+    place: Indexes
+    topic: Indexes
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
+        """Take the messages on `topics` (base names by topic); others are passed over."""
+        names = tuple(topics.values())
+        columns: list[tuple[Indexes, Indexes, Indexes, Indexes]] = []
+        for number, part in enumerate(outputs):
+            lookup = np.full(int(part.messages.channel.max(initial=0)) + 1, -1)
+            for channel, (topic, _) in part.topics.items():
+                if topic in topics and channel < len(lookup):
+                    lookup[channel] = names.index(topics[topic])
+            topic_numbers = lookup[part.messages.channel]
+            chosen = np.flatnonzero(topic_numbers >= 0)
+            columns.append((part.sequence[chosen], np.full(len(chosen), number), chosen, topic_numbers[chosen]))
+        empty = np.zeros(0, np.int64)
+        joined = [np.concatenate(column) for column in zip(*columns, strict=True)] if columns else [empty] * 4
+        if joined[0].size and (joined[0][1:] < joined[0][:-1]).any():
+            order = np.argsort(joined[0], kind="stable")
+            joined = [column[order] for column in joined]
+        return cls(outputs, joined[0], joined[1], joined[2], joined[3], names)
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def before(self, sequence: int) -> int:
+        """Return the number of messages sent before the entry with this number."""
+        return int(np.searchsorted(self.sequence, sequence))
+
+    def record(self, index: int) -> OutputRecord:
+        """Return one message."""
+        return self.parts[int(self.part[index])].record(int(self.place[index]))
+
+    def by_topic(self, begin: int, end: int) -> Iterator[tuple[str, Indexes, Bytes, Indexes, Indexes]]:
+        """Yield base name, indexes, and buffer, starts and lengths, for each topic of each chunk."""
+        for number in range(int(self.part[begin]), int(self.part[end - 1]) + 1) if end > begin else ():
+            first, last = np.searchsorted(self.part[begin:end], (number, number + 1)) + begin
+            messages, topic = self.parts[number].messages, self.topic[first:last]
+            for kind, name in enumerate(self.names):
+                indexes = first + np.flatnonzero(topic == kind)
+                if indexes.size:
+                    places = self.place[indexes]
+                    yield name, indexes, messages.buffer, messages.start[places], messages.length[places]
+
+
+def _other_topics(batch: Batch, topics: Mapping[str, str]) -> dict[str, str]:
+    """Return the topics of a batch that do not follow from the motion, under themselves."""
+    present = (topic for part in batch.outputs for topic, _ in part.topics.values())
+    return {topic: topic for topic in present if topic not in topics}
+
+
+def _warm_up(scene: Scene, tol: float, templates: Mapping[str, Template], *, rows: bool) -> None:
+    """Compile what a replay needs, so that its time is that of the work."""
+    twin = Twin(scene, tol=tol, excitation="sampled")
+    stamps = np.arange(1, 3, dtype=np.int64) * 1000
+    session = Session(twin)
+    done = session.apply_samples(stamps, np.zeros((2, 3)), np.array([1]), rows=rows)
+    table, others = np.empty((6, 2), np.int64), np.empty(2, np.int64)
+    template = sample_template("")
+    scan(np.frombuffer(bytes(8), np.uint8), table, others)
+    places = np.zeros(1, np.int64)
+    buffer = np.frombuffer(bytes(8), np.uint8)
+    numbers, flags = np.zeros((1, 6)), np.zeros(1, bool)
+    read_numbers(
+        buffer, places, places, template.data, template.fixed, template.runs, places.copy(), numbers, flags
+    )  # fmt: skip
+    if done.rows is not None:
+        for name, (stamp, values) in frame_numbers(session.outputs.take_rows(stamps, done.rows, np.arange(2))).items():
+            template = templates[name]
+            differs(
+                buffer, places, places, template.data, template.fixed, template.runs, places, stamp, values, flags
+            )  # fmt: skip
 
 
 def _hash(data: bytes) -> str:

@@ -1,124 +1,240 @@
-"""One recording on disk: `run/run_0.mcap` with `run/metadata.yaml` beside it, written from a single thread."""
+"""One recording on disk: `run/run_0.mcap`, `run/run_1.mcap`, ... with `run/metadata.yaml`, written from one thread."""
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from mcap.writer import Writer
+import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
+from plow_twin.record.chunks import MESSAGE_HEAD
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, to_message
-from plow_twin.record.messages import Message
-from plow_twin.record.metadata_yaml import TopicCount, bag_metadata, qos_text, write_metadata
+from plow_twin.record.mcap_file import ChunkBuilder, McapFile
+from plow_twin.record.messages import Message, WrenchStamped
+from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
+from plow_twin.record.outputs import SLOW_TOPICS, frame_numbers, frame_templates, head_numbers
+from plow_twin.record.reader import sample_template
+from plow_twin.record.template import Indexes
 from plow_twin.stream.journal import Entry, Sample
+from plow_twin.stream.outputs import Frames
 
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
+
+
+@dataclass
+class _Part:
+    """One file of the recording."""
+
+    path: Path
+    file: McapFile
+    channels: dict[str, tuple[int, str]] = field(default_factory=dict)
+
+    def facts(self) -> PartFacts:
+        counts = [
+            TopicCount(topic, message_type, self.file.counts[number])
+            for topic, (number, message_type) in self.channels.items()
+        ]
+        return PartFacts(self.path.name, *self.file.times, counts)
 
 
 class RunWriter:
     """Write entries and outputs in the order given.
 
-    Every method may raise `OSError` (disk full); after that only `abandon` may be called.
+    The journal and the outputs stand in chunks of their own, a chunk of the journal before that of what was sent after
+    its entries. Every method may raise `OSError` (disk full); after that only `abandon` may be called.
 
     Parameters
     ----------
     folder
         Made by the writer; must not exist or be empty.
     chunk_size
-        Bytes [B] in one compressed chunk.
+        Bytes [B] of journal and outputs at which their chunks are closed.
     min_free_bytes
         `reason_to_stop` speaks up when the disk has less free space [B] than that.
+    sync
+        Whether each flush also asks the disk.
     """
 
-    def __init__(self, folder: Path, header: RunHeader, chunk_size: int, min_free_bytes: int) -> None:
+    def __init__(
+        self, folder: Path, header: RunHeader, chunk_size: int, min_free_bytes: int, *, sync: bool = False
+    ) -> None:
         self.folder = folder
         self.header = header
         self.path = folder / f"{folder.name}_0.mcap"
+        self._chunk_size = chunk_size
         self._min_free_bytes = min_free_bytes
-        self._topics: dict[str, tuple[int, TopicCount]] = {}
-        self._schemas: dict[str, int] = {}
-        self._start_ns, self._end_ns = -1, -1
+        self._sync = sync
+        self._journal, self._outputs = ChunkBuilder("zstd"), ChunkBuilder("lz4")
+        self._sample = sample_template(header.frame_id)
+        self._frames = frame_templates(header.frame_id, header.child_frame_id)
+        self._done: list[PartFacts] = []
+        self._bytes_before = 0
         warm_up()
         _make_folder(folder)
-        self._file = _UnbufferedFile(self.path)
-        # the library's stream is an IO[bytes] by annotation, but only write, tell and flush are used
-        self._mcap = Writer(self._file, chunk_size=chunk_size)  # type: ignore[arg-type]
-        self._mcap.start(profile="ros2", library=f"plow_twin {header.package_version}")
-        self._mcap.add_metadata(HEADER_RECORD, header.to_record())
+        self._number = 0
+        self._part = self._open()
+
+    def _open(self) -> _Part:
+        path = self.folder / f"{self.folder.name}_{self._number}.mcap"
+        file = McapFile(path, f"plow_twin {self.header.package_version}")
+        file.metadata(HEADER_RECORD, {**self.header.to_record(), "part": str(self._number)})
+        return _Part(path, file)
 
     @property
     def bytes_written(self) -> int:
-        """Size of the file so far [B]."""
-        return self._file.tell()
+        """Size of all parts so far [B]."""
+        return self._bytes_before + self._part.file.size
+
+    @property
+    def part_bytes(self) -> int:
+        """Size of the part that is being written [B]."""
+        return self._part.file.size
 
     def write_entry(self, sequence: int, log_time_ns: int, entry: Entry | Dropped) -> None:
         """Write one journal entry under its place in the common order."""
         topic = self.header.samples_topic if isinstance(entry, Sample) else self.header.entries_topic
         stamp_ns = getattr(entry, "stamp_ns", log_time_ns)
-        self._write(topic, sequence, log_time_ns, stamp_ns, to_message(entry, self.header.frame_id))
+        self._write(self._journal, topic, sequence, log_time_ns, stamp_ns, to_message(entry, self.header.frame_id))
+
+    def write_samples(
+        self, sequence: Indexes, log_time_ns: Indexes, stamp_ns: Indexes, wrench: NDArray[np.float64]
+    ) -> None:
+        """Write many samples of the journal."""
+        numbers = np.zeros((len(stamp_ns), 6))
+        numbers[:, [0, 1, 5]] = wrench
+        length = MESSAGE_HEAD + len(self._sample)
+        starts = self._journal.reserve(length * len(stamp_ns)) + length * np.arange(len(stamp_ns))
+        channel = self._channel(self.header.samples_topic, WrenchStamped.TYPE)
+        self._journal.add_many(
+            channel, self._sample, starts, sequence & _SEQUENCE_MASK, np.maximum(log_time_ns, 0), stamp_ns, numbers
+        )
+        self._close_full_chunks()
+
+    def write_frames(self, sequence: Indexes, log_time_ns: Indexes, frames: Frames) -> None:
+        """Write the messages of many frames, each sent after journal entry number `sequence`."""
+        log_time_ns = np.maximum(log_time_ns, 0)
+        numbers = frame_numbers(frames)
+        everywhere = np.arange(len(frames))
+        rows = {name: frames.slow_index if name in SLOW_TOPICS else everywhere for name in numbers}
+        sizes = np.zeros(len(frames), np.int64)
+        places = {}
+        for name, row in rows.items():
+            places[name] = sizes[row].copy()
+            sizes[row] += MESSAGE_HEAD + len(self._frames[name])
+        ends = np.cumsum(sizes)
+        begin = self._outputs.reserve(int(ends[-1])) if len(frames) else 0
+        for name, row in rows.items():
+            if not len(row):
+                continue
+            stamps, values = numbers[name]
+            template = self._frames[name]
+            channel = self._channel(self.header.topic(name), template.message_type)
+            starts = begin + (ends - sizes)[row] + places[name]
+            self._outputs.add_many(
+                channel, template, starts, sequence[row] & _SEQUENCE_MASK, log_time_ns[row], stamps, values
+            )
+        self._close_full_chunks()
 
     def write_output(self, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message) -> None:
         """Write one message that the node sent after journal entry number `sequence`."""
-        self._write(topic, sequence, log_time_ns, stamp_ns, message)
+        self._write(self._outputs, topic, sequence, log_time_ns, stamp_ns, message)
 
-    def _write(self, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message) -> None:
+    def _write(
+        self, chunk: ChunkBuilder, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message
+    ) -> None:
         # MCAP times are unsigned; the exact stamp is in the message
         log_time_ns, stamp_ns = max(0, log_time_ns), max(0, stamp_ns)
-        data = encode(message)
-        channel, counter = self._topics.get(topic) or self._add_topic(topic, message.TYPE)
-        if counter.message_type != message.TYPE:
-            raise RecordingError(f"{topic}: got a {message.TYPE}, expected a {counter.message_type} as before")
-        self._mcap.add_message(channel, log_time_ns, data, stamp_ns, sequence & _SEQUENCE_MASK)
-        counter.count += 1
-        self._start_ns = log_time_ns if self._start_ns < 0 else min(self._start_ns, log_time_ns)
-        self._end_ns = max(self._end_ns, log_time_ns)
+        channel = self._channel(topic, message.TYPE)
+        chunk.add(channel, sequence & _SEQUENCE_MASK, log_time_ns, stamp_ns, encode(message))
+        self._close_full_chunks()
 
-    def _add_topic(self, topic: str, message_type: str) -> tuple[int, TopicCount]:
-        schema = self._schemas.get(message_type)
-        if schema is None:
-            schema = self._mcap.register_schema(message_type, "ros2msg", schema_text(message_type).encode())
-            self._schemas[message_type] = schema
-        qos = {"offered_qos_profiles": qos_text(message_type), "topic_type_hash": type_hash(message_type)}
-        channel = self._mcap.register_channel(topic, "cdr", schema, qos)
-        self._topics[topic] = (channel, TopicCount(topic, message_type))
-        return self._topics[topic]
+    def _channel(self, topic: str, message_type: str) -> int:
+        known = self._part.channels.get(topic)
+        if known is None:
+            qos = {"offered_qos_profiles": qos_text(message_type), "topic_type_hash": type_hash(message_type)}
+            number = self._part.file.channel(topic, message_type, schema_text(message_type).encode(), qos)
+            known = self._part.channels[topic] = (number, message_type)
+        if known[1] != message_type:
+            raise RecordingError(f"{topic}: got a {message_type}, expected a {known[1]} as before")
+        return known[0]
+
+    def _close_full_chunks(self) -> None:
+        if self._journal.size + self._outputs.size >= self._chunk_size:
+            self._close_chunks()
+
+    def _close_chunks(self) -> None:
+        self._part.file.chunk(self._journal)
+        self._part.file.chunk(self._outputs)
 
     def flush(self) -> None:
         """Hand all that was written to the operating system; a killed process loses nothing of it."""
-        self._mcap.flush()  # type: ignore[no-untyped-call]
+        self._close_chunks()
+        if self._sync:
+            self._part.file.sync()
 
     def reason_to_stop(self) -> str | None:
         """Return why recording should end now, while the file can still be closed: little disk space, or file gone."""
-        if not self._file.is_linked():
+        if not self._part.file.is_linked():
             return "the file was removed or replaced"
         free = shutil.disk_usage(self.folder).free
         if free < self._min_free_bytes:
             return f"{free} B free on the disk, expected at least {self._min_free_bytes} B"
         return None
 
+    def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
+        """Go on in a new part, which is opened before the old one is closed.
+
+        Whoever asks must write a snapshot next. With `keep_bytes` the oldest parts are removed while all are larger.
+        """
+        self._close_chunks()
+        old, self._number = self._part, self._number + 1
+        self._part = self._open()
+        self._finish(old, {topic: str(count) for topic, count in loss.items()})
+        if keep_bytes:
+            self._remove_oldest(keep_bytes)
+
+    def _remove_oldest(self, keep_bytes: int) -> None:
+        while self._done:
+            sizes = {facts.name: _size(self.folder / facts.name) for facts in self._done}
+            if sum(sizes.values()) <= keep_bytes:
+                return
+            (self.folder / self._done.pop(0).name).unlink(missing_ok=True)
+
+    def _finish(self, part: _Part, record: Mapping[str, str]) -> None:
+        part.file.metadata(LOSS_RECORD, record)
+        part.file.finish()
+        part.file.close()
+        self._bytes_before += part.file.size
+        self._done.append(part.facts())
+
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
         """Write the loss counters, why recording ended before the run (if it did), the index and `metadata.yaml`."""
         record = {topic: str(count) for topic, count in loss.items()}
-        custom = {f"plow_twin_lost {topic}": count for topic, count in record.items()}
+        custom: dict[str, str] = {f"plow_twin_lost {topic}": count for topic, count in record.items()}
         if stop_reason is not None:
             record[STOPPED_EARLY_KEY] = custom[f"plow_twin_{STOPPED_EARLY_KEY}"] = stop_reason
-        self._mcap.flush()  # type: ignore[no-untyped-call]
-        self._mcap.add_metadata(LOSS_RECORD, record)
-        self._mcap.finish()  # type: ignore[no-untyped-call]
-        self._file.close()
-        topics = [counter for _, counter in self._topics.values()]
-        start, end = max(0, self._start_ns), max(0, self._end_ns)
-        write_metadata(self.folder, bag_metadata(self.path.name, topics, start, end, custom))
+        self._close_chunks()
+        self._finish(self._part, record)
+        self._bytes_before -= self._part.file.size
+        write_metadata(self.folder, bag_metadata(self._done, custom))
 
     def abandon(self) -> None:
         """Leave the file as it is, without an index: after an error."""
-        self._file.close()
+        self._part.file.close()
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
 
 
 def _make_folder(folder: Path) -> None:
@@ -130,43 +246,13 @@ def _make_folder(folder: Path) -> None:
         raise RecordingError(f"{folder}: cannot be made: {error.strerror}") from error
 
 
-class _UnbufferedFile:
-    """A file that holds nothing back, so that nothing is left to fail a second time when the disk is full.
-
-    The MCAP writer hands over whole chunks, which need no buffer.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        try:
-            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            raise RecordingError(f"{path}: cannot be made: {error.strerror}") from error
-        self._offset = 0
-        self._open = True
-
-    def write(self, data: bytes) -> int:
-        view = memoryview(data)
-        while view:
-            count = os.write(self._descriptor, view)
-            self._offset += count
-            view = view[count:]
-        return len(data)
-
-    def tell(self) -> int:
-        return self._offset
-
-    def flush(self) -> None:
-        """Do nothing: every write has reached the operating system."""
-
-    def is_linked(self) -> bool:
-        """Tell whether the path still leads to this file."""
-        try:
-            return os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
-        except FileNotFoundError:
-            return False
-
-    def close(self) -> None:
-        if self._open:
-            self._open = False
-            os.close(self._descriptor)
+def warm_up_writer(header: RunHeader) -> None:
+    """Compile what lays messages into chunks, so that no compiler runs beside the first samples."""
+    templates: dict[str, Any] = {"sample": sample_template(header.frame_id)}
+    templates |= frame_templates(header.frame_id, header.child_frame_id)
+    one = np.zeros(1, np.int64)
+    for template in templates.values():
+        builder = ChunkBuilder("zstd")
+        builder.reserve(MESSAGE_HEAD + len(template))
+        builder.add_many(1, template, one, one, one, one, np.zeros((1, template.count)))
+    head_numbers(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 7)))

@@ -11,7 +11,6 @@ from typing import Final
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
-from plow_twin.record.outputs import frame_messages
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
 from plow_twin.ros.diagnostics import Part
 from plow_twin.ros.parameters import Settings
@@ -49,7 +48,6 @@ class Recording:
         clock: Callable[[], int] | None,
         on_error: Callable[[str], None],
     ) -> None:
-        self._frames = (settings.frame_id, settings.child_frame_id)
         self._topics = topics
         header = RunHeader(
             scene_yaml=dump_scene(scene),
@@ -86,8 +84,7 @@ class Recording:
 
     def frame(self, frame: Frame) -> None:
         """Take the messages of a frame that has been published."""
-        for topic, message in frame_messages(frame, *self._frames).items():
-            self._recorder.output(self._topics[topic], frame.stamp_ns, message)
+        self._recorder.frame(frame)
 
     def status(self, stamp_ns: int, name: str, hardware_id: str, report: Part) -> None:
         """Take a status that has been published."""

@@ -71,14 +71,61 @@ class Frame:
         return math.isfinite(total)
 
 
+@dataclass(frozen=True)
+class Frames:
+    """Many frames: the fields of `Frame` with a leading axis (n,); the slow parts of the frames `slow_index` (m,)."""
+
+    stamp_ns: NDArray[np.int64]
+    penetration: Array
+    rate: Array
+    force: Array
+    touches: NDArray[np.int64]
+    impulse: Array
+    peak: Array
+    q: Array
+    v: Array
+    slow_index: NDArray[np.int64]
+    clearance: Array
+    wear_rate: Array
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def __getitem__(self, index: int) -> Frame:
+        place = int(np.searchsorted(self.slow_index, index))
+        slow = place < len(self.slow_index) and self.slow_index[place] == index
+        return Frame(
+            stamp_ns=int(self.stamp_ns[index]),
+            **{name: getattr(self, name)[index] for name in _ARRAYS},
+            slow=Slow(self.clearance[place], self.wear_rate[place]) if slow else None,
+        )
+
+    @classmethod
+    def of(cls, frames: Sequence[Frame]) -> Frames:
+        """Put frames together."""
+        slow = [(index, frame.slow) for index, frame in enumerate(frames) if frame.slow is not None]
+        arrays = {name: np.stack([getattr(frame, name) for frame in frames]) for name in _ARRAYS}
+        return cls(
+            stamp_ns=np.array([frame.stamp_ns for frame in frames], np.int64),
+            **arrays,
+            slow_index=np.array([index for index, _ in slow], np.int64),
+            clearance=np.array([part.clearance for _, part in slow]).reshape(-1, len(CLEARANCE_NAMES)),
+            wear_rate=np.array([part.wear_rate for _, part in slow]).reshape(-1, PAIR_COUNT),
+        )
+
+
+_ARRAYS: Final = ("penetration", "rate", "force", "touches", "impulse", "peak", "q", "v")
+
+
 def clearances(scene: Scene, depth: Array) -> Array:
-    """Return total horizontal and vertical clearance and the eight pad depths, shape (10,) [m].
+    """Return total horizontal and vertical clearance and the eight pad depths, shape (..., 10) [m], from (..., 8).
 
     A side's walls move out by the mean depth of the two pads on it.
     """
-    horizontal = scene.clearance.horizontal_m + depth[_LEFT].mean() + depth[_RIGHT].mean()
-    vertical = scene.clearance.vertical_m + depth[_TOP].mean() + depth[_BOTTOM].mean()
-    return np.concatenate(((horizontal, vertical), depth))
+    left, right, top, bottom = (depth[..., side].mean(axis=-1) for side in (_LEFT, _RIGHT, _TOP, _BOTTOM))
+    horizontal = scene.clearance.horizontal_m + left + right
+    vertical = scene.clearance.vertical_m + top + bottom
+    return np.concatenate((np.stack((horizontal, vertical), axis=-1), depth), axis=-1)
 
 
 def prior_points(scene: Scene, depth: Array) -> tuple[Array, Array]:
@@ -128,6 +175,15 @@ class Outputs:
         self._impulse = np.add.reduce(np.concatenate((self._impulse[None], series.impulse[good])), axis=0)
         np.maximum(self._peak, series.peak[good].max(axis=0), out=self._peak)
 
+    @property
+    def pending(self) -> tuple[int, Advance] | None:
+        """Stamp and advance that the next frame shows, None when there is none since the last."""
+        return None if self._advance is None else (self._stamp_ns, self._advance)
+
+    def set_pending(self, pending: tuple[int, Advance] | None) -> None:
+        """Go back to what `pending` was: `state` does not hold it."""
+        self._stamp_ns, self._advance = (self._stamp_ns, None) if pending is None else pending
+
     def restart(self) -> None:
         """Forget what has not been published; the touches go on counting."""
         self._advance = None
@@ -155,6 +211,69 @@ class Outputs:
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
         return frame
+
+    def take_rows(self, stamps: NDArray[np.int64], rows: AdvanceSeries, taken: NDArray[np.int64]) -> Frames:
+        """Take in good advances that ended at `stamps`, with a frame after each of the rising numbers of rows `taken`.
+
+        The same bits as `add` for each row and `take` after those rows.
+        """
+        first = np.concatenate(([0], taken[:-1] + 1)) if len(taken) else taken
+        impulse, peak = rows.impulse[first] + 0.0, rows.peak[first].copy()
+        if len(taken):
+            impulse[0] = self._impulse + rows.impulse[0]
+            np.maximum(self._peak, rows.peak[0], out=peak[0])
+        lengths = taken - first
+        for offset in range(1, int(lengths.max(initial=0)) + 1):
+            longer = np.flatnonzero(lengths >= offset)
+            impulse[longer] += rows.impulse[first[longer] + offset]
+            peak[longer] = np.maximum(peak[longer], rows.peak[first[longer] + offset])
+        touches = self._touches + np.cumsum(rows.makes, axis=0)
+        slow_index, clearance, wear_rate = self._slow_rows(stamps[taken], rows.wear_depth[taken])
+        frames = Frames(
+            stamp_ns=stamps[taken],
+            penetration=rows.penetration[taken],
+            rate=rows.rate[taken],
+            force=rows.force[taken],
+            touches=touches[taken],
+            impulse=impulse,
+            peak=peak,
+            q=rows.q[taken],
+            v=rows.v[taken],
+            slow_index=slow_index,
+            clearance=clearance,
+            wear_rate=wear_rate,
+        )
+        self._touches, self._stamp_ns = touches[-1].copy(), int(stamps[-1])
+        begin = int(taken[-1]) + 1 if len(taken) else 0
+        if len(taken):
+            self._impulse, self._peak = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
+        left = np.concatenate((self._impulse[None], rows.impulse[begin:]))
+        self._impulse = np.add.accumulate(left)[-1].copy()
+        self._peak = np.maximum(self._peak, rows.peak[begin:].max(axis=0, initial=0.0))
+        self._advance = rows[len(stamps) - 1] if begin < len(stamps) else None
+        return frames
+
+    def _slow_rows(self, stamps: NDArray[np.int64], depth: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Return which of some frames have a slow part, and the parts."""
+        before_ns, depth_before = self._slow_ns, self._slow_depth
+        spans = stamps // SLOW_PERIOD_NS
+        changed = np.ones(len(stamps), bool)
+        changed[1:] = spans[1:] != spans[:-1]
+        if before_ns is not None and len(stamps):
+            changed[0] = spans[0] != before_ns // SLOW_PERIOD_NS
+        index = np.flatnonzero(changed)
+        if not index.size:
+            return index, np.zeros((0, len(CLEARANCE_NAMES))), np.zeros((0, PAIR_COUNT))
+        stamps, depth = stamps[index], depth[index]
+        elapsed_s, grown = np.ones(len(stamps)), np.zeros(depth.shape)
+        elapsed_s[1:], grown[1:] = np.diff(stamps) * 1e-9, np.diff(depth, axis=0)
+        if before_ns is not None:
+            elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, depth[0] - depth_before
+        self._slow_ns, self._slow_depth = int(stamps[-1]), depth[-1].copy()
+        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, depth))
+        intervals = np.stack((low, high), axis=-1).reshape(len(depth), -1)
+        clearance = np.concatenate((clearances(self._scene, depth), intervals), axis=-1)
+        return index, clearance, grown / elapsed_s[:, None]
 
     def _slow_part(self, depth: Array) -> Slow | None:
         before_ns = self._slow_ns

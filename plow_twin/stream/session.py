@@ -6,12 +6,16 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset, Sample, Snapshot, Travel
 from plow_twin.stream.outputs import Outputs
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from plow_twin.advance import Advance, AdvanceSeries
-    from plow_twin.twin import Twin
+    from plow_twin.twin import MarkedAdvance, Twin
 
 #: A digest follows each so many advances.
 DIGEST_INTERVAL: Final = 100
@@ -146,6 +150,39 @@ class Session:
         if self._advances % DIGEST_INTERVAL == 0:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
         return series
+
+    def apply_samples(
+        self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], marks: NDArray[np.int64], *, rows: bool = True
+    ) -> MarkedAdvance:
+        """Apply many samples at once for a replay: nothing is emitted, and `outputs` is left to the caller.
+
+        Parameters
+        ----------
+        stamps : ndarray of int64, shape (n,)
+            Never falling, the first not before the time reached [ns].
+        wrench : ndarray, shape (n, 3)
+        marks, rows
+            As of `Twin.advance_marked`.
+
+        Raises
+        ------
+        ValueError
+            A sample cannot be applied; the motion is unchanged then.
+        """
+        reached = self.stamp_ns if self.stamp_ns is not None else int(stamps[0])
+        if stamps[0] < reached or (stamps[1:] < stamps[:-1]).any():
+            raise ValueError(f"stamp: expected stamps that do not fall, from {reached} ns on")
+        origin = int(stamps[0]) if self.origin_ns is None else self.origin_ns
+        done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows)
+        self.origin_ns, self.stamp_ns = origin, int(stamps[-1])
+        self._advances += len(stamps)
+        return done
+
+    def restore(self, snapshot: Snapshot, pending: tuple[int, Advance] | None, origin_ns: int | None) -> None:
+        """Go back to a snapshot, with what the next frame then was to show (`Outputs.pending`); nothing is emitted."""
+        self._restore(snapshot.data)
+        self.origin_ns = origin_ns
+        self.outputs.set_pending(pending)
 
     def _reset(self) -> None:
         self.twin.reset(0.0)

@@ -1,0 +1,322 @@
+"""MCAP from front to back, a chunk at a time, its messages as arrays of places: no object is made for a message.
+
+No index is needed: a file without its end is read as far as it goes, a chunk that is damaged is left out and counted.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import IO, Any, Final
+
+import numpy as np
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.template import Bytes, Indexes, compiled
+
+try:  # twenty times as fast as the standard library's
+    from isal.isal_zlib import crc32 as crc32
+except ImportError:
+    from zlib import crc32 as crc32
+
+MAGIC: Final = b"\x89MCAP0\r\n"
+#: A longer record, or a chunk that says it holds more, is damage [B].
+RECORD_LIMIT: Final = 256 * 1024 * 1024
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
+_HEAD: Final = struct.Struct("<BQ")
+_CHUNK_HEAD: Final = struct.Struct("<QQQII")
+#: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
+MESSAGE_HEAD: Final = 31
+_COLUMNS: Final = 6
+#: Chunks below that size [B] are looked through together.
+_SMALL: Final = 2**18
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A topic of a file: its type, encoding and the schema's text."""
+
+    topic: str
+    message_type: str
+    encoding: str
+    schema: bytes
+
+
+@dataclass(frozen=True)
+class Messages:
+    """Messages of one chunk: places in `buffer`, in the file's order; every array has shape (n,)."""
+
+    buffer: Bytes
+    channel: Indexes
+    sequence: Indexes
+    log_time_ns: Indexes
+    publish_time_ns: Indexes
+    start: Indexes
+    length: Indexes
+
+    def __len__(self) -> int:
+        return len(self.channel)
+
+    def __getitem__(self, chosen: Any) -> Messages:
+        """Return some of the messages, by a mask, a slice or indexes."""
+        columns = (self.channel, self.sequence, self.log_time_ns, self.publish_time_ns, self.start, self.length)
+        return Messages(self.buffer, *(column[chosen] for column in columns))
+
+    def data(self, index: int) -> bytes:
+        """Return the bytes of one message."""
+        start = int(self.start[index])
+        return self.buffer[start : start + int(self.length[index])].tobytes()
+
+
+@dataclass
+class ChunkReader:
+    """Iterate over the chunks of one MCAP file.
+
+    `channels` grows while the file is read. Once the iteration has ended, `finished` says whether the file has its end
+    and `damaged` how many chunks could not be read; `metadata` receives each metadata record when it is met.
+
+    Parameters
+    ----------
+    path
+        The file.
+    wanted
+        Asked, where a chunk's index can be read, with the channel numbers in it: False leaves the chunk unopened.
+    """
+
+    path: Path
+    on_metadata: Callable[[str, dict[str, str]], object] = lambda name, record: None
+    wanted: Callable[[set[int]], bool] | None = None
+    channels: dict[int, Channel] = field(default_factory=dict)
+    finished: bool = False
+    damaged: int = 0
+    position: int = 0
+
+    def __iter__(self) -> Iterator[Messages]:
+        self.finished, self.damaged, self.position = False, 0, 0
+        schemas: dict[int, tuple[str, bytes]] = {}
+        loose: list[bytes] = []
+        opened: list[Bytes] = []
+        with open_mcap(self.path) as stream:
+            size = os.fstat(stream.fileno()).st_size
+            stream.seek(len(MAGIC))
+            while True:
+                head = stream.read(_HEAD.size)
+                if len(head) < _HEAD.size:
+                    break
+                opcode, length = _HEAD.unpack(head)
+                begin = stream.tell()
+                if length > RECORD_LIMIT or begin + length > size:
+                    break
+                self.position = begin + length
+                if opcode == _MESSAGE:
+                    loose.append(head + stream.read(length))
+                    if len(loose) >= 4096 or length > _SMALL:
+                        opened.append(np.frombuffer(b"".join(loose), np.uint8))
+                        loose = []
+                elif loose:
+                    opened.append(np.frombuffer(b"".join(loose), np.uint8))
+                    loose = []
+                if sum(map(len, opened)) > _SMALL:
+                    yield from self._scan(opened, schemas)
+                    opened = []
+                if opcode == _MESSAGE:
+                    continue
+                if opcode == _CHUNK:
+                    if self.wanted is None or self._is_wanted(stream, begin + length, size):
+                        stream.seek(begin)
+                        content = self._open(stream.read(length))
+                        if content is not None:
+                            if len(content) > _SMALL:
+                                yield from self._scan(opened, schemas)
+                                opened = []
+                            opened.append(content)
+                        else:
+                            yield from self._scan(opened, schemas)
+                            opened = []
+                            self._note_damage(schemas)
+                    stream.seek(begin + length)
+                elif opcode in (_SCHEMA, _CHANNEL):
+                    self._declare(opcode, stream.read(length), schemas)
+                elif opcode == _METADATA:
+                    self._metadata(stream.read(length))
+                elif opcode == _FOOTER:
+                    self.finished = stream.read(length + len(MAGIC))[-len(MAGIC) :] == MAGIC
+                    break
+                else:
+                    stream.seek(begin + length)
+            if loose:
+                opened.append(np.frombuffer(b"".join(loose), np.uint8))
+            yield from self._scan(opened, schemas)
+
+    def _is_wanted(self, stream: IO[bytes], place: int, size: int) -> bool:
+        """Ask by the index records behind a chunk; without one the chunk is wanted."""
+        numbers: set[int] = set()
+        while place + 11 <= size:
+            stream.seek(place)
+            opcode, length, number = struct.unpack("<BQH", stream.read(11))
+            if opcode != _MESSAGE_INDEX:
+                break
+            numbers.add(number)
+            place += _HEAD.size + length
+        known = numbers <= self.channels.keys()
+        return not numbers or not known or self.wanted is None or self.wanted(numbers)
+
+    def _open(self, record: bytes) -> Bytes | None:
+        """Return what a chunk holds, or None when it is damaged."""
+        try:
+            _, _, size, crc, letters = _CHUNK_HEAD.unpack_from(record)
+            place = _CHUNK_HEAD.size + letters
+            compression = record[_CHUNK_HEAD.size : place].decode()
+            (length,) = struct.unpack_from("<Q", record, place)
+            data = memoryview(record)[place + 8 : place + 8 + length]
+            if len(data) != length or size > RECORD_LIMIT:
+                return None
+            content = decompress(compression, data, size)
+        except Exception:  # each decompressor has errors of its own; all mean that the chunk is damaged
+            return None
+        if len(content) != size or (crc and crc32(content) != crc):
+            return None
+        return np.frombuffer(content, np.uint8)
+
+    def _scan(self, contents: list[Bytes], schemas: dict[int, tuple[str, bytes]]) -> Iterator[Messages]:
+        """Yield the messages of some chunks, together where they are whole."""
+        if not contents:
+            return
+        content = contents[0] if len(contents) == 1 else np.concatenate(contents)
+        table = np.empty((_COLUMNS, len(content) // MESSAGE_HEAD + 1), np.int64)
+        others = np.empty(256, np.int64)
+        count, other_count, whole = scan(content, table, others)
+        if not whole and len(contents) > 1:
+            for part in contents:
+                yield from self._scan([part], schemas)
+            return
+        for place in others[: min(other_count, len(others))]:
+            opcode, length = _HEAD.unpack_from(content.data, int(place))
+            start = int(place) + _HEAD.size
+            self._declare(opcode, content[start : start + length].tobytes(), schemas)
+        self.damaged += 0 if whole else 1
+        yield Messages(content, *(column[:count] for column in table))
+
+    def _declare(self, opcode: int, record: bytes, schemas: dict[int, tuple[str, bytes]]) -> None:
+        from mcap import records
+        from mcap.data_stream import ReadDataStream
+
+        stream = ReadDataStream(BytesIO(record))
+        try:
+            if opcode == _SCHEMA:
+                schema = records.Schema.read(stream)
+                schemas[schema.id] = (schema.name, schema.data)
+            else:
+                channel = records.Channel.read(stream)
+                name, text = schemas.get(channel.schema_id, ("", b""))
+                self.channels[channel.id] = Channel(channel.topic, name, channel.message_encoding, text)
+        except Exception:  # damage: what it would have named is passed over
+            self.damaged += 1
+
+    def _metadata(self, record: bytes) -> None:
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Metadata
+
+        try:
+            metadata = Metadata.read(ReadDataStream(BytesIO(record)))
+        except Exception:
+            self.damaged += 1
+            return
+        self.on_metadata(metadata.name, dict(metadata.metadata))
+
+    def _note_damage(self, schemas: dict[int, tuple[str, bytes]]) -> None:
+        """Count a damaged chunk, and take from the index at the end the channels that it may have declared."""
+        from mcap.reader import make_reader
+
+        self.damaged += 1
+        try:
+            with self.path.open("rb") as stream:
+                summary = make_reader(stream).get_summary()
+        except Exception:  # no index, no help
+            return
+        if summary is None:
+            return
+        for schema in summary.schemas.values():
+            schemas.setdefault(schema.id, (schema.name, schema.data))
+        for channel in summary.channels.values():
+            name, text = schemas.get(channel.schema_id, ("", b""))
+            self.channels.setdefault(channel.id, Channel(channel.topic, name, channel.message_encoding, text))
+
+
+def decompress(compression: str, data: memoryview, size: int) -> bytes:
+    """Return the content of a chunk, of at most `size` bytes."""
+    if compression == "zstd":
+        import zstandard
+
+        if zstandard.frame_content_size(data) not in (-1, size):
+            raise RecordingError(f"chunk: got {zstandard.frame_content_size(data)} bytes, expected {size}")
+        content: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    elif compression == "lz4":
+        import lz4.frame
+
+        content = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+    elif not compression:
+        content = bytes(data)
+    else:
+        raise RecordingError(f"compression: got {compression!r}, expected zstd, lz4 or none")
+    return content
+
+
+@compiled
+def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
+    """Fill the columns of `table` with the messages of a chunk and `others` with the places of schemas and channels.
+
+    Returns the number of each, and whether the records end where the chunk ends.
+    """
+    place, count, other = np.int64(0), 0, 0
+    size = content.size
+    while place + 9 <= size:
+        length = np.int64(0)
+        for i in range(8):
+            length |= np.int64(content[place + 1 + i]) << (8 * i)
+        start = place + 9
+        if length < 0 or length > size - start:
+            return count, other, False
+        opcode = content[place]
+        if opcode == 5 and length >= 22:
+            table[0, count] = np.int64(content[start]) | np.int64(content[start + 1]) << 8
+            number = np.int64(0)
+            for i in range(4):
+                number |= np.int64(content[start + 2 + i]) << (8 * i)
+            table[1, count] = number
+            log, publish = np.int64(0), np.int64(0)
+            for i in range(8):
+                log |= np.int64(content[start + 6 + i]) << (8 * i)
+                publish |= np.int64(content[start + 14 + i]) << (8 * i)
+            table[2, count], table[3, count] = log, publish
+            table[4, count], table[5, count] = start + 22, length - 22
+            count += 1
+        elif opcode == 3 or opcode == 4:
+            if other < others.size:
+                others[other] = place
+            other += 1
+        place = start + length
+    return count, other, bool(place == size)
+
+
+def open_mcap(path: Path) -> IO[bytes]:
+    """Open an MCAP file.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read or is none.
+    """
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+    if stream.read(len(MAGIC)) != MAGIC:
+        stream.close()
+        raise RecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r})")
+    stream.seek(0)
+    return stream

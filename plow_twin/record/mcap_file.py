@@ -1,0 +1,330 @@
+"""One MCAP file as it is written: messages are laid into chunks as bytes, many at a time, by compiled code.
+
+The compiled code and the compressors hold no interpreter lock. Every write is a whole record, so that a killed process
+leaves a file that can be read up to its last chunk.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.chunks import MAGIC, MESSAGE_HEAD, crc32
+from plow_twin.record.template import Bytes, Indexes, Template, compiled, fill
+
+_INDEX_ENTRY: Final = np.dtype([("time", "<u8"), ("offset", "<u8")])
+
+
+class ChunkBuilder:
+    """The messages of one chunk that is being filled."""
+
+    def __init__(self, compression: str) -> None:
+        self.compression = compression
+        self._buffer: Bytes = np.empty(1 << 16, np.uint8)
+        self.size = 0
+        self._channels: list[Indexes] = []
+        self._times: list[Indexes] = []
+        self._offsets: list[Indexes] = []
+
+    def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
+        """Add one message."""
+        head = struct.pack("<BQHIQQ", 5, 22 + len(data), channel, sequence, log_time_ns, publish_time_ns)
+        record = np.frombuffer(head + data, np.uint8)
+        place = self.reserve(len(record))
+        self._buffer[place : place + len(record)] = record
+        self._note(np.array([channel]), np.array([log_time_ns]), np.array([place]))
+
+    def add_many(
+        self,
+        channel: int,
+        template: Template,
+        starts: Indexes,
+        sequence: Indexes,
+        log_time_ns: Indexes,
+        stamp_ns: Indexes,
+        values: Any,
+    ) -> None:
+        """Fill in many messages of one template, at places within what `reserve` has returned."""
+        places = starts + MESSAGE_HEAD
+        heads(self._buffer, starts, channel, sequence, log_time_ns, np.maximum(stamp_ns, 0), len(template))
+        fill(self._buffer, places, template.data, template.runs, stamp_ns, values)
+        self._note(np.full(len(starts), channel), log_time_ns, starts)
+
+    def reserve(self, size: int) -> int:
+        """Return the place of `size` new bytes."""
+        place = self.size
+        self.size += size
+        if self.size > len(self._buffer):
+            larger = np.empty(max(self.size, 2 * len(self._buffer)), np.uint8)
+            larger[:place] = self._buffer[:place]
+            self._buffer = larger
+        return place
+
+    def _note(self, channel: Indexes, time_ns: Indexes, offset: Indexes) -> None:
+        self._channels.append(channel)
+        self._times.append(time_ns)
+        self._offsets.append(offset)
+
+    def take(self) -> tuple[Bytes, dict[int, Any]]:
+        """Return the records and, by channel, times and offsets in order of time, and begin anew."""
+        channels, times, offsets = map(np.concatenate, (self._channels, self._times, self._offsets))
+        index = {}
+        for channel in np.unique(channels).tolist():
+            chosen = np.flatnonzero(channels == channel)
+            chosen = chosen[np.argsort(times[chosen], kind="stable")]
+            entries = np.empty(len(chosen), _INDEX_ENTRY)
+            entries["time"], entries["offset"] = times[chosen], offsets[chosen]
+            index[channel] = entries
+        content = self._buffer[: self.size]
+        self.size, self._channels, self._times, self._offsets = 0, [], [], []
+        return content, index
+
+
+@compiled
+def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  # type: ignore[no-untyped-def]
+    """Write opcode, length, channel, sequence and times of messages whose data have `length` bytes."""
+    for n in range(starts.size):
+        head = buffer[starts[n] : starts[n] + 31]
+        head[0] = 5
+        for i in range(8):
+            head[1 + i] = ((length + 22) >> (8 * i)) & 0xFF
+            head[15 + i] = (log_time[n] >> (8 * i)) & 0xFF
+            head[23 + i] = (publish_time[n] >> (8 * i)) & 0xFF
+        for i in range(2):
+            head[9 + i] = (channel >> (8 * i)) & 0xFF
+        for i in range(4):
+            head[11 + i] = (sequence[n] >> (8 * i)) & 0xFF
+
+
+class McapFile:
+    """An MCAP file that is being written.
+
+    Every method may raise `OSError` (disk full); after that only `close` may be called.
+    """
+
+    def __init__(self, path: Path, library: str) -> None:
+        from mcap.records import Header
+
+        self._file = UnbufferedFile(path)
+        self._schemas: dict[str, Any] = {}
+        self._channels: dict[int, Any] = {}
+        self._undeclared: list[Any] = []
+        self._chunks: list[Any] = []
+        self._metadata: list[Any] = []
+        self._counts: Counter[int] = Counter()
+        self._times: list[int] = []
+        self._file.write(MAGIC)
+        self._write(Header("ros2", library))
+
+    @property
+    def size(self) -> int:
+        """Bytes written so far [B]."""
+        return self._file.tell()
+
+    @property
+    def counts(self) -> Counter[int]:
+        """Messages by channel."""
+        return self._counts
+
+    @property
+    def times(self) -> tuple[int, int]:
+        """First and last log time [ns], zeros without a message."""
+        return (min(self._times), max(self._times)) if self._times else (0, 0)
+
+    def _write(self, record: Any) -> int:
+        from mcap.data_stream import RecordBuilder
+
+        builder = RecordBuilder()
+        record.write(builder)
+        data: bytes = builder.end()  # type: ignore[no-untyped-call]
+        self._file.write(data)
+        return len(data)
+
+    def metadata(self, name: str, record: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        from mcap.records import Metadata, MetadataIndex
+
+        offset = self.size
+        length = self._write(Metadata(name=name, metadata=dict(record)))
+        self._metadata.append(MetadataIndex(offset=offset, length=length, name=name))
+
+    def channel(self, topic: str, message_type: str, schema: bytes, metadata: Mapping[str, str]) -> int:
+        """Return the number of a new channel; it is declared before the next chunk."""
+        from mcap.records import Channel, Schema
+
+        if message_type not in self._schemas:
+            number = len(self._schemas) + 1
+            self._schemas[message_type] = Schema(id=number, data=schema, encoding="ros2msg", name=message_type)
+            self._undeclared.append(self._schemas[message_type])
+        number = len(self._channels) + 1
+        self._channels[number] = Channel(
+            id=number,
+            topic=topic,
+            message_encoding="cdr",
+            metadata=dict(metadata),
+            schema_id=self._schemas[message_type].id,
+        )
+        self._undeclared.append(self._channels[number])
+        return number
+
+    def chunk(self, builder: ChunkBuilder) -> None:
+        """Write a chunk and its index; an empty one is left out."""
+        from mcap.records import ChunkIndex
+
+        if not builder.size:
+            return
+        for record in self._undeclared:
+            self._write(record)
+        self._undeclared = []
+        content, index = builder.take()
+        first = min(int(entries["time"][0]) for entries in index.values())
+        last = max(int(entries["time"][-1]) for entries in index.values())
+        name = builder.compression.encode()
+        data = _compress(builder.compression, content)
+        start = self.size
+        crc = crc32(content)
+        head = struct.pack("<QQQII", first, last, len(content), crc, len(name)) + name + struct.pack("<Q", len(data))
+        record = struct.pack("<BQ", 6, len(head) + len(data)) + head + data
+        offsets, place, parts = {}, start + len(record), [record]
+        for channel, entries in index.items():
+            offsets[channel] = place
+            raw = entries.tobytes()
+            parts.append(struct.pack("<BQHI", 7, 6 + len(raw), channel, len(raw)) + raw)
+            place += len(parts[-1])
+            self._counts[channel] += len(entries)
+        self._file.write(b"".join(parts))  # with its index in one go
+        self._times += [first, last]
+        if len(self._times) > 64:
+            self._times = [min(self._times), max(self._times)]
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=len(record),
+                chunk_start_offset=start,
+                compression=builder.compression,
+                compressed_size=len(data),
+                message_end_time=last,
+                message_index_length=place - start - len(record),
+                message_index_offsets=offsets,
+                message_start_time=first,
+                uncompressed_size=len(content),
+            )
+        )
+
+    def finish(self) -> None:
+        """Write the index and the end."""
+        from mcap.data_stream import RecordBuilder
+        from mcap.opcode import Opcode
+        from mcap.records import DataEnd, Footer, Statistics, SummaryOffset
+
+        for record in self._undeclared:
+            self._write(record)
+        self._write(DataEnd(0))
+        start = self.size
+        statistics = Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=self._counts.total(),
+            metadata_count=len(self._metadata),
+            message_start_time=self.times[0],
+            message_end_time=self.times[1],
+            schema_count=len(self._schemas),
+        )
+        groups = (
+            (Opcode.SCHEMA, list(self._schemas.values())),
+            (Opcode.CHANNEL, list(self._channels.values())),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.METADATA_INDEX, self._metadata),
+        )
+        builder, offsets = RecordBuilder(), []
+        for opcode, records in groups:
+            begin = builder.count
+            for record in records:
+                record.write(builder)
+            if records:
+                length = builder.count - begin
+                offsets.append(SummaryOffset(group_opcode=opcode, group_start=start + begin, group_length=length))
+        offset_start = start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        summary = builder.end()  # type: ignore[no-untyped-call]
+        crc = crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start), crc32(summary))
+        self._file.write(summary)
+        self._write(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
+        self._file.write(MAGIC)
+
+    def sync(self) -> None:
+        """Have the operating system put what was written on the disk."""
+        self._file.sync()
+
+    def is_linked(self) -> bool:
+        """Tell whether the path still leads to this file."""
+        return self._file.is_linked()
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
+
+
+def _compress(compression: str, content: Bytes) -> bytes:
+    data: bytes
+    if compression == "lz4":
+        import lz4.frame
+
+        data = lz4.frame.compress(content)
+    else:
+        import zstandard
+
+        data = zstandard.ZstdCompressor(level=3).compress(content.tobytes())
+    return data
+
+
+class UnbufferedFile:
+    """A file that holds nothing back, so that nothing is left to fail a second time when the disk is full."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be made: {error.strerror}") from error
+        self._offset = 0
+        self._open = True
+
+    def write(self, data: bytes) -> None:
+        """Write all of it."""
+        view = memoryview(data)
+        while view:
+            count = os.write(self._descriptor, view)
+            self._offset += count
+            view = view[count:]
+
+    def tell(self) -> int:
+        """Return the bytes written so far."""
+        return self._offset
+
+    def sync(self) -> None:
+        """Wait for the disk."""
+        os.fdatasync(self._descriptor)
+
+    def is_linked(self) -> bool:
+        """Tell whether the path still leads to this file."""
+        try:
+            return os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
+        except FileNotFoundError:
+            return False
+
+    def close(self) -> None:
+        """Close it; once is enough."""
+        if self._open:
+            self._open = False
+            os.close(self._descriptor)
