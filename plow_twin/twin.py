@@ -187,10 +187,10 @@ class Twin:
             As `advance_samples`; nothing has changed then.
         """
         if self.excitation != "sampled" or self._bound is not None:
-            raise ValueError("advance_marked: expected excitation='sampled' without max_evaluations")
+            raise ArgumentError("advance_marked: expected excitation='sampled' without max_evaluations")
         check_times(self.time, t)
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
-            raise ValueError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
+            raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
         out = empty_series(t) if rows else None
         status = np.zeros(len(t), np.int64) if out is None else out.status
         saved = np.zeros(len(marks), STATE)

@@ -236,7 +236,7 @@ class _Replay:
         stamps = entries.stamp_ns[entries.sample]
         before = self.session.snapshot(), self.session.outputs.pending, self.session.origin_ns
         try:
-            found = self.session.apply_samples(
+            found = self.session.advance_marked(
                 stamps,
                 entries.wrench[entries.sample],
                 done[digests],
@@ -546,7 +546,7 @@ def _warm_up(scene: Scene, tol: float, templates: Mapping[str, Template], *, row
     twin = Twin(scene, tol=tol, excitation="sampled")
     stamps = np.arange(1, 3, dtype=np.int64) * 1000
     session = Session(twin)
-    done = session.apply_samples(stamps, np.zeros((2, 3)), np.array([1]), rows=rows)
+    done = session.advance_marked(stamps, np.zeros((2, 3)), np.array([1]), rows=rows)
     table, others = np.empty((6, 2), np.int64), np.empty(2, np.int64)
     template = sample_template("")
     scan(np.frombuffer(bytes(8), np.uint8), table, others)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from plow_twin.model.kernel import kernel
 from plow_twin.solve.drive import _advance, _clear, _read_row
-from plow_twin.solve.layout import PIECE, STEPS, T0
+from plow_twin.solve.layout import PIECE, STATE, T0
 
 
 @kernel()
@@ -15,17 +17,16 @@ def advance_marked(params, parts, states, work, totals, times, wrench, budget, m
     or None: then nothing is read out.
     """
     w, sums, piece = work[0], totals[0], parts.segments[0]
-    p, state = params[0], states[0]
+    p, state, before = params[0], states[0], np.empty(1, STATE)
     state.step[PIECE] = 0
     mark = 0
     for i in range(times.size):
-        before = state.count[STEPS]
         span = times[i] - state.clock[T0]
         piece.knot = state.clock[T0]
         for j in range(3):
             piece.start[j] = wrench[i, j]
             piece.slope[j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
-        status[i] = _advance(p, parts, state, w, sums, times[i], times[i], before + budget, None)
+        status[i] = _advance(p, parts, states, 0, before, w, sums, times[i], times[i], budget, None)[0]
         if rows is not None:
             q, v, penetration, rate, force, peak, impulse, makes, depth = rows
             _read_row(p, parts, state, w, sums, i, q, v, penetration, rate, force, peak, impulse, makes, depth)

@@ -151,7 +151,7 @@ class Session:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
         return series
 
-    def apply_samples(
+    def advance_marked(
         self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], marks: NDArray[np.int64], *, rows: bool = True
     ) -> MarkedAdvance:
         """Apply many samples at once for a replay: nothing is emitted, and `outputs` is left to the caller.
