@@ -1,10 +1,10 @@
 """Digital twin of a mechanism with clearance: the coal plough's head in its guide."""
 
-from plow_twin.advance import Advance as Advance
-from plow_twin.advance import AdvanceSeries as AdvanceSeries
-from plow_twin.advance import AdvanceTogether as AdvanceTogether
-from plow_twin.ensemble import Ensemble as Ensemble
-from plow_twin.ensemble import simulate_many as simulate_many
+from plow_twin.run.advance import Advance as Advance
+from plow_twin.run.advance import AdvanceSeries as AdvanceSeries
+from plow_twin.run.advance import AdvanceBatch as AdvanceBatch
+from plow_twin.run.ensemble import Ensemble as Ensemble
+from plow_twin.run.ensemble import simulate_many as simulate_many
 from plow_twin.errors import ArgumentError as ArgumentError
 from plow_twin.errors import PlowTwinError as PlowTwinError
 from plow_twin.errors import Problem as Problem
@@ -28,8 +28,8 @@ from plow_twin.model.scene import Provenance as Provenance
 from plow_twin.model.scene import Scene as Scene
 from plow_twin.model.scene import Table as Table
 from plow_twin.model.scene import Wear as Wear
-from plow_twin.simulate import Result as Result
-from plow_twin.simulate import simulate as simulate
-from plow_twin.twin import Status as Status
-from plow_twin.twin import Twin as Twin
-from plow_twin.twins import Twins as Twins
+from plow_twin.run.simulate import Result as Result
+from plow_twin.run.simulate import simulate as simulate
+from plow_twin.run.twin import Status as Status
+from plow_twin.run.twin import Twin as Twin
+from plow_twin.run.batch import TwinBatch as TwinBatch

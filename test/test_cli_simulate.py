@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from plow_twin import PAIR_NAMES, simulate
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.scene_file import dump_scene, load_scene
 
 RUN = ["simulate", "paper", "--t-end", "2", "--output-dt", "0.01"]
@@ -141,7 +141,7 @@ def test_too_little_memory_is_one_line_and_exits_with_1() -> None:
     code = """
 import resource, sys
 from plow_twin import simulate
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.scene_file import load_scene
 from plow_twin.cli import main
 simulate(load_scene(scene_path("paper")), 0.1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from installing import build_wheel, install, make_environment, run
 
-from plow_twin.presets import PRESETS
+from plow_twin.scene_file.presets import PRESETS
 
 pytestmark = [pytest.mark.package, pytest.mark.timeout(400)]
 

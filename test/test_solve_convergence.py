@@ -11,7 +11,7 @@ import pytest
 from scenes import pose_error, preset, reference, wall_and_point
 
 from plow_twin import Contact, Scene, simulate
-from plow_twin.solve import compiled
+from plow_twin.solve import compiled_scene
 
 REFERENCES = {"bench_kv": "bench_kv", "bench_hc": "bench_hc", "paper": "paper_r1"}
 
@@ -47,7 +47,7 @@ def fixed_step_errors(
             )  # fmt: skip
             exact = simulate(scene, t_end, output_dt=t_end, tol=1e-13)
             fixed = simulate(scene, t_end, output_dt=t_end, method=method, dt=dt)
-            found.append(abs(fixed.q[-1, 1] - exact.q[-1, 1]))
+            found.append(abs(fixed_step.q[-1, 1] - exact.q[-1, 1]))
         errors.append(float(np.mean(found)))
     return errors
 

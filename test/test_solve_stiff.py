@@ -9,8 +9,8 @@ import pytest
 from scenes import pose_error, preset, wall_and_point
 
 from plow_twin import Contact, Friction, Scene, Twin, simulate
-from plow_twin.solve import compiled
-from plow_twin.solve.layout import IMPLICIT, Implicit
+from plow_twin.solve import compiled_scene
+from plow_twin.solve.state import Implicit
 
 
 def damped(damping: float) -> Scene:
@@ -27,14 +27,14 @@ def test_implicit_and_explicit_steps_agree(
     damping: float, friction: Friction | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = replace(damped(damping), friction=friction)
-    implicit = simulate(scene, 0.5, output_dt=0.01, audit=True)
+    implicit = simulate(scene, 0.5, output_dt=0.01, energy_balance=True)
     monkeypatch.setattr(compiled, "_implicit", lambda *arguments: None)
     explicit = simulate(scene, 0.5, output_dt=0.01)
     assert implicit.solver["steps"] < 0.4 * explicit.solver["steps"]
     assert pose_error(scene, implicit.q, explicit.q) < 5e-9
     assert len(implicit.events) == len(explicit.events)
     assert implicit.events["time"] == pytest.approx(explicit.events["time"], abs=1e-7)
-    assert implicit.audit is not None and implicit.audit.relative_imbalance < 1e-7
+    assert implicit.energy_balance is not None and implicit.energy_balance.relative_imbalance < 1e-7
 
 
 def test_the_work_hardly_grows_with_the_damping() -> None:
@@ -43,7 +43,7 @@ def test_the_work_hardly_grows_with_the_damping() -> None:
         twin = Twin(damped(damping))
         twin.advance(0.3)
         steps[damping] = twin.steps
-        assert twin._state.count[IMPLICIT] > 0
+        assert twin._state.implicit_steps > 0
     # explicit steps would be a hundred times as many
     assert steps[1e11] < 10 * steps[1e9]
 

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.scene_file import load_scene
-from plow_twin.stream.driver import Driver, Policy, State, counters
+from plow_twin.stream.driver import Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
 from plow_twin.stream.journal import Entry, Hold, Reset, Sample
-from plow_twin.stream.outputs import Frame
+from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
-from plow_twin.twin import Twin
+from plow_twin.run.twin import Twin
 
 SCENE = load_scene(scene_path("paper"))
 T0 = 1_795_000_000_000_000_000

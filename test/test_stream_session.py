@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene, Wear
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Reset, Sample, Snapshot, Travel
-from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, Frame, Outputs, prior_points
+from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, Publication, Outputs, prior_points
 from plow_twin.stream.session import DIGEST_INTERVAL, Session
-from plow_twin.twin import Twin
+from plow_twin.run.twin import Twin
 
 T0 = 1_795_000_000_123_456_789
 MS = 1_000_000

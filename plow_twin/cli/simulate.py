@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from plow_twin.cli.console import DONE, POSITIVE, busy, json_option, kilonewton, output_console, quiet_option, table
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from plow_twin.books import Books
-    from plow_twin.simulate import Result
+    from plow_twin.run.energy_balance import EnergyBalance
+    from plow_twin.run.simulate import Result
 
 #: A row takes some 200 B.
 MOST_ROWS: Final = 10_000_000
@@ -71,7 +71,7 @@ def simulate(
 def _run(scene: str, quiet: bool, t_end: float, *settings: Any) -> Result:
     from plow_twin.errors import SceneError
     from plow_twin.scene_file import load_scene
-    from plow_twin.simulate import simulate as run
+    from plow_twin.run.simulate import simulate as run
 
     model = load_scene(scene_path(scene))
     try:
@@ -138,11 +138,11 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
         "solver": _plain(result.solver),
         "wall_s": float(result.wall_s),
         "compile_s": float(result.compile_s),
-        **({} if result.audit is None else {"audit": _plain(books_of(result.audit))}),
+        **({} if result.energy_balance is None else {"audit": _plain(energy_balance_of(result.energy_balance))}),
     }
 
 
-def books_of(books: Books) -> dict[str, Any]:
+def energy_balance_of(books: EnergyBalance) -> dict[str, Any]:
     """Return the books as plain numbers and lists, with the imbalance over the turnover."""
     from dataclasses import asdict
 
@@ -158,7 +158,7 @@ def _plain(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else value
 
 
-def _audit_table(books: Books) -> Table:
+def _audit_table(books: EnergyBalance) -> Table:
     rows = table("books of energy", "what", "J")
     kinetic, stored = (end - start for start, end in (books.kinetic_j, books.stored_j))
     for name, value in (
@@ -198,7 +198,7 @@ def _print_statistics(result: Result, scene: str, t_end: float) -> None:
     for name in sorted({*ccw, *cw}, key=lambda name: (len(name), name)):
         sets.add_row(name, f"{ccw.get(name, 0.0):.1%}", f"{cw.get(name, 0.0):.1%}")
     console.print(sets)
-    if result.audit is not None:
-        console.print(_audit_table(result.audit))
+    if result.energy_balance is not None:
+        console.print(_audit_table(result.energy_balance))
     solver = ", ".join(f"{key} {value}" for key, value in result.solver.items())
     console.print(f"{solver}; {result.wall_s * 1e3:.1f} ms, compiled in {result.compile_s:.1f} s", highlight=False)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene

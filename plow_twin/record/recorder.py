@@ -24,7 +24,7 @@ from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS
 from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
-from plow_twin.stream.outputs import Frame, Frames
+from plow_twin.stream.outputs import Publication, Frames
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter

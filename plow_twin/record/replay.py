@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
-from plow_twin.advance import AdvanceSeries
+from plow_twin.run.advance import AdvanceSeries
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.cdr import decode, encode
@@ -25,7 +25,7 @@ from plow_twin.record.chunks import scan
 from plow_twin.record.header import RunHeader, build_fingerprint
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS, frame_messages, frame_numbers, frame_templates
+from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS, publication_messages, frame_numbers, frame_templates
 from plow_twin.record.reader import (
     Batch,
     Entries,
@@ -38,9 +38,9 @@ from plow_twin.record.reader import (
 )
 from plow_twin.record.template import Bytes, Indexes, Template, differs, read_numbers
 from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot
-from plow_twin.stream.outputs import Frame, Frames
+from plow_twin.stream.outputs import Publication, Frames
 from plow_twin.stream.session import Session
-from plow_twin.twin import Twin
+from plow_twin.run.twin import Twin
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
@@ -364,7 +364,7 @@ class _Replay:
     def _difference(self, record: OutputRecord, frame: Frame) -> tuple[str, str, str] | None:
         """Return what differs between a recorded message and that of a frame, computed as the node does."""
         name = self.topics[record.topic]
-        computed = frame_messages(frame, self.header.frame_id, self.header.child_frame_id).get(name)
+        computed = publication_messages(frame, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
             return "message", "a message", "none"
         return None if encode(computed) == record.data else _first_difference(record, computed)
@@ -445,7 +445,7 @@ class _Replay:
             frame = self.frames[len(self.frames) - 1] if self.frames else self.session.outputs.take()
             self.frames = None
             frames = (self.header.frame_id, self.header.child_frame_id)
-            self.messages = {} if frame is None else frame_messages(frame, *frames)
+            self.messages = {} if frame is None else publication_messages(frame, *frames)
         computed = self.messages.get(name)
         if computed is None and self.resumed:
             self.report.not_compared[name] += 1

@@ -23,7 +23,7 @@ from rich.table import Table
 from plow_twin.errors import PlowTwinError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, corner_of
 from plow_twin.model.scene import Mark, Provenance, Wear
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.ros.run_summary import SENSES, RunSummary, corner_letters, summarise
 from plow_twin.scene_file import dump_scene, load_scene
 

@@ -28,7 +28,7 @@ from sensor_msgs.msg import JointState
 
 from plow_twin.errors import SceneError
 from plow_twin.model.loads import compile_loads
-from plow_twin.presets import scene_path
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.ros.main import StopRequested, StopSignals, make_executor
 from plow_twin.ros.messages import set_stamp
 from plow_twin.ros.qos import LATCHED, sensor_input

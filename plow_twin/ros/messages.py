@@ -17,12 +17,12 @@ from std_msgs.msg import Header
 from plow_twin.model.loads import load_direction
 from plow_twin.model.scene import Constant, Harmonic, Scene
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.outputs import Frame
+from plow_twin.stream.outputs import Publication
 
 Wrench = tuple[float, float, float]
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
-#: Stamp and length of the frame's name, then force and torque; big endian and little endian.
+#: Stamp and length of the publication's name, then force and torque; big endian and little endian.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
 
@@ -108,7 +108,7 @@ class JointStateWriter:
 
 
 class OdometryWriter:
-    """One `Odometry` that is written over: pose in the slide's frame, twist in the head's own axes.
+    """One `Odometry` that is written over: pose in the slide's publication, twist in the head's own axes.
 
     The covariances stay zero: unknown.
     """
@@ -117,11 +117,11 @@ class OdometryWriter:
         self.message = Odometry(child_frame_id=child_frame_id)
         self.message.header.frame_id = frame_id
 
-    def write(self, frame: Frame) -> Odometry:
-        """Return the message of one frame."""
-        set_stamp(self.message.header, frame.stamp_ns)
-        x, y, theta = frame.q.tolist()
-        vx, vy, omega = frame.v.tolist()
+    def write(self, publication: Publication) -> Odometry:
+        """Return the message of one publication."""
+        set_stamp(self.message.header, publication.stamp_ns)
+        x, y, theta = publication.q.tolist()
+        vx, vy, omega = publication.v.tolist()
         cos, sin = math.cos(theta), math.sin(theta)
         pose, twist = self.message.pose.pose, self.message.twist.twist
         pose.position.x, pose.position.y = x, y

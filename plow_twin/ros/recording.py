@@ -16,7 +16,7 @@ from plow_twin.ros.diagnostics import Part
 from plow_twin.ros.parameters import Settings
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
-from plow_twin.stream.outputs import Frame
+from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 _QUEUE_SIZE: Final = 20_000
@@ -82,8 +82,8 @@ class Recording:
         """Take a journal entry; a loss is counted by the recorder."""
         self._recorder.journal(entry)
 
-    def frame(self, frame: Frame) -> None:
-        """Take the messages of a frame that has been published."""
+    def publication(self, publication: Publication) -> None:
+        """Take the messages of a publication that has been published."""
         self._recorder.frame(frame)
 
     def status(self, stamp_ns: int, name: str, hardware_id: str, report: Part) -> None:

@@ -10,9 +10,9 @@ from typing import Final
 from plow_twin.stream.health import RealTimeFactor
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 from plow_twin.stream.journal import Entry, Hold, Parameter, ParameterValue, Reset, Sample, Travel
-from plow_twin.stream.outputs import Frame
+from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
-from plow_twin.twin import Status
+from plow_twin.run.twin import Status
 
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
 Arrival = tuple[int, tuple[float, float, float]]
@@ -21,7 +21,7 @@ Arrival = tuple[int, tuple[float, float, float]]
 _LARGEST_HOLD_NS: Final = NS_PER_S
 
 
-class State(Enum):
+class StreamState(Enum):
     """What the stream is doing."""
 
     WAITING = "waiting for the first sample"
@@ -63,7 +63,7 @@ class Driver:
         self.policy = policy
         self.every_sample = every_sample
         self.real_time = RealTimeFactor()
-        self.state = State.WAITING
+        self.state = StreamState.WAITING
         #: text of the last failed advance
         self.failure = ""
         self.failures = 0
@@ -121,8 +121,8 @@ class Driver:
         self.holds += 1
         if self.policy.hold == "zero" and not self._zeroed:
             self._zeroed = True
-            return self._advance(Sample(stamp_ns, (0.0, 0.0, 0.0)), now_ns, State.STALE)
-        return self._advance(Hold(stamp_ns), now_ns, State.STALE)
+            return self._advance(Sample(stamp_ns, (0.0, 0.0, 0.0)), now_ns, StreamState.STALE)
+        return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Frame | None:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
@@ -146,7 +146,7 @@ class Driver:
             self.clock.restart()
             self.clock.judge(stamp_ns, ())
             self._restart_model(stamp_ns, f"clock {verdict.value}")
-        return self._advance(Hold(stamp_ns), now_ns, State.RUNNING)
+        return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Take over the speed along the face [m/s]; its sign is a direction and does not wear."""
@@ -176,13 +176,13 @@ class Driver:
         self.resets += 1
         self._failures_in_row = 0
         self._newest_ns = self._counted_ns = None
-        self.state = State.WAITING
+        self.state = StreamState.WAITING
 
     def _use(self, samples: list[Sample], now_ns: int) -> Iterator[Frame]:
         """Advance to samples: one by one where each is published, else in one go."""
         if self.every_sample:
             for sample in samples:
-                frame = self._advance(sample, now_ns, State.RUNNING)
+                frame = self._advance(sample, now_ns, StreamState.RUNNING)
                 if frame is not None:
                     yield frame
             return
@@ -190,10 +190,10 @@ class Driver:
             self._advanced(now_ns)
             # an end that is good ends a row of failures, whatever came before it
             for status in series.status[-1:] if not series.status.any() else series.status:
-                self._judge_advance(Status(int(status)), State.RUNNING)
+                self._judge_advance(Status(int(status)), StreamState.RUNNING)
             self._give_up_after_failures()
 
-    def _advance(self, entry: Entry, now_ns: int, state: State) -> Frame | None:
+    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Frame | None:
         advance = self.session.apply(entry)
         if advance is None:
             return None
@@ -209,14 +209,14 @@ class Driver:
             self.real_time.advanced((reached_ns - self._counted_ns) * 1e-9, now_ns)
         self._counted_ns = reached_ns
 
-    def _judge_advance(self, status: Status, state: State) -> None:
+    def _judge_advance(self, status: Status, state: StreamState) -> None:
         if not status:
             self._failures_in_row = 0
             self.state = state
             return
         self.failures += 1
         self._failures_in_row += 1
-        self.state = State.FAILED
+        self.state = StreamState.FAILED
         self.failure = status.text
 
     def _give_up_after_failures(self) -> None:

@@ -1,6 +1,6 @@
-"""What is published of the motion, as plain numbers: one frame per publication, nothing lost between two of them.
+"""What is published of the motion, as plain numbers: one after the other, nothing lost between two of them.
 
-A frame is a function of the journal alone, so that a replay forms the same frames bit for bit.
+A publication is a function of the journal alone, so that a replay forms the same publications bit for bit.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 
 if TYPE_CHECKING:
-    from plow_twin.advance import Advance, AdvanceSeries
+    from plow_twin.run.advance import Advance, AdvanceSeries
 
 Array = NDArray[np.float64]
 
-#: `clearance` and `wear_rate` change slowly: they are part of the first frame in each such span of stamps.
+#: `clearance` and `wear_rate` change slowly: they are part of the first publication in each such span of stamps.
 SLOW_PERIOD_NS: Final = 100_000_000
 
 PAD_NAMES: Final = tuple(f"pad_{name}" for name in PAIR_NAMES)
@@ -36,25 +36,25 @@ _STATE_SIZE: Final = 4 * PAIR_COUNT
 
 @dataclass(frozen=True)
 class Slow:
-    """The slowly changing part of a frame: `clearance` (30,) [m] under `CLEARANCE_NAMES`, `wear_rate` (8,) [m/s]."""
+    """The slowly changing part of a publication: `clearance` (30,) [m] under `CLEARANCE_NAMES`, `wear_rate` (8,) [m/s]."""
 
     clearance: Array
     wear_rate: Array
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One publication: the state at `stamp_ns`, and all that happened since the frame before.
+class Publication:
+    """One publication: the state at `stamp_ns`, and all that happened since the publication before.
 
-    `penetration` [m], `rate` [m/s] and `force` [N] are those at the stamp, shape (8,); `touches` counts all touches so
-    far, `impulse` [N s] and `peak` [N] are those since the frame before; `q` [m, m, rad] and `v` have shape (3,).
+    `penetration` [m], `rate` [m/s] and `force` [N] are those at the stamp, shape (8,); `makes` counts all makes so
+    far, `impulse` [N s] and `peak` [N] are those since the publication before; `q` [m, m, rad] and `v` have shape (3,).
     """
 
     stamp_ns: int
     penetration: Array
     rate: Array
     force: Array
-    touches: NDArray[np.int64]
+    makes: NDArray[np.int64]
     impulse: Array
     peak: Array
     q: Array
@@ -73,13 +73,13 @@ class Frame:
 
 @dataclass(frozen=True)
 class Frames:
-    """Many frames: the fields of `Frame` with a leading axis (n,); the slow parts of the frames `slow_index` (m,)."""
+    """Many publications: the fields of `Publication` with a leading axis (n,); the slow parts of the publications `slow_index` (m,)."""
 
     stamp_ns: NDArray[np.int64]
     penetration: Array
     rate: Array
     force: Array
-    touches: NDArray[np.int64]
+    makes: NDArray[np.int64]
     impulse: Array
     peak: Array
     q: Array
@@ -91,22 +91,22 @@ class Frames:
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def __getitem__(self, index: int) -> Frame:
+    def __getitem__(self, index: int) -> Publication:
         place = int(np.searchsorted(self.slow_index, index))
         slow = place < len(self.slow_index) and self.slow_index[place] == index
-        return Frame(
+        return Publication(
             stamp_ns=int(self.stamp_ns[index]),
             **{name: getattr(self, name)[index] for name in _ARRAYS},
             slow=Slow(self.clearance[place], self.wear_rate[place]) if slow else None,
         )
 
     @classmethod
-    def of(cls, frames: Sequence[Frame]) -> Frames:
-        """Put frames together."""
-        slow = [(index, frame.slow) for index, frame in enumerate(frames) if frame.slow is not None]
-        arrays = {name: np.stack([getattr(frame, name) for frame in frames]) for name in _ARRAYS}
+    def of(cls, publications: Sequence[Publication]) -> Frames:
+        """Put publications together."""
+        slow = [(index, publication.slow) for index, publication in enumerate(publications) if publication.slow is not None]
+        arrays = {name: np.stack([getattr(publication, name) for publication in publications]) for name in _ARRAYS}
         return cls(
-            stamp_ns=np.array([frame.stamp_ns for frame in frames], np.int64),
+            stamp_ns=np.array([publication.stamp_ns for publication in publications], np.int64),
             **arrays,
             slow_index=np.array([index for index, _ in slow], np.int64),
             clearance=np.array([part.clearance for _, part in slow]).reshape(-1, len(CLEARANCE_NAMES)),
@@ -114,52 +114,52 @@ class Frames:
         )
 
 
-_ARRAYS: Final = ("penetration", "rate", "force", "touches", "impulse", "peak", "q", "v")
+_ARRAYS: Final = ("penetration", "rate", "force", "makes", "impulse", "peak", "q", "v")
 
 
-def clearances(scene: Scene, depth: Array) -> Array:
+def clearances(scene: Scene, wear_depth: Array) -> Array:
     """Return total horizontal and vertical clearance and the eight pad depths, shape (..., 10) [m], from (..., 8).
 
-    A side's walls move out by the mean depth of the two pads on it.
+    A side's walls move out by the mean wear_depth of the two pads on it.
     """
-    left, right, top, bottom = (depth[..., side].mean(axis=-1) for side in (_LEFT, _RIGHT, _TOP, _BOTTOM))
+    left, right, top, bottom = (wear_depth[..., side].mean(axis=-1) for side in (_LEFT, _RIGHT, _TOP, _BOTTOM))
     horizontal = scene.clearance.horizontal_m + left + right
     vertical = scene.clearance.vertical_m + top + bottom
-    return np.concatenate((np.stack((horizontal, vertical), axis=-1), depth), axis=-1)
+    return np.concatenate((np.stack((horizontal, vertical), axis=-1), wear_depth), axis=-1)
 
 
-def prior_points(scene: Scene, depth: Array) -> tuple[Array, Array]:
+def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
 
     Growth is proportional to k_s as long as it is small against the clearance. Without wear, or with k_s = 0, both
-    points equal the depth.
+    points equal the wear_depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
-        return depth, depth
+        return wear_depth, wear_depth
     initial = np.asarray(scene.wear.initial_depth_m)
     low, high = (point / scene.wear.coefficient_m2_n for point in scene.wear.prior_m2_n)
-    return initial + (depth - initial) * low, initial + (depth - initial) * high
+    return initial + (wear_depth - initial) * low, initial + (wear_depth - initial) * high
 
 
 class Outputs:
-    """Collect advances into frames. Touches, impulses and peaks survive any number of advances between two frames."""
+    """Collect advances into publications. Makes, impulses and peaks survive any number of advances between two publications."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._advance: Advance | None = None
         self._stamp_ns = 0
-        self._touches = np.zeros(PAIR_COUNT, np.int64)
+        self._makes = np.zeros(PAIR_COUNT, np.int64)
         self._impulse = np.zeros(PAIR_COUNT)
         self._peak = np.zeros(PAIR_COUNT)
         #: stamp and pad depths of the last slow part; None before the first
         self._slow_ns: int | None = None
-        self._slow_depth = np.zeros(PAIR_COUNT)
+        self._slow_wear_depth = np.zeros(PAIR_COUNT)
 
     def add(self, stamp_ns: int, advance: Advance) -> None:
         """Take in one good advance that ended at `stamp_ns`."""
         self._advance = advance
         self._stamp_ns = stamp_ns
-        self._touches += advance.makes
+        self._makes += advance.makes
         self._impulse += advance.impulse
         np.maximum(self._peak, advance.peak, out=self._peak)
 
@@ -170,14 +170,14 @@ class Outputs:
             return
         last = int(good[-1])
         self._advance, self._stamp_ns = series[last], stamps_ns[last]
-        self._touches += series.makes[good].sum(axis=0)
+        self._makes += series.makes[good].sum(axis=0)
         # row by row, as `add` does: the sum has the same bits
         self._impulse = np.add.reduce(np.concatenate((self._impulse[None], series.impulse[good])), axis=0)
         np.maximum(self._peak, series.peak[good].max(axis=0), out=self._peak)
 
     @property
     def pending(self) -> tuple[int, Advance] | None:
-        """Stamp and advance that the next frame shows, None when there is none since the last."""
+        """Stamp and advance that the next publication shows, None when there is none since the last."""
         return None if self._advance is None else (self._stamp_ns, self._advance)
 
     def set_pending(self, pending: tuple[int, Advance] | None) -> None:
@@ -185,23 +185,23 @@ class Outputs:
         self._stamp_ns, self._advance = (self._stamp_ns, None) if pending is None else pending
 
     def restart(self) -> None:
-        """Forget what has not been published; the touches go on counting."""
+        """Forget what has not been published; the makes go on counting."""
         self._advance = None
         self._slow_ns = None
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
 
-    def take(self) -> Frame | None:
-        """Return the frame of everything since the last one, or None when there was no advance since."""
+    def take(self) -> Publication | None:
+        """Return the publication of everything since the last one, or None when there was no advance since."""
         advance, self._advance = self._advance, None
         if advance is None:
             return None
-        frame = Frame(
+        publication = Publication(
             self._stamp_ns,
             advance.penetration,
             advance.rate,
             advance.force,
-            self._touches.copy(),
+            self._makes.copy(),
             self._impulse.copy(),
             self._peak.copy(),
             advance.q,
@@ -210,10 +210,10 @@ class Outputs:
         )
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
-        return frame
+        return publication
 
     def take_rows(self, stamps: NDArray[np.int64], rows: AdvanceSeries, taken: NDArray[np.int64]) -> Frames:
-        """Take in good advances that ended at `stamps`, with a frame after each of the rising numbers of rows `taken`.
+        """Take in good advances that ended at `stamps`, with a publication after each of the rising numbers of rows `taken`.
 
         The same bits as `add` for each row and `take` after those rows.
         """
@@ -227,14 +227,14 @@ class Outputs:
             longer = np.flatnonzero(lengths >= offset)
             impulse[longer] += rows.impulse[first[longer] + offset]
             peak[longer] = np.maximum(peak[longer], rows.peak[first[longer] + offset])
-        touches = self._touches + np.cumsum(rows.makes, axis=0)
+        makes = self._makes + np.cumsum(rows.makes, axis=0)
         slow_index, clearance, wear_rate = self._slow_rows(stamps[taken], rows.wear_depth[taken])
-        frames = Frames(
+        publications = Frames(
             stamp_ns=stamps[taken],
             penetration=rows.penetration[taken],
             rate=rows.rate[taken],
             force=rows.force[taken],
-            touches=touches[taken],
+            makes=makes[taken],
             impulse=impulse,
             peak=peak,
             q=rows.q[taken],
@@ -243,7 +243,7 @@ class Outputs:
             clearance=clearance,
             wear_rate=wear_rate,
         )
-        self._touches, self._stamp_ns = touches[-1].copy(), int(stamps[-1])
+        self._makes, self._stamp_ns = makes[-1].copy(), int(stamps[-1])
         begin = int(taken[-1]) + 1 if len(taken) else 0
         if len(taken):
             self._impulse, self._peak = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
@@ -251,11 +251,11 @@ class Outputs:
         self._impulse = np.add.accumulate(left)[-1].copy()
         self._peak = np.maximum(self._peak, rows.peak[begin:].max(axis=0, initial=0.0))
         self._advance = rows[len(stamps) - 1] if begin < len(stamps) else None
-        return frames
+        return publications
 
-    def _slow_rows(self, stamps: NDArray[np.int64], depth: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """Return which of some frames have a slow part, and the parts."""
-        before_ns, depth_before = self._slow_ns, self._slow_depth
+    def _slow_rows(self, stamps: NDArray[np.int64], wear_depth: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Return which of some publications have a slow part, and the parts."""
+        before_ns, depth_before = self._slow_ns, self._slow_wear_depth
         spans = stamps // SLOW_PERIOD_NS
         changed = np.ones(len(stamps), bool)
         changed[1:] = spans[1:] != spans[:-1]
@@ -264,39 +264,39 @@ class Outputs:
         index = np.flatnonzero(changed)
         if not index.size:
             return index, np.zeros((0, len(CLEARANCE_NAMES))), np.zeros((0, PAIR_COUNT))
-        stamps, depth = stamps[index], depth[index]
-        elapsed_s, grown = np.ones(len(stamps)), np.zeros(depth.shape)
-        elapsed_s[1:], grown[1:] = np.diff(stamps) * 1e-9, np.diff(depth, axis=0)
+        stamps, wear_depth = stamps[index], wear_depth[index]
+        elapsed_s, grown = np.ones(len(stamps)), np.zeros(wear_depth.shape)
+        elapsed_s[1:], grown[1:] = np.diff(stamps) * 1e-9, np.diff(wear_depth, axis=0)
         if before_ns is not None:
-            elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, depth[0] - depth_before
-        self._slow_ns, self._slow_depth = int(stamps[-1]), depth[-1].copy()
-        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, depth))
-        intervals = np.stack((low, high), axis=-1).reshape(len(depth), -1)
-        clearance = np.concatenate((clearances(self._scene, depth), intervals), axis=-1)
+            elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - depth_before
+        self._slow_ns, self._slow_wear_depth = int(stamps[-1]), wear_depth[-1].copy()
+        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
+        intervals = np.stack((low, high), axis=-1).reshape(len(wear_depth), -1)
+        clearance = np.concatenate((clearances(self._scene, wear_depth), intervals), axis=-1)
         return index, clearance, grown / elapsed_s[:, None]
 
-    def _slow_part(self, depth: Array) -> Slow | None:
+    def _slow_part(self, wear_depth: Array) -> Slow | None:
         before_ns = self._slow_ns
         if before_ns is not None and self._stamp_ns // SLOW_PERIOD_NS == before_ns // SLOW_PERIOD_NS:
             return None
-        grown = np.zeros(PAIR_COUNT) if before_ns is None else depth - self._slow_depth
+        grown = np.zeros(PAIR_COUNT) if before_ns is None else wear_depth - self._slow_wear_depth
         elapsed_s = 1.0 if before_ns is None else (self._stamp_ns - before_ns) * 1e-9
-        self._slow_ns, self._slow_depth = self._stamp_ns, depth.copy()
-        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, depth))
+        self._slow_ns, self._slow_wear_depth = self._stamp_ns, wear_depth.copy()
+        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         intervals = np.stack((low, high), axis=1).ravel()
-        return Slow(np.concatenate((clearances(self._scene, depth), intervals)), grown / elapsed_s)
+        return Slow(np.concatenate((clearances(self._scene, wear_depth), intervals)), grown / elapsed_s)
 
     def state(self) -> bytes:
-        """Return what the next frame depends on beside the next advance, exactly."""
+        """Return what the next publication depends on beside the next advance, exactly."""
         slow_ns = -1 if self._slow_ns is None else self._slow_ns
-        numbers = (self._touches, self._impulse, self._peak, self._slow_depth, np.array([slow_ns]))
+        numbers = (self._makes, self._impulse, self._peak, self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)
 
     def set_state(self, data: bytes) -> None:
         """Go on from a state that `state` returned."""
         parts = np.frombuffer(data, np.float64, _STATE_SIZE).reshape(4, PAIR_COUNT)
-        self._touches = parts[0].view(np.int64).copy()
-        self._impulse, self._peak, self._slow_depth = (part.copy() for part in parts[1:])
+        self._makes = parts[0].view(np.int64).copy()
+        self._impulse, self._peak, self._slow_wear_depth = (part.copy() for part in parts[1:])
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns
         self._advance = None
