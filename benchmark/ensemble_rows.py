@@ -13,7 +13,7 @@ from lean import rk4
 from work_precision import LEAN_RK4, OURS
 
 from plow_twin import Clearance, Initial, Scene
-from plow_twin.ensemble import simulate_many
+from plow_twin.run.ensemble import simulate_many
 
 Notify = Callable[[str], None]
 SECTION = "ensemble"

@@ -15,12 +15,12 @@ import numpy as np
 from bench_scenes import ROOT, SPARSE, T_END, bench_scene, constants, error_scale
 from cases import Array, Row, pose_error, timed
 
-from plow_twin import Scene, Table, Twin, Twins, simulate
+from plow_twin import Scene, Table, Twin, TwinBatch, simulate
 
 Notify = Callable[[str], None]
 TOL = 1e-6
 TWINS = 256
-_TWIN, _TWINS = "plow_twin Twin", "plow_twin Twins"
+_TWIN, _TWINS = "plow_twin Twin", "plow_twin TwinBatch"
 
 
 def sampled_rows(repeats: int, notify: Notify) -> Iterator[Row]:
@@ -64,7 +64,7 @@ def _many_twins(scene: Scene, t: Array, wrench: Array, samples: int) -> float:
     contacts = [
         dataclasses.replace(scene.contact, stiffness=scene.contact.stiffness * (1.0 + i / TWINS)) for i in range(TWINS)
     ]
-    twins = Twins([dataclasses.replace(scene, contact=contact) for contact in contacts], tol=TOL)
+    twins = TwinBatch([dataclasses.replace(scene, contact=contact) for contact in contacts], tol=TOL)
     twins.advance(1e-6)
     twins.reset(0.0)
 

@@ -124,7 +124,7 @@ def reference_line(scene: Scene, t_end: float, output_dt: float) -> str:
     """Return the scene as the line of numbers that `reference.c` reads."""
     contact, law = scene.contact, LAWS[scene.contact.law]
     kind = _KINDS[contact.law]
-    damping = contact.damping if contact.restitution is None else law.damping_factor(contact.restitution)
+    damping = contact.damping if contact.restitution is None else law.damping_number(contact.restitution)
     numbers: list[float] = [
         scene.frame.width_m, scene.frame.height_m, scene.clearance.horizontal_m, scene.clearance.vertical_m,
         scene.head.mass_kg, scene.head.inertia_kg_m2, scene.gravity.acceleration_m_s2, scene.gravity.arm_m,

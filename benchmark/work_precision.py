@@ -16,9 +16,9 @@ from cases import Array, Case, Row, Sample, pose_error, timed
 from lean import rk4
 
 from plow_twin import Scene, SolverError, Status, simulate
-from plow_twin.simulate import BUDGET, Method, Motion, output_times, run_events
-from plow_twin.solve.compiled import compile_scene
-from plow_twin.solve.layout import COEFFICIENTS, STEPS, T0, new_work
+from plow_twin.run.simulate import BUDGET, Method, Motion, output_times, run_events
+from plow_twin.solve.compiled_scene import compile_scene
+from plow_twin.solve.state import new_work
 
 SECTION = "work_precision"
 OURS, OURS_BARE = "plow_twin events", "plow_twin events, poses only"
@@ -62,7 +62,7 @@ def prepare_simulate(
     tol: float = 1e-9,
     dt: float | None = None,
     *,
-    audit: bool = False,
+    energy_balance: bool = False,
     whole_call: bool = False,
 ) -> Callable[[], Sample]:
     """Prepare `simulate` with everything it gives: poses, rates, forces, penetrations, events, statistics.
@@ -72,7 +72,7 @@ def prepare_simulate(
     method: Method = "events" if dt is None else "rk4"
 
     def run() -> Sample:
-        wall, result = timed(lambda: simulate(scene, t_end, output_dt, tol, method, dt, audit))
+        wall, result = timed(lambda: simulate(scene, t_end, output_dt, tol, method, dt, energy_balance))
         solver = result.solver
         return Sample(
             wall if whole_call else result.wall_s, result.q, solver["steps"], solver["evaluations"], len(result.events)
@@ -92,9 +92,9 @@ def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_EN
     def run() -> Sample:
         wall, (code, motion) = timed(solve)
         if code != Status.OK:
-            raise SolverError(f"at t = {motion.state.clock[T0]:.9g} s: {Status(code).text}")
-        count = motion.state.count
-        return Sample(wall, motion.q, int(count[STEPS]), int(count[COEFFICIENTS]), int(motion.log.length[0]))
+            raise SolverError(f"at t = {motion.state.step_start:.9g} s: {Status(code).text}")
+        state = motion.state
+        return Sample(wall, motion.q, int(state.steps), int(state.evaluations), int(motion.log.length[0]))
 
     # compiles
     nothing = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))

@@ -19,10 +19,10 @@ import llvmlite.binding
 import numpy as np
 from scenes import preset
 from test_solve_flight import swaying
+from test_solve_implicit import damped
 from test_solve_rest import fallen
-from test_solve_stiff import damped
 
-from plow_twin import Contact, Friction, Scene, Twin, Twins, Wear, simulate
+from plow_twin import Contact, Friction, Scene, Twin, TwinBatch, Wear, simulate
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import compile_loads
 
@@ -78,7 +78,7 @@ def _batch() -> Figures:
     scene = preset("bench_kv")
     wider = replace(scene, clearance=replace(scene.clearance, horizontal_m=0.028))
     wrench = np.stack([compile_loads(scene.loads).at(times)] * 2)
-    rows = Twins([scene, wider]).advance_samples(times, wrench)
+    rows = TwinBatch([scene, wider]).advance_samples(times, wrench)
     return {"digest": _digest((rows.q, rows.v, rows.force, rows.peak, rows.impulse)), "steps": int(rows.steps.sum())}
 
 
@@ -92,7 +92,7 @@ CASES: dict[str, Callable[[], Figures]] = {
     "free flight": lambda: _run(swaying(), 3600.0),
     "rest": lambda: _run(fallen(), 600.0),
     "fixed steps": lambda: _run(preset("paper"), method="rk4", dt=1e-4, output_dt=0.1),
-    "energy": lambda: _run(preset("bench_kv"), audit=True),
+    "energy": lambda: _run(preset("bench_kv"), energy_balance=True),
     "samples": lambda: _stream(preset("bench_kv")),
     "samples, bounded": lambda: _stream(preset("bench_kv"), max_evaluations=200),
     "batch": _batch,

@@ -44,7 +44,7 @@ def test_the_readme_s_example_runs() -> None:
 def test_the_model_page_s_law_of_one_s_own_runs() -> None:
     (example,) = blocks(ROOT / "docs" / "model.md", "python")
     # a process of its own: the law stays where it was added
-    code = f"{example}\nfrom plow_twin.model.contact_laws import LAWS\nprint(LAWS[contact.law].damping_factor(0.4))"
+    code = f"{example}\nfrom plow_twin.model.contact_laws import LAWS\nprint(LAWS[contact.law].damping_number(0.4))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=False)
     assert (done.stdout.strip(), done.stderr) == (str(1.2 * (1.0 - 0.4) / 0.4), "")
 
@@ -64,7 +64,7 @@ def test_the_interface_page_is_the_code_s() -> None:
 
 def test_the_model_page_names_reconstruction_s_figures() -> None:
     text = (ROOT / "docs" / "model.md").read_text()
-    result = plow_twin.simulate(loads_scene((ROOT / "config" / "paper.yaml").read_text(), ROOT), 60.0)
+    result = plow_twin.run.simulate(loads_scene((ROOT / "config" / "paper.yaml").read_text(), ROOT), 60.0)
     table = result.statistics
     for pair, senses in (("bottom_right_bottom", "147.6 / 75.0 kN"), ("top_right_top", "183.3 / 90.2 kN")):
         row = table[pair]

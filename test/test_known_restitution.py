@@ -16,7 +16,7 @@ from scenes import ROOT
 from scipy.integrate import solve_ivp
 
 from plow_twin import Contact
-from plow_twin.model.contact_laws import LAWS, exact_damping_factor
+from plow_twin.model.contact_laws import LAWS, exact_damping_number
 
 # delivered restitution at restitution asked for .1 .. .9, .95; published tables of the laws
 ASKED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
@@ -70,7 +70,7 @@ def test_the_other_laws_deliver_what_is_known_of_them(law: str) -> None:
 def test_every_law_delivers_what_the_identity_makes_of_its_damping(law: str) -> None:
     for asked in (0.15, 0.55, 0.85):
         delivered = restitution.measure(law, [asked])[0].delivered
-        assert exact_damping_factor(delivered) == pytest.approx(LAWS[law].damping_factor(asked), rel=1e-7)
+        assert exact_damping_number(delivered) == pytest.approx(LAWS[law].damping_number(asked), rel=1e-7)
 
 
 @pytest.mark.parametrize(

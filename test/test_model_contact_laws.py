@@ -10,22 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plow_twin import Clearance, Contact, Frame, Head, Scene, SceneError
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import row, set_row
 from plow_twin.model.contact import free_force, normal_force, power_term, power_terms, root_terms
-from plow_twin.model.contact_laws import DAMPING_FACTOR_CAP, LAWS, exact_damping_factor
-from plow_twin.model.kernel import kernel
-from plow_twin.model.lanes import row, set_row
+from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, exact_damping_number
 
 
 @pytest.mark.parametrize(
     ("e", "d"), [(0.1, 9.998159), (0.3, 3.087082), (0.5, 1.432751), (0.7, 0.634828), (0.9, 0.166482)]
 )
 def test_exact_damping_factor_is_the_published_one(e: float, d: float) -> None:
-    assert exact_damping_factor(e) == pytest.approx(d, abs=5e-7)
+    assert exact_damping_number(e) == pytest.approx(d, abs=5e-7)
 
 
 @given(st.floats(0.02, 0.999))
 def test_exact_damping_factor_satisfies_its_identity(e: float) -> None:
-    d = exact_damping_factor(e)
+    d = exact_damping_number(e)
     assert 0.0 < d <= 1.0 / e
     if 1.0 - d * e > 1e-9:
         assert d * (1.0 + e) == pytest.approx(math.log((1.0 + d) / (1.0 - d * e)), rel=1e-6)
@@ -34,8 +34,8 @@ def test_exact_damping_factor_satisfies_its_identity(e: float) -> None:
 def test_limits_of_restitution_stay_finite() -> None:
     for name, law in LAWS.items():
         if law.takes_restitution:
-            assert law.damping_factor(1.0) == 0.0, name
-            assert 0.0 < law.damping_factor(0.0) <= DAMPING_FACTOR_CAP, name
+            assert law.damping_number(1.0) == 0.0, name
+            assert 0.0 < law.damping_number(0.0) <= DAMPING_NUMBER_CAP, name
 
 
 @given(st.floats(-0.01, 0.02), st.floats(-5.0, 5.0), st.floats(0.0, 20.0), st.sampled_from([1.0, 1.5, 2.0, 2.2]))

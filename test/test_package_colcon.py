@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from installing import ROOT, clean_environment, copy_sources, run
 
-from plow_twin.presets import PRESETS
+from plow_twin.scene_file.presets import PRESETS
 
 pytestmark = [pytest.mark.package, pytest.mark.timeout(300)]
 

@@ -16,8 +16,8 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.ros.demo import program
 from plow_twin.ros.run_summary import summarise
+from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
-from plow_twin.twin import Twin
 
 
 def _demo(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -35,8 +35,8 @@ from plow_twin import (
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.pairs import CORNER_NAMES
 from plow_twin.model.scene import DOF_NAMES
-from plow_twin.presets import PRESETS, scene_path
 from plow_twin.scene_file import dump_scene, load_scene, loads_scene, scene_schema
+from plow_twin.scene_file.presets import PRESETS, scene_path
 
 MINIMAL = """
 version: 1

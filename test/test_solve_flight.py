@@ -9,9 +9,9 @@ import pytest
 from scenes import preset
 
 from plow_twin import Gravity, Harmonic, Initial, Scene, Table, Twin, simulate
-from plow_twin.simulate import Motion, output_times, run_events
-from plow_twin.solve.compiled import Compiled, compile_scene
-from plow_twin.solve.layout import FLYING, STEPS, new_work
+from plow_twin.run.simulate import Motion, output_times, run_events
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
+from plow_twin.solve.state import new_work
 
 
 def swaying(drift: tuple[float, float, float] = (0.0, 0.0, 0.0), amplitude: float = 1e-3, omega: float = 20.0) -> Scene:
@@ -24,14 +24,14 @@ def swaying(drift: tuple[float, float, float] = (0.0, 0.0, 0.0), amplitude: floa
     return dataclasses.replace(scene, gravity=Gravity(0.0), loads=(load,), initial=Initial(v=tuple(v)))
 
 
-def without_flight(scene: Scene, tol: float) -> Compiled:
+def without_flight(scene: Scene, tol: float) -> CompiledScene:
     compiled = compile_scene(scene, tol)
     return dataclasses.replace(
         compiled, parts=compiled.parts._replace(terms=compiled.parts.terms._replace(flight=None))
     )
 
 
-def run(compiled: Compiled, t_end: float, output_dt: float) -> Motion:
+def run(compiled: CompiledScene, t_end: float, output_dt: float) -> Motion:
     times = output_times(t_end, output_dt)
     motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)), outputs=True)
     assert run_events(compiled, motion, times, t_end, new_work(), 10**7) == (0, len(times))
@@ -40,13 +40,16 @@ def run(compiled: Compiled, t_end: float, output_dt: float) -> Motion:
 
 def test_an_hour_of_swinging_costs_36_steps_and_is_exact() -> None:
     scene, amplitude, omega = swaying(), 1e-3, 20.0
-    result = simulate(scene, 3600.0, 3.7, audit=True)
+    result = simulate(scene, 3600.0, 3.7, energy_balance=True)
     assert result.solver["steps"] == 36 and len(result.events) == 0
     # phases of 72,000 rad are rounded to 1e-11
     shape = np.array([1.0, 0.5, 1.0]) * amplitude
     assert np.abs(result.q + shape * np.sin(omega * result.t)[:, None]).max() < 1e-13
     assert np.abs(result.v + shape * omega * np.cos(omega * result.t)[:, None]).max() < 2e-12
-    assert result.audit is not None and result.audit.imbalance_j < 1e-12 * result.audit.turnover_j
+    assert (
+        result.energy_balance is not None
+        and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -55,7 +58,7 @@ def test_a_drifting_head_meets_the_same_walls_as_the_series_find(seed: int) -> N
     drift = rng.uniform(-3e-3, 3e-3, 3)
     scene = swaying(tuple(drift), 10.0 ** rng.uniform(-5, -3), 10.0 ** rng.uniform(1.0, 2.5))
     flown, expanded = run(compile_scene(scene, 1e-10), 20.0, 0.01), run(without_flight(scene, 1e-10), 20.0, 0.01)
-    assert flown.state.count[STEPS] < expanded.state.count[STEPS]
+    assert flown.state.steps < expanded.state.steps
     first = np.flatnonzero(expanded.force.any(axis=1))
     until = int(first[0]) + 1 if len(first) else len(flown.q)
     assert until < len(flown.q), "the head should meet a wall"
@@ -71,7 +74,7 @@ def test_long_linear_pieces_and_harmonics_are_flown_together() -> None:
     force = np.array([[0.0, 0.0, 0.0], [0.02, -0.01, 0.0], [-0.02, 0.01, 0.005], [0.0, 0.0, 0.0]])
     scene = dataclasses.replace(scene, loads=(*scene.loads, Table("drift", knots, force)))
     flown, expanded = run(compile_scene(scene, 1e-11), 40.0, 0.1), run(without_flight(scene, 1e-11), 40.0, 0.1)
-    assert flown.state.count[STEPS] < 0.1 * expanded.state.count[STEPS]
+    assert flown.state.steps < 0.1 * expanded.state.steps
     assert np.abs(flown.q - expanded.q).max() < 1e-11 and np.abs(flown.v - expanded.v).max() < 1e-10
 
 
@@ -79,7 +82,7 @@ def test_a_twin_in_flight_is_asked_saved_and_restored_without_a_trace() -> None:
     scene = swaying((2e-4, 0.0, 0.0))
     twin, other = Twin(scene), Twin(scene)
     asked = [twin.advance(t) for t in np.linspace(0.1, 40.0, 700)]
-    assert twin._state.step[FLYING] == 1
+    assert twin._state.in_flight == 1
     assert other.advance(40.0).q.tolist() == asked[-1].q.tolist()
     restored = Twin(scene)
     restored.restore(twin.snapshot())

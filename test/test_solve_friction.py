@@ -10,7 +10,7 @@ import pytest
 from scenes import pose_error, preset
 
 from plow_twin import Clearance, Constant, Contact, Frame, Friction, Gravity, Head, Initial, Scene, simulate
-from plow_twin.solve import compiled
+from plow_twin.solve import compiled_scene
 
 MASS, G, STIFFNESS, MU, SPEED = 800.0, 9.81, 1e8, 0.3, 0.02
 
@@ -55,15 +55,15 @@ def test_a_push_above_the_limit_accelerates_it_by_what_is_left() -> None:
 @pytest.mark.parametrize("name", ["paper", "bench_hc"])
 def test_both_solvers_agree_and_the_books_balance(name: str) -> None:
     scene = replace(preset(name), friction=Friction(0.3, 0.02))
-    events = simulate(scene, 2.0, output_dt=0.1, audit=True)
+    events = simulate(scene, 2.0, output_dt=0.1, energy_balance=True)
     steps = simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=1e-5)
     assert pose_error(scene, steps.q, events.q) < 1e-7
-    assert events.audit is not None and events.audit.relative_imbalance < 1e-12
-    assert events.audit.friction_work_j > 100.0
+    assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-12
+    assert events.energy_balance.friction_work_j > 100.0
     without = simulate(preset(name), 2.0, output_dt=0.1)
     assert pose_error(scene, without.q, events.q) > 1e-3
 
 
 def test_without_friction_none_of_its_code_is_compiled() -> None:
     for friction in (None, Friction(0.0)):
-        assert compiled.compile_scene(replace(preset("paper"), friction=friction), 1e-9).parts.terms.slip is None
+        assert compiled_scene.compile_scene(replace(preset("paper"), friction=friction), 1e-9).parts.terms.slip is None

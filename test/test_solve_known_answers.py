@@ -12,7 +12,7 @@ import pytest
 from scenes import preset, wall_and_point
 
 from plow_twin import Clearance, Constant, Contact, Frame, Gravity, Head, Scene, SolverError, simulate
-from plow_twin.model.contact_laws import exact_damping_factor
+from plow_twin.model.contact_laws import exact_damping_number
 
 
 def test_hertz_impact_of_a_sphere_on_a_rigid_plane() -> None:
@@ -34,7 +34,7 @@ def test_depth_and_time_of_an_impact(n: float, duration: float) -> None:
     undamped = simulate(wall_and_point(Contact("hertz", stiffness, n), speed=speed, mass=mass), 0.1, tol=1e-11)
     depth = ((n + 1.0) * mass * speed**2 / (2.0 * stiffness)) ** (1.0 / (n + 1.0))
     assert np.diff(undamped.events["time"])[0] == pytest.approx(duration * depth / speed, rel=1e-8)
-    d = exact_damping_factor(0.4)
+    d = exact_damping_number(0.4)
     expected = ((n + 1.0) * mass * speed**2 / stiffness * (d - math.log1p(d)) / d**2) ** (1.0 / (n + 1.0))
     scene = wall_and_point(Contact("exact_restitution", stiffness, n, restitution=0.4), speed=speed, mass=mass)
     damped = simulate(scene, 0.009, output_dt=1e-7, tol=1e-11)

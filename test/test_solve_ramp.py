@@ -11,7 +11,7 @@ from scenes import pose_error, preset, wall_and_point
 
 from plow_twin import Contact, ContactLaw, SceneError, add_law, simulate
 from plow_twin.model import contact_laws
-from plow_twin.model.contact_laws import exact_damping_factor
+from plow_twin.model.contact_laws import exact_damping_number
 
 
 def delivered(contact: Contact, mass: float = 2.0) -> float:
@@ -34,10 +34,10 @@ def test_a_short_ramp_is_kelvin_voigt_and_a_long_one_elastic() -> None:
 def test_both_solvers_agree(stiffness: float, exponent: float) -> None:
     contact = Contact("ramped_damping", stiffness, exponent, damping=6e4, ramp_m=1e-3)
     scene = replace(preset("paper"), contact=contact)
-    events = simulate(scene, 2.0, output_dt=0.1, audit=True)
+    events = simulate(scene, 2.0, output_dt=0.1, energy_balance=True)
     steps = simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=1e-5)
     assert pose_error(scene, steps.q, events.q) < 1e-6
-    assert events.audit is not None and events.audit.relative_imbalance < 1e-12
+    assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-12
     assert 2 in events.events["mode_to"]
 
 
@@ -58,11 +58,11 @@ def laws_restored() -> Iterator[None]:
 @pytest.mark.usefixtures("laws_restored")
 def test_a_law_of_one_s_own_works_like_the_others() -> None:
     """One definition: scenes, checks and every solver take it."""
-    add_law("half_exact", ContactLaw("half exact", "of this test", lambda e: 0.5 * exact_damping_factor(e)))
+    add_law("half_exact", ContactLaw("half exact", "of this test", lambda e: 0.5 * exact_damping_number(e)))
     stiffness, e = 1e8, 0.6
     scene = replace(preset("paper"), contact=Contact("half_exact", stiffness, restitution=e))
     assert delivered(scene.contact) > e + 0.1
-    damping = 0.5 * exact_damping_factor(e)
+    damping = 0.5 * exact_damping_number(e)
     assert delivered(scene.contact) == pytest.approx(
         delivered(Contact("hunt_crossley", stiffness, damping=damping)), abs=1e-9
     )

@@ -11,8 +11,7 @@ from scipy.optimize import fsolve
 
 from plow_twin import Gravity, Harmonic, Initial, Scene, Twin, Wear, simulate
 from plow_twin.model.geometry import arm_rows, body_state, penetration_rows
-from plow_twin.solve.compiled import compile_scene
-from plow_twin.solve.layout import RESTING
+from plow_twin.solve.compiled_scene import compile_scene
 
 LAWS = ("kelvin_voigt", "exact_restitution")
 
@@ -45,14 +44,17 @@ def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("law", LAWS)
 def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> None:
     scene = fallen(law)
-    result = simulate(scene, 3600.0, 360.0, audit=True)
+    result = simulate(scene, 3600.0, 360.0, energy_balance=True)
     settled = simulate(scene, 120.0, 1.0)
     assert result.solver["steps"] < settled.solver["steps"] + 40
     assert np.array_equal(result.q[1], result.q[-1]) and not result.v[-1].any()
     assert np.abs(result.q[-1] - static_pose(scene, result.q[-1])).max() < 1e-12
     weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
-    assert result.audit is not None and result.audit.imbalance_j < 1e-12 * result.audit.turnover_j
-    assert np.abs(result.audit.momentum_imbalance).max() < 1e-12 * weight * 3600.0
+    assert (
+        result.energy_balance is not None
+        and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
+    )
+    assert np.abs(result.energy_balance.momentum_imbalance).max() < 1e-12 * weight * 3600.0
     # the pads carry the weight meanwhile: the totals go on
     carried = sum(row["impulse"] for row in result.statistics.values())
     before = sum(row["impulse"] for row in settled.statistics.values())
@@ -67,7 +69,7 @@ def test_a_load_that_changes_wakes_the_head() -> None:
     rows = [twin.advance_samples(t, wrench) for twin in twins]
     assert rows[0].steps[45:50].max() <= 1
     assert np.abs(rows[0].q[50:] - rows[1].q[50:]).max() < 1e-8
-    assert np.ptp(rows[0].q[50:], axis=0).max() > 1e-3 and twins[0]._state.step[RESTING] == 0
+    assert np.ptp(rows[0].q[50:], axis=0).max() > 1e-3 and twins[0]._state.at_rest == 0
 
 
 def test_what_slides_is_not_at_rest() -> None:
@@ -91,7 +93,7 @@ def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
     )  # fmt: skip
     twin = Twin(scene, tol=1e-6)
     twin.advance(1e-3)
-    assert bool(twin._state.step[RESTING]) == stable
+    assert bool(twin._state.at_rest) == stable
     nudged = dataclasses.replace(scene, initial=Initial((0.0, -sunk, 1e-9)))
     theta = np.abs(simulate(nudged, 9.0, 0.01, tol=1e-9).q[:, 2])
     assert theta.max() < 2e-9 if stable else theta.max() > 1e-3
@@ -100,7 +102,7 @@ def test_an_unstable_balance_is_not_rest(corners: tuple[str, ...]) -> None:
 def test_a_twin_at_rest_is_asked_saved_and_restored_without_a_trace() -> None:
     twin, other = Twin(fallen()), Twin(fallen())
     rows = [twin.advance(t) for t in np.linspace(0.5, 77.7, 300)]
-    assert twin._state.step[RESTING] == 1 and not rows[-1].v.any()
+    assert twin._state.at_rest == 1 and not rows[-1].v.any()
     assert other.advance(77.7).q.tolist() == rows[-1].q.tolist()
     restored = Twin(fallen())
     restored.restore(twin.snapshot())

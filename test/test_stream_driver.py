@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from plow_twin.presets import scene_path
+from plow_twin.run.twin import Status, Twin
 from plow_twin.scene_file import load_scene
-from plow_twin.stream.driver import Driver, Policy, State, counters
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.driver import Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
 from plow_twin.stream.journal import Entry, Hold, Reset, Sample
 from plow_twin.stream.session import Session
-from plow_twin.twin import Status, Twin
 
 SCENE = load_scene(scene_path("paper"))
 T0 = 1_795_000_000_000_000_000
@@ -45,12 +45,12 @@ def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     held = bench.journal[2:]
     first: Entry = Sample(T0 + 21 * MS, (0.0, 0.0, 0.0)) if hold == "zero" else Hold(T0 + 21 * MS)
     assert held == [first, Hold(T0 + 31 * MS)]
-    assert driver.state is State.STALE
+    assert driver.state is StreamState.STALE
 
     # what the model has passed is late, the next one is used at once
     assert driver.sample(T0 + 31 * MS, LOAD, now_ns=132 * MS) is None
     assert driver.sample(T0 + 32 * MS, LOAD, now_ns=132 * MS) is not None
-    assert driver.state is State.RUNNING
+    assert driver.state is StreamState.RUNNING
     assert counters(driver)["dropped_late"] == 1
     assert counters(driver)["holds"] == 2
 
@@ -120,7 +120,7 @@ def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_res
     assert isinstance(bench.journal[-1], Reset)
     recovered = driver.sample(T0 + 30 * MS, LOAD, now_ns=30 * MS)
     assert recovered is not None and recovered.status is Status.OK
-    assert driver.state is State.RUNNING
+    assert driver.state is StreamState.RUNNING
 
 
 def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:

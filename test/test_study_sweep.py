@@ -21,8 +21,8 @@ from plow_twin.errors import SceneError
 from plow_twin.scene_file import dump_scene
 from plow_twin.study.parameters import StudyError, parameter_of, parameter_paths, with_parameters
 from plow_twin.study.store import Store
-from plow_twin.study.sweep import Sweep, parse_axis
-from plow_twin.study.sweep_run import run_here, run_on_cluster
+from plow_twin.study.sweep.run import run_here, run_on_cluster
+from plow_twin.study.sweep.table import Sweep, parse_axis
 
 GRID = ["--x", "clearance.horizontal_m=0.020:0.030:5", "--y", "contact.stiffness=6e6:6e7:3:log"]
 STATISTICS = (
@@ -119,7 +119,7 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.Capt
 def test_failed_members_are_listed_and_other_questions_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plow_twin.study.sweep_run.CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("plow_twin.study.sweep.run.CONNECT_TIMEOUT_S", 0.5)
     arguments = ["study", "sweep", "paper", "--statistic", "max", "--t-end", "2", "--out", str(tmp_path)]
     arguments += ["--x", "contact.stiffness=1e3,-1,1e7,1e8"]
     assert run(arguments) == 3

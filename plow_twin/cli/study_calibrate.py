@@ -10,14 +10,14 @@ import click
 
 from plow_twin.cli.console import DONE, POSITIVE, output_console, progress, quiet_option, table
 from plow_twin.cli.study_options import set_option, study_scene, usage_errors
-from plow_twin.presets import config_folder
+from plow_twin.scene_file.presets import config_folder
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
-    from plow_twin.study.calibrate import Calibration, Search
-    from plow_twin.study.fit import Fit
-    from plow_twin.study.objective import Objective
-    from plow_twin.study.unknowns import Space
+    from plow_twin.study.calibration.calibrate import Calibration, Search
+    from plow_twin.study.calibration.fit import Fit
+    from plow_twin.study.calibration.objective import Objective
+    from plow_twin.study.calibration.unknowns import Space
 
 
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, scene or targets.")
@@ -57,9 +57,9 @@ def calibrate(
     scene: str, out: Path, quiet: bool, settings: tuple[str, ...], unknowns: tuple[str, ...], **options: Any
 ) -> int:
     """Fit unknowns of SCENE to published figures or to a recorded motion; writes fit.yaml and calibration.json."""
-    from plow_twin.study.calibrate import Search
-    from plow_twin.study.fit import write_fit
-    from plow_twin.study.unknowns import Space, check_usable, parse_unknown
+    from plow_twin.study.calibration.calibrate import Search
+    from plow_twin.study.calibration.fit import write_fit
+    from plow_twin.study.calibration.unknowns import Space, check_usable, parse_unknown
 
     with usage_errors():
         model, objective, source, proposed = _objective(scene, settings, options)
@@ -103,9 +103,9 @@ def _objective(
     """Return the scene, the objective, what it is called, and the unknowns that the target file proposes."""
     from dataclasses import replace
 
-    from plow_twin.study.objective import RecordingObjective, TargetObjective
-    from plow_twin.study.pose_recording import load_poses
-    from plow_twin.study.targets import load_targets
+    from plow_twin.study.calibration.objective import RecordingObjective, TargetObjective
+    from plow_twin.study.calibration.pose_recording import load_poses
+    from plow_twin.study.calibration.targets import load_targets
 
     target, recording, workers = options["target"], options["recording"], options["workers"]
     if (target is None) == (recording is None):
@@ -138,10 +138,10 @@ def _run(
     options: dict[str, Any],
     quiet: bool,
 ) -> Fit:
-    from plow_twin.study.calibrate import calibrate as fit_to
-    from plow_twin.study.fit import Fit, fitted_scene, objective_of, target_rows
-    from plow_twin.study.objective import TargetObjective
-    from plow_twin.study.uniqueness import identifiability, near_optimal
+    from plow_twin.study.calibration.calibrate import calibrate as fit_to
+    from plow_twin.study.calibration.fit import Fit, fitted_scene, objective_of, target_rows
+    from plow_twin.study.calibration.objective import TargetObjective
+    from plow_twin.study.calibration.uniqueness import identifiability, near_optimal
 
     first = space.point(model)
     with progress("calibrating", quiet) as on_progress:

@@ -21,7 +21,7 @@ from plow_twin.cli.study_options import set_option, study_scene, usage_errors
 
 if TYPE_CHECKING:
     from plow_twin.study.store import Store
-    from plow_twin.study.sweep import Axis, Table
+    from plow_twin.study.sweep.table import Axis, Table
 
 #: Rows of a table on the terminal; larger ones are thinned out, files hold everything.
 MOST_ROWS: Final = 24
@@ -71,8 +71,8 @@ def sweep(
     from plow_twin.scene_file import dump_scene
     from plow_twin.study.report import require
     from plow_twin.study.store import Store
-    from plow_twin.study.sweep import Sweep, parse_axis
-    from plow_twin.study.sweep_output import draw, write_parquet
+    from plow_twin.study.sweep.output import draw, write_parquet
+    from plow_twin.study.sweep.table import Sweep, parse_axis
 
     require("matplotlib", "pyarrow", *(["distributed"] if dask else []))
     with usage_errors():
@@ -108,7 +108,7 @@ def _list_failed(result: Table) -> None:
 
 
 def _computed(store: Store, workers: int | None, dask: str | None, quiet: bool) -> Table:
-    from plow_twin.study.sweep_run import run_here, run_on_cluster
+    from plow_twin.study.sweep.run import run_here, run_on_cluster
 
     size, chunks = store.sweep.size, store.chunks
     lacking = sum(len(chunks[index]) for index in store.missing())

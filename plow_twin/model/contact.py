@@ -14,33 +14,45 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.model.kernel import kernel
-from plow_twin.model.lanes import row, splat
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import row, splat
 
 
 @kernel(inline=True)
 def free_force(
-    penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float, ramp: float
+    penetration: float,
+    rate: float,
+    stiffness: float,
+    exponent: float,
+    damping_factor: float,
+    viscous: float,
+    ramp: float,
 ) -> float:
     """Return the law's F in N for penetration d in m and rate d' in m/s, negative where it would pull.
 
-    `factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero. `ramp` in m is zero without a ramp.
+    `damping_factor` is lambda in s/m, `viscous` is C in N s/m; one of them is zero. `ramp` in m is zero without a ramp.
     """
     elastic = stiffness * (penetration if exponent == 1.0 else max(penetration, 0.0) ** exponent)
     if ramp > 0.0 and penetration < ramp:
         share = penetration / ramp
         viscous *= share * share * (3.0 - 2.0 * share)
-    return elastic * (1.0 + factor * rate) + viscous * rate
+    return elastic * (1.0 + damping_factor * rate) + viscous * rate
 
 
 @kernel(inline=True)
 def normal_force(
-    penetration: float, rate: float, stiffness: float, exponent: float, factor: float, viscous: float, ramp: float
+    penetration: float,
+    rate: float,
+    stiffness: float,
+    exponent: float,
+    damping_factor: float,
+    viscous: float,
+    ramp: float,
 ) -> float:
     """Return F >= 0 in N: a contact never pulls, nor acts from outside (`free_force`)."""
     if penetration <= 0.0:
         return 0.0
-    return max(0.0, free_force(penetration, rate, stiffness, exponent, factor, viscous, ramp))
+    return max(0.0, free_force(penetration, rate, stiffness, exponent, damping_factor, viscous, ramp))
 
 
 @kernel(fast=True, inline=True)

@@ -1,7 +1,7 @@
 """Contact laws: each is one definition with its equation and its source.
 
 Most laws have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive inward. They differ
-in the damping factor  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch. The others
+in the damping number  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch. The others
 add C d' to K d^n, at once (Kelvin-Voigt) or ramped in. A law is added by one entry in `LAWS`, by `add_law` from
 outside: every solver reads nothing but these numbers.
 """
@@ -17,10 +17,10 @@ from typing import Final
 from scipy.optimize import brentq
 
 #: Largest D = lambda v0 used: a restitution below about 1/1000 would need an unbounded damping.
-DAMPING_FACTOR_CAP: Final = 1e3
+DAMPING_NUMBER_CAP: Final = 1e3
 
 
-def exact_damping_factor(restitution: float) -> float:
+def exact_damping_number(restitution: float) -> float:
     """Return the D that delivers the restitution e exactly:  D (1 + e) = ln((1 + D) / (1 - D e)).
 
     It holds for F = K d^n (1 + lambda d') whatever K, n and the mass. D is 0 at e = 1 and unbounded as e goes to 0.
@@ -51,7 +51,7 @@ class ContactLaw:
     title: str
     source: str
     #: D(e) of the law, or None where the law has no restitution form
-    factor: Callable[[float], float] | None = None
+    number_of: Callable[[float], float] | None = None
     takes_damping: bool = True
     #: the only exponent the law admits, or None
     exponent: float | None = None
@@ -63,21 +63,21 @@ class ContactLaw:
     @property
     def takes_restitution(self) -> bool:
         """Whether the law can be asked for a restitution."""
-        return self.factor is not None
+        return self.number_of is not None
 
-    def damping_factor(self, restitution: float) -> float:
+    def damping_number(self, restitution: float) -> float:
         """Return D = lambda v0 of the law for the restitution asked of it."""
-        if self.factor is None:
+        if self.number_of is None:
             raise ValueError(f"{self.title} has no restitution form")
         try:
-            return min(self.factor(restitution), DAMPING_FACTOR_CAP)
+            return min(self.number_of(restitution), DAMPING_NUMBER_CAP)
         except ZeroDivisionError:
-            return DAMPING_FACTOR_CAP
+            return DAMPING_NUMBER_CAP
 
 
 _LAWS: Final[dict[str, ContactLaw]] = {
     "exact_restitution": ContactLaw(
-        "exact restitution", "D (1 + e) = ln((1 + D) / (1 - D e))", exact_damping_factor, takes_damping=False
+        "exact restitution", "D (1 + e) = ln((1 + D) / (1 - D e))", exact_damping_number, takes_damping=False
     ),
     "kelvin_voigt": ContactLaw(
         "Kelvin-Voigt", "F = max(0, K d + C d'); Goldsmith, Impact, 1960", exponent=1.0, additive=True

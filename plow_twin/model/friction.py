@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from plow_twin.model.kernel import kernel
+from plow_twin.kernel.compiler import kernel
 
 
 @kernel(inline=True)

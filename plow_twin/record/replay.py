@@ -17,16 +17,17 @@ from typing import Any, Final
 
 import numpy as np
 
+from plow_twin.build import build_fingerprint
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode
-from plow_twin.record.header import RunHeader, build_fingerprint
+from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.record.outputs import FRAME_TOPICS, frame_messages
+from plow_twin.record.outputs import FRAME_TOPICS, publication_messages
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
+from plow_twin.run.twin import Twin
 from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot
 from plow_twin.stream.session import Session
-from plow_twin.twin import Twin
 
 #: Topics that depend on the frame before: after a lost message they can be compared again from the next snapshot on.
 _CUMULATIVE: Final = frozenset({"contact_peaks", "clearance", "wear_rate"})
@@ -221,7 +222,7 @@ class _Replay:
         if self.messages is None:  # the first message of a frame
             frame = self.session.outputs.take()
             frames = (self.header.frame_id, self.header.child_frame_id)
-            self.messages = {} if frame is None else frame_messages(frame, *frames)
+            self.messages = {} if frame is None else publication_messages(frame, *frames)
         computed = self.messages.get(name)
         if computed is None and self.resumed:
             self.report.not_compared[name] += 1

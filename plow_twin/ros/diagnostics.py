@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from plow_twin.ros.inputs import TOPICS
-from plow_twin.stream.driver import State, counters
+from plow_twin.stream.driver import StreamState, counters
 
 if TYPE_CHECKING:
     from plow_twin.ros.runtime import Runtime
@@ -102,7 +102,7 @@ def markdown_tables() -> dict[str, str]:
     }
 
 
-_LEVELS: Final = {State.WAITING: OK, State.RUNNING: OK, State.STALE: WARN, State.FAILED: ERROR}
+_LEVELS: Final = {StreamState.WAITING: OK, StreamState.RUNNING: OK, StreamState.STALE: WARN, StreamState.FAILED: ERROR}
 
 
 def status(
@@ -121,12 +121,12 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None) -> tuple[bytes
         return (ERROR if reason else OK), reason or lifecycle, values
     state = runtime.driver.state
     values["stream"] = state.name.lower()
-    values["stale_inputs"] = "excitation" if state is State.STALE else ""
+    values["stale_inputs"] = "excitation" if state is StreamState.STALE else ""
     values |= dict.fromkeys(("horizontal", "vertical", "pads"), "prior")
     values |= {f"publishers_{topic}": str(count) for topic, count in runtime.inputs.publishers.items()}
     if lifecycle != "active":
         return OK, lifecycle, values
-    message = f"{state.value}: {runtime.driver.failure}" if state is State.FAILED else state.value
+    message = f"{state.value}: {runtime.driver.failure}" if state is StreamState.FAILED else state.value
     return _LEVELS[state], message, values
 
 
@@ -140,7 +140,7 @@ class Health:
         """Return lifecycle, stream and solver."""
         level, message, _ = summary(lifecycle, reason, runtime)
         if runtime is not None and self._grown({"solver_failures": runtime.driver.failures}, ("solver_failures",)):
-            level, message = ERROR, f"{State.FAILED.value}: {runtime.driver.failure}"
+            level, message = ERROR, f"{StreamState.FAILED.value}: {runtime.driver.failure}"
         values = dict.fromkeys(KEYS["state"], "")
         values |= {"lifecycle": lifecycle, "reason": reason}
         if runtime is not None:
@@ -174,7 +174,7 @@ class Health:
             "refused_publishers": str(inputs.refused_publishers),
         }
         grown = self._grown({**counted, "messages_lost": inputs.lost}, _TROUBLE)
-        if runtime.driver.state is State.STALE:
+        if runtime.driver.state is StreamState.STALE:
             grown.insert(0, "excitation stale")
         if "dropped_unstamped" in grown:
             return ERROR, "; ".join(grown), values

@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 from plow_twin.model.loads import load_direction
 from plow_twin.model.scene import Constant, Harmonic, Scene
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.outputs import Frame
+from plow_twin.stream.outputs import Publication
 
 Wrench = tuple[float, float, float]
 
@@ -106,11 +106,11 @@ class OdometryWriter:
         self.message = Odometry(child_frame_id=child_frame_id)
         self.message.header.frame_id = frame_id
 
-    def write(self, frame: Frame) -> Odometry:
-        """Return the message of one frame."""
-        set_stamp(self.message.header, frame.stamp_ns)
-        x, y, theta = frame.q.tolist()
-        vx, vy, omega = frame.v.tolist()
+    def write(self, publication: Publication) -> Odometry:
+        """Return the message of one publication."""
+        set_stamp(self.message.header, publication.stamp_ns)
+        x, y, theta = publication.q.tolist()
+        vx, vy, omega = publication.v.tolist()
         cos, sin = math.cos(theta), math.sin(theta)
         pose, twist = self.message.pose.pose, self.message.twist.twist
         pose.position.x, pose.position.y = x, y

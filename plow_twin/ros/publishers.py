@@ -1,4 +1,4 @@
-"""The outputs of a frame as ROS messages."""
+"""The outputs of a publication as ROS messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sensor_msgs.msg import JointState
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.ros.messages import JointStateWriter, OdometryWriter
 from plow_twin.ros.qos import OUTPUT
-from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, Frame
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, Publication
 
 #: Output topics that follow from the motion, with their types.
 TOPICS: Final[dict[str, type]] = {
@@ -24,8 +24,8 @@ TOPICS: Final[dict[str, type]] = {
 }
 
 
-class FramePublishers:
-    """Publishers of all outputs of a frame; their messages are written over."""
+class OutputPublishers:
+    """Publishers of all outputs of a publication; their messages are written over."""
 
     def __init__(self, node: Node, frame_id: str, child_frame_id: str) -> None:
         self._node = node
@@ -37,16 +37,18 @@ class FramePublishers:
         self._wear_rate = JointStateWriter(frame_id, PAD_NAMES, ("velocity",))
         self.published = 0
 
-    def publish(self, frame: Frame, forces_sent: Callable[[], None]) -> None:
-        """Publish a frame, the forces first; `forces_sent` is called right after them."""
-        stamp = frame.stamp_ns
-        self._send("contact_forces", self._forces.write(stamp, frame.penetration, frame.rate, frame.force))
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
+        """Send a publication, the forces first; `forces_sent` is called right after them."""
+        stamp = publication.stamp_ns
+        self._send(
+            "contact_forces", self._forces.write(stamp, publication.penetration, publication.rate, publication.force)
+        )
         forces_sent()
-        self._send("contact_peaks", self._peaks.write(stamp, frame.touches, frame.impulse, frame.peak))
-        self._send("head_state", self._head.write(frame))
-        if frame.slow is not None:
-            self._send("clearance", self._clearance.write(stamp, frame.slow.clearance))
-            self._send("wear_rate", self._wear_rate.write(stamp, frame.slow.wear_rate))
+        self._send("contact_peaks", self._peaks.write(stamp, publication.makes, publication.impulse, publication.peak))
+        self._send("head_state", self._head.write(publication))
+        if publication.slow is not None:
+            self._send("clearance", self._clearance.write(stamp, publication.slow.clearance))
+            self._send("wear_rate", self._wear_rate.write(stamp, publication.slow.wear_rate))
         self.published += 1
 
     def close(self) -> None:

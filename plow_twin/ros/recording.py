@@ -11,13 +11,13 @@ from typing import Final
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
-from plow_twin.record.outputs import frame_messages
+from plow_twin.record.outputs import publication_messages
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
 from plow_twin.ros.diagnostics import Part
 from plow_twin.ros.parameters import Settings
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
-from plow_twin.stream.outputs import Frame
+from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 _QUEUE_SIZE: Final = 20_000
@@ -84,10 +84,10 @@ class Recording:
         """Take a journal entry; a loss is counted by the recorder."""
         self._recorder.journal(entry)
 
-    def frame(self, frame: Frame) -> None:
-        """Take the messages of a frame that has been published."""
-        for topic, message in frame_messages(frame, *self._frames).items():
-            self._recorder.output(self._topics[topic], frame.stamp_ns, message)
+    def publication(self, publication: Publication) -> None:
+        """Take the messages of a publication that has been published."""
+        for topic, message in publication_messages(publication, *self._frames).items():
+            self._recorder.output(self._topics[topic], publication.stamp_ns, message)
 
     def status(self, stamp_ns: int, name: str, hardware_id: str, report: Part) -> None:
         """Take a status that has been published."""

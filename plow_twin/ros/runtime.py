@@ -15,24 +15,23 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from plow_twin.model.scene import Scene
-from plow_twin.presets import scene_path
 from plow_twin.ros.inputs import Inputs
 from plow_twin.ros.messages import Wrench
 from plow_twin.ros.parameters import Settings
-from plow_twin.ros.publishers import TOPICS, FramePublishers
+from plow_twin.ros.publishers import TOPICS, OutputPublishers
 from plow_twin.ros.solver_start import warm_up
+from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.driver import Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.session import Session
-from plow_twin.twin import Twin
 
 if TYPE_CHECKING:
-    from plow_twin.advance import Advance
     from plow_twin.ros.diagnostics import Part
     from plow_twin.ros.recording import Recording
+    from plow_twin.run.advance import Advance
 
 _CATCH_UP_S: Final = 0.002
 
@@ -66,7 +65,7 @@ class Runtime:
         self._settings = settings
         self._changed = changed
         self.sim_time: bool = node.get_parameter("use_sim_time").value
-        self.scene: Scene = load_scene(scene_path(settings.scene))
+        self.scene: Scene = load_scene(settings.scene)
         sampled = settings.excitation_source != "scene"
         node.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
         twin = Twin(self.scene, tol=settings.tolerance, excitation="sampled" if sampled else "scene")
@@ -74,7 +73,7 @@ class Runtime:
         self.compile_s = warm_up(twin, stop_asked)
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
-        #: frames that were not published because a number was not finite
+        #: publications that were not published because a number was not finite
         self.withheld = 0
         self._received_ns = 0
         self._q: NDArray[np.float64] | None = None
@@ -88,7 +87,7 @@ class Runtime:
         self.recording = self._record()
         if self.recording:
             made.callback(self.recording.close)
-        self._publishers = FramePublishers(node, settings.frame_id, settings.child_frame_id)
+        self._publishers = OutputPublishers(node, settings.frame_id, settings.child_frame_id)
         made.callback(self._publishers.close)
         session = Session(twin, on_entry=self.recording.journal if self.recording else _ignore)
         self.driver = Driver(session, self._intake(), policy(settings))
@@ -114,7 +113,7 @@ class Runtime:
 
     @property
     def published(self) -> int:
-        """Number of frames published."""
+        """Number of publications."""
         return self._publishers.published
 
     @property
@@ -251,18 +250,18 @@ class Runtime:
         self._changed()
 
     def _publish(self) -> None:
-        frame = self.driver.session.outputs.take()
-        if frame is None:
+        publication = self.driver.session.outputs.take()
+        if publication is None:
             return
-        if not frame.finite:
+        if not publication.finite:
             self.withheld += 1
             return
-        self._q = frame.q
-        self._publishers.publish(frame, self._forces_sent)
+        self._q = publication.q
+        self._publishers.publish(publication, self._forces_sent)
         if self._received_ns and not self.sim_time:
-            self.age.add((time.time_ns() - frame.stamp_ns) * 1e-9)
+            self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
         if self.recording:
-            self.recording.frame(frame)
+            self.recording.publication(publication)
 
     def _forces_sent(self) -> None:
         if self._received_ns:

@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Final
 
 from plow_twin.errors import PlowTwinError
-from plow_twin.twin import Twin
+from plow_twin.run.twin import Twin
 
 #: Longest time for which a request to stop is not seen [s].
 _LOOK_S: Final = 0.05

@@ -5,19 +5,10 @@ Guards are polynomials of the step; `polynomial.first_root` finds where one turn
 
 from __future__ import annotations
 
-from plow_twin.model.kernel import kernel
-from plow_twin.model.lanes import below, magnitude, row, set_row, splat
-from plow_twin.solve.layout import (
-    CLIPPED,
-    CROSSING,
-    GUARD_ROOTS,
-    OFF,
-    ON,
-    RATIO,
-    RELEASED,
-    SIGN,
-)
-from plow_twin.solve.polynomial import first_root, first_root_within
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.polynomial import first_root, first_root_within
+from plow_twin.kernel.simd import below, magnitude, row, set_row, splat
+from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
 
 @kernel(fast=True)
@@ -26,7 +17,7 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
 
     off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, else d >= 0 or a small depth; others: d >= 0.
     """
-    guard, weights = w.guard, w.lanes
+    guard, weights = w.guard, w.per_pair
     for pair in range(8):
         mode = state.mode[pair]
         weights[SIGN, pair] = 0.0 if p.enabled[pair] == 0 else -1.0 if mode == OFF else 1.0
@@ -35,7 +26,7 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
             weights[RATIO, pair] = p.viscous / p.stiffness
     sign, ratio = row(weights, SIGN), row(weights, RATIO)
     for k in range(order + 1):
-        set_row(guard, k, row(w.gap, k) * sign)
+        set_row(guard, k, row(w.penetration, k) * sign)
     if viscous is not None and ramp is None and penetrating:
         for k in range(order):
             set_row(guard, k, row(guard, k) + row(w.rate, k) * ratio)
@@ -51,7 +42,7 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
 
 
 @kernel()
-def _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, ramp) -> bool:
+def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp) -> bool:
     """Write the second guard of a penetrating pair to `w.column[0]`; return whether it has one.
 
     on: 1 + lambda d' >= 0, with a ramp F >= 0; clipped: the force would pull; released: d <= p.release.
@@ -60,7 +51,7 @@ def _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, 
     g[order] = 0.0
     if mode == RELEASED:
         for k in range(order + 1):
-            g[k] = -w.gap[k, pair]
+            g[k] = -w.penetration[k, pair]
         g[0] += p.release
     elif ramp is not None:
         _pull(p, w, order, pair, mode, integer, fraction)
@@ -68,13 +59,13 @@ def _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, 
         if mode == ON:
             return False
         for k in range(order):
-            g[k] = -(w.gap[k, pair] + p.viscous / p.stiffness * w.rate[k, pair])
+            g[k] = -(w.penetration[k, pair] + p.viscous / p.stiffness * w.rate[k, pair])
     else:
-        if factor is None:
+        if hysteretic is None:
             return False
         sign = 1.0 if mode == ON else -1.0
         for k in range(order):
-            g[k] = sign * state.factor[pair] * w.rate[k, pair]
+            g[k] = sign * state.damping_factor[pair] * w.rate[k, pair]
         g[0] += sign
     g[0] = max(g[0], 0.0)
     return True
@@ -90,16 +81,16 @@ def _pull(p, w, order, pair, mode, integer, fraction) -> None:
         elif fraction is not None:
             elastic = w.power[0, k, pair]
         else:
-            elastic = w.gap[k, pair]
+            elastic = w.penetration[k, pair]
         g[k] = sign * (p.stiffness * elastic + p.viscous * w.damped[k, pair])
 
 
 @kernel()
 def _ramp_guard(p, state, w, order, pair) -> None:
     """Write the guard of a pair that stays on its side of the ramp's end to `w.column[0]`."""
-    g, sign = w.column[0], 1.0 if state.beyond[pair] == 1 else -1.0
+    g, sign = w.column[0], 1.0 if state.beyond_ramp[pair] == 1 else -1.0
     for k in range(order + 1):
-        g[k] = sign * w.gap[k, pair]
+        g[k] = sign * w.penetration[k, pair]
     g[0] = max(g[0] - sign * p.ramp, 0.0)
 
 
@@ -157,12 +148,12 @@ def _sooner(state, w, order, best) -> float:
     column = w.column[0]
     if _stays(column, order, best):
         return best
-    state.count[GUARD_ROOTS] += 1
+    state.guard_roots += 1
     return min(best, first_root(column, order, best, w))
 
 
 @kernel()
-def first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer, fraction, ramp):
+def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp):
     """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
     _guards(p, state, w, order, penetrating, viscous, ramp)
     best, event, target = sigma, -1, 0
@@ -175,7 +166,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer
             if _stays(column, order, best):
                 # an event found before is sooner
                 continue
-            state.count[GUARD_ROOTS] += 1
+            state.guard_roots += 1
             root = first_root_within(column, order, sigma, w)
             if root < best:
                 best, event, target = root, pair, _next_mode(p, state.mode[pair], viscous, fraction, ramp)
@@ -183,7 +174,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer
         for pair in range(8):
             if state.mode[pair] == OFF:
                 continue
-            if _second_guard(p, state, w, order, pair, viscous, factor, integer, fraction, ramp):
+            if _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp):
                 root = _sooner(state, w, order, best)
                 if root < best:
                     best, event, target = root, pair, CLIPPED if state.mode[pair] == ON else ON

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from plow_twin.model.kernel import kernel
+from plow_twin.kernel.compiler import kernel
 
 
 @kernel()

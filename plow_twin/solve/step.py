@@ -1,4 +1,4 @@
-"""One step: series, length, first event, what happened in it, and the switch at its end.
+"""One step: series, step size, first event, what happened in it, and the switch at its end.
 
 A step never depends on where output is wanted. It ends at an event, at a knot of the load, or where its series stops
 being accurate.
@@ -10,53 +10,16 @@ import math
 
 import numpy as np
 
-from plow_twin.model.kernel import kernel
-from plow_twin.solve.contacts import gap_and_rate, slow_touch, touch, weigh_pairs
+from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.dense_output import evaluate, wear_depth_at
 from plow_twin.solve.events import first_event
-from plow_twin.solve.flight import take_off
-from plow_twin.solve.layout import (
-    ALPHA,
-    AT_HARD_END,
-    BETA,
-    COEFFICIENTS,
-    COS,
-    CROSSING,
-    EVENT_PAIR,
-    EVENT_TO,
-    EVENTS,
-    EXPLICIT_LENGTH,
-    FLYING,
-    HARD_END,
-    IMPLICIT_LENGTH,
-    LAST_LENGTH,
-    LENGTH,
-    NOW,
-    OFF,
-    ON,
-    ORDER,
-    OVERDAMPED,
-    PIECE,
-    RECOVERIES,
-    RELEASED,
-    RESTING,
-    SIGMA,
-    SIN,
-    STALL,
-    STEPS,
-    T0,
-    THETA,
-    TOUCHED,
-    TOUCHING,
-    USED,
-    WAS_EXPLICIT,
-    WAS_IMPLICIT,
-    WAS_OVERDAMPED,
-)
-from plow_twin.solve.length import accurate_length, before_sticking, time_to_part
-from plow_twin.solve.readout import evaluate, worn_depth
-from plow_twin.solve.rest import settle
-from plow_twin.solve.series import expand, expand_harmonics, one_by_one
-from plow_twin.solve.stiff import PATIENCE, STAGES, collocate, note_explicit
+from plow_twin.solve.method.flight import take_off
+from plow_twin.solve.method.implicit import PATIENCE, STAGES, collocate, note_explicit
+from plow_twin.solve.method.rest import settle
+from plow_twin.solve.method.step_size import accurate_step, before_sticking, time_to_separation
+from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
+from plow_twin.solve.modes import penetration_and_rate, slow_touch, touch, weigh_pairs
+from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, THETA
 
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
@@ -65,12 +28,12 @@ _TOUCH_REACH = 2.5
 
 
 @kernel()
-def _linear_load(segments, step, t0, w):
+def _linear_load(segments, state, t0, w):
     """Add the linear load at t0 to `w.wrench` and return the time up to which it is linear."""
-    piece = step[PIECE]
+    piece = state.piece
     while piece + 1 < segments.size and segments[piece + 1].knot <= t0:
         piece += 1
-    step[PIECE] = piece
+    state.piece = piece
     here = segments[piece]
     if t0 < here.knot:
         for j in range(3):
@@ -83,26 +46,25 @@ def _linear_load(segments, step, t0, w):
 
 
 @kernel(inline=True)
-def _note(state, sigma, length, order, pair, target, at_hard_end) -> None:
+def _note(state, sigma, step_size, order, pair, target, ends_at_stop) -> None:
     """Note the step that has been laid out."""
-    clock, step = state.clock, state.step
-    clock[SIGMA], clock[LENGTH], clock[USED] = sigma, length, 0.0
-    step[ORDER], step[EVENT_PAIR], step[EVENT_TO] = order, pair, target
-    step[AT_HARD_END] = 1 if at_hard_end else 0
+    state.sigma_end, state.step_size, state.elapsed = sigma, step_size, 0.0
+    state.order, state.event_pair, state.event_mode = order, pair, target
+    state.ends_at_stop = 1 if ends_at_stop else 0
 
 
 @kernel()
-def begin(
+def lay_out_step(
     p,
     parts,
     state,
     w,
-    hard_time,
+    stop_time,
     harmonics,
     second,
     segments,
     viscous,
-    factor,
+    hysteretic,
     integer,
     fraction,
     ramp,
@@ -114,130 +76,131 @@ def begin(
     flight,
     rest,
 ) -> bool:
-    """Lay out the next step, at most to `hard_time`; return False when it is not finite."""
-    clock, step = state.clock, state.step
-    t0 = clock[T0]
+    """Lay out the next step, at most to `stop_time`; return False when it is not finite."""
+    t0 = state.step_start
     penetrating = weigh_pairs(p, state, w, viscous, fraction, ramp)
     for j in range(3):
         w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
     if segments is not None:
-        hard_time = min(hard_time, _linear_load(parts.segments, step, t0, w))
-    clock[HARD_END] = hard_time
-    span = min(hard_time - t0, LONGEST_STEP)
+        stop_time = min(stop_time, _linear_load(parts.segments, state, t0, w))
+    state.stop_time = stop_time
+    span = min(stop_time - t0, LONGEST_STEP)
     limited = span < LONGEST_STEP
-    clock[ALPHA], clock[BETA] = 1.0, 0.0
-    hard, length = span, 0.0
-    state.count[STEPS] += 1
+    state.alpha, state.beta = 1.0, 0.0
+    sigma_limit, step_size = span, 0.0
+    state.steps += 1
     if flight is not None:
-        length = 0.0 if penetrating else take_off(p, parts.harmonics, state, w, span)
-        step[FLYING] = 1 if length > 0.0 else 0
+        step_size = 0.0 if penetrating else take_off(p, parts.harmonics, state, w, span)
+        state.in_flight = 1 if step_size > 0.0 else 0
     if rest is not None:
         steady = penetrating and w.wrench[1, 0] == 0.0 and w.wrench[1, 1] == 0.0 and w.wrench[1, 2] == 0.0
-        step[RESTING] = 1 if steady and settle(p, parts, state, w) else 0
-        length = span if step[RESTING] == 1 else 0.0
-    if (flight is not None or rest is not None) and length > 0.0:
-        _note(state, length, length, 1, -1, 0, limited and length == span)
+        state.at_rest = 1 if steady and settle(p, parts, state, w) else 0
+        step_size = span if state.at_rest == 1 else 0.0
+    if (flight is not None or rest is not None) and step_size > 0.0:
+        _note(state, step_size, step_size, 1, -1, 0, limited and step_size == span)
         return True
     if implicit is not None:
-        clock[WAS_IMPLICIT], clock[WAS_EXPLICIT] = clock[IMPLICIT_LENGTH], clock[EXPLICIT_LENGTH]
-        step[WAS_OVERDAMPED] = step[OVERDAMPED]
-    if implicit is not None and penetrating and step[OVERDAMPED] >= PATIENCE:
-        length = collocate(p, parts, state, w, span, implicit)
-    if length > 0.0:
-        order, sigma = STAGES, length
+        state.implicit_size_before, state.explicit_size_before = state.implicit_size, state.explicit_size
+        state.overdamped_before = state.overdamped
+    if implicit is not None and penetrating and state.overdamped >= PATIENCE:
+        step_size = collocate(p, parts, state, w, span, implicit)
+    if step_size > 0.0:
+        order, sigma = STAGES, step_size
     else:
-        if step[TOUCHING] != 0:
+        if state.touching != 0:
             # a force that starts like d^1.5 is analytic in the square root of time
-            clock[ALPHA], clock[BETA] = 0.0, 2.0
-            hard = math.sqrt(span)
+            state.alpha, state.beta = 0.0, 2.0
+            sigma_limit = math.sqrt(span)
         elif fraction is not None and penetrating:
-            parting = time_to_part(p, parts, state, w, span, harmonics) if p.exponent == 1.5 else 0.0
+            parting = time_to_separation(p, parts, state, w, span, harmonics) if p.exponent == 1.5 else 0.0
             if parting > 0.0:
                 # one that ends like d^1.5 is analytic in the root of the time left
                 root = math.sqrt(parting)
-                clock[ALPHA], clock[BETA] = 2.0 * root, -2.0
-                hard = root if parting <= span else root - math.sqrt(parting - span)
+                state.alpha, state.beta = 2.0 * root, -2.0
+                sigma_limit = root if parting <= span else root - math.sqrt(parting - span)
                 limited = limited and parting > span
-            elif p.exponent == 1.5 and 0.0 < t0 - clock[TOUCHED] < _TOUCH_REACH * clock[LAST_LENGTH]:
+            elif p.exponent == 1.5 and 0.0 < t0 - state.touch_time < _TOUCH_REACH * state.last_step_size:
                 # and still in the root of the time since its start, some steps on
-                root = math.sqrt(t0 - clock[TOUCHED])
-                clock[ALPHA], clock[BETA] = 2.0 * root, 2.0
-                hard = math.sqrt(t0 - clock[TOUCHED] + span) - root
+                root = math.sqrt(t0 - state.touch_time)
+                state.alpha, state.beta = 2.0 * root, 2.0
+                sigma_limit = math.sqrt(t0 - state.touch_time + span) - root
         if harmonics is not None:
-            expand_harmonics(parts.harmonics, second, t0, clock[ALPHA], clock[BETA], p.order, w)
+            expand_harmonics(parts.harmonics, second, t0, state.alpha, state.beta, p.order, w)
         terms = one_by_one(parts.terms)
-        order = expand(p, state, w, p.order, penetrating, hard, *terms)
-        state.count[COEFFICIENTS] += order
-        sigma = hard if order < p.order else accurate_length(p, w, order, hard)
+        order = expand(p, state, w, p.order, penetrating, sigma_limit, *terms)
+        state.evaluations += order
+        sigma = sigma_limit if order < p.order else accurate_step(p, w, order, sigma_limit)
         if not math.isfinite(sigma):
             return False
         if slip is not None:
             sigma = before_sticking(p, state, w, order, sigma)
         if implicit is not None and penetrating:
-            note_explicit(p, state, w, clock[ALPHA] * sigma + 0.5 * clock[BETA] * sigma * sigma, sigma < hard)
-    limited = limited and sigma == hard
-    end, pair, target = first_event(p, state, w, order, sigma, penetrating, viscous, factor, integer, fraction, ramp)
-    if pair >= 0 and step[STALL] > p.max_events:
+            note_explicit(p, state, w, state.alpha * sigma + 0.5 * state.beta * sigma * sigma, sigma < sigma_limit)
+    limited = limited and sigma == sigma_limit
+    end, pair, target = first_event(
+        p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp
+    )
+    if pair >= 0 and state.events_at_once > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
-        state.count[RECOVERIES] += 1
+        state.recoveries += 1
         end, pair = max(end, min(sigma, 1e-9)), -1
         limited = limited and end == sigma
     limited = limited and pair < 0
-    length = span if limited else clock[ALPHA] * end + 0.5 * clock[BETA] * end * end
-    _note(state, end, length, order, pair, target, limited)
+    step_size = span if limited else state.alpha * end + 0.5 * state.beta * end * end
+    _note(state, end, step_size, order, pair, target, limited)
     return True
 
 
 @kernel()
-def finish(p, parts, state, w, totals, log, wear, fraction) -> None:
+def complete_step(p, parts, state, w, totals, log, wear, fraction) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
-    clock, step, y = state.clock, state.step, state.y
-    sigma = clock[SIGMA]
+    y = state.y
+    sigma = state.sigma_end
     if wear is not None:
-        worn_depth(state, w, sigma, state.depth)
+        wear_depth_at(state, w, sigma, state.wear_depth)
     evaluate(p, parts, state, w, sigma, y)
     y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
-    before = clock[T0]
-    clock[T0] = before + clock[LENGTH]
-    if step[AT_HARD_END] == 1:
-        clock[T0] = clock[HARD_END]
-    clock[NOW] = clock[T0]
-    clock[LENGTH] = -1.0
-    clock[USED] = 0.0
-    clock[LAST_LENGTH] = clock[T0] - before
-    at_once = clock[T0] - before <= 1e-15 * (1.0 + abs(before))
-    touching = step[TOUCHING] if at_once else 0
-    step[TOUCHING] = 0
-    pair = step[EVENT_PAIR]
+    before = state.step_start
+    state.step_start = before + state.step_size
+    if state.ends_at_stop == 1:
+        state.step_start = state.stop_time
+    state.time = state.step_start
+    state.step_size = -1.0
+    state.elapsed = 0.0
+    state.last_step_size = state.step_start - before
+    at_once = state.step_start - before <= 1e-15 * (1.0 + abs(before))
+    touching = state.touching if at_once else 0
+    state.touching = 0
+    pair = state.event_pair
     if pair < 0:
-        step[STALL] = 0
+        state.events_at_once = 0
         return
-    step[STALL] = step[STALL] + 1 if at_once else 0
-    old, new = state.mode[pair], step[EVENT_TO]
+    state.events_at_once = state.events_at_once + 1 if at_once else 0
+    old, new = state.mode[pair], state.event_mode
     if new == CROSSING:
-        state.beyond[pair] = 1 - state.beyond[pair]
+        state.beyond_ramp[pair] = 1 - state.beyond_ramp[pair]
         new = old
     state.mode[pair] = new
-    state.count[EVENTS] += 1
+    state.events += 1
     if fraction is not None:
-        step[TOUCHING] = touching & ~(1 << pair)
-    step[OVERDAMPED] = 0
+        state.touching = touching & ~(1 << pair)
+    state.overdamped = 0
     if new == OFF:
-        state.beyond[pair] = 0
+        state.beyond_ramp[pair] = 0
     if old == OFF:
         touch(p, state, pair)
         totals.makes[pair] += 1
         if fraction is not None and new == ON:
-            if gap_and_rate(p, state, pair)[1] > slow_touch(p):
-                step[TOUCHING] |= 1 << pair
-                clock[TOUCHED] = clock[T0]
+            if penetration_and_rate(p, state, pair)[1] > slow_touch(p):
+                state.touching |= 1 << pair
+                state.touch_time = state.step_start
             else:
                 state.mode[pair] = RELEASED
     # to the outside a released pair is on
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:
         i = log.length[0]
-        log.time[i], log.pair[i] = clock[T0], pair
+        log.time[i], log.pair[i] = state.step_start, pair
         log.mode_from[i], log.mode_to[i] = old, new
-        log.rate[i] = gap_and_rate(p, state, pair)[1]
+        log.rate[i] = penetration_and_rate(p, state, pair)[1]
         log.length[0] = i + 1

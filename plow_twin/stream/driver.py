@@ -12,13 +12,13 @@ from plow_twin.stream.journal import Entry, Hold, Parameter, ParameterValue, Res
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
-    from plow_twin.advance import Advance
+    from plow_twin.run.advance import Advance
 
 #: Most model time that one call may catch up when the excitation is silent [ns]: the work of a call stays bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
 
 
-class State(Enum):
+class StreamState(Enum):
     """What the stream is doing."""
 
     WAITING = "waiting for the first sample"
@@ -49,7 +49,7 @@ class Driver:
         self.intake = intake
         self.policy = policy
         self.real_time = RealTimeFactor()
-        self.state = State.WAITING
+        self.state = StreamState.WAITING
         #: text of the last failed advance
         self.failure = ""
         self.failures = 0
@@ -77,7 +77,7 @@ class Driver:
         if verdict.resets:
             self._restart_model(stamp_ns, verdict.value)
         self._received_ns, self._newest_ns, self._zeroed = now_ns, stamp_ns, False
-        return self._advance(Sample(stamp_ns, wrench), now_ns, State.RUNNING)
+        return self._advance(Sample(stamp_ns, wrench), now_ns, StreamState.RUNNING)
 
     def silence(self, now_ns: int) -> Advance | None:
         """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
@@ -93,8 +93,8 @@ class Driver:
         self.holds += 1
         if self.policy.hold == "zero" and not self._zeroed:
             self._zeroed = True
-            return self._advance(Sample(stamp_ns, (0.0, 0.0, 0.0)), now_ns, State.STALE)
-        return self._advance(Hold(stamp_ns), now_ns, State.STALE)
+            return self._advance(Sample(stamp_ns, (0.0, 0.0, 0.0)), now_ns, StreamState.STALE)
+        return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Advance | None:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
@@ -118,7 +118,7 @@ class Driver:
             self.clock.restart()
             self.clock.judge(stamp_ns, ())
             self._restart_model(stamp_ns, f"clock {verdict.value}")
-        return self._advance(Hold(stamp_ns), now_ns, State.RUNNING)
+        return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Take over the speed along the face [m/s]; its sign is a direction and does not wear."""
@@ -148,9 +148,9 @@ class Driver:
         self.resets += 1
         self._failures_in_row = 0
         self._newest_ns = None
-        self.state = State.WAITING
+        self.state = StreamState.WAITING
 
-    def _advance(self, entry: Entry, now_ns: int, state: State) -> Advance | None:
+    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Advance | None:
         before_ns = self.session.stamp_ns
         advance = self.session.apply(entry)
         after_ns = self.session.stamp_ns
@@ -162,7 +162,7 @@ class Driver:
             return advance
         self.failures += 1
         self._failures_in_row += 1
-        self.state = State.FAILED
+        self.state = StreamState.FAILED
         self.failure = advance.status.text
         if 0 < self.policy.failure_limit <= self._failures_in_row:
             self.reset(after_ns or 0, f"{self._failures_in_row} failed advances: {self.failure}")

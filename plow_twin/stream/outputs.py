@@ -1,6 +1,6 @@
-"""What is published of the motion, as plain numbers: one frame per publication, nothing lost between two of them.
+"""What is published of the motion, as plain numbers: one after the other, nothing lost between two of them.
 
-A frame is a function of the journal alone, so that a replay forms the same frames bit for bit.
+A publication is a function of the journal alone, so that a replay forms the same publications bit for bit.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 
 if TYPE_CHECKING:
-    from plow_twin.advance import Advance
+    from plow_twin.run.advance import Advance
 
 Array = NDArray[np.float64]
 
-#: `clearance` and `wear_rate` change slowly: they are part of the first frame in each such span of stamps.
+#: `clearance` and `wear_rate` change slowly: they are part of the first publication in each such span of stamps.
 SLOW_PERIOD_NS: Final = 100_000_000
 
 PAD_NAMES: Final = tuple(f"pad_{name}" for name in PAIR_NAMES)
@@ -35,25 +35,25 @@ _STATE_SIZE: Final = 4 * PAIR_COUNT
 
 @dataclass(frozen=True)
 class Slow:
-    """The slowly changing part of a frame: `clearance` (30,) [m] under `CLEARANCE_NAMES`, `wear_rate` (8,) [m/s]."""
+    """What changes slowly: `clearance` (30,) [m] under `CLEARANCE_NAMES`, `wear_rate` (8,) [m/s]."""
 
     clearance: Array
     wear_rate: Array
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One publication: the state at `stamp_ns`, and all that happened since the frame before.
+class Publication:
+    """One publication: the state at `stamp_ns`, and all that happened since the publication before.
 
-    `penetration` [m], `rate` [m/s] and `force` [N] are those at the stamp, shape (8,); `touches` counts all touches so
-    far, `impulse` [N s] and `peak` [N] are those since the frame before; `q` [m, m, rad] and `v` have shape (3,).
+    `penetration` [m], `rate` [m/s] and `force` [N] are those at the stamp, shape (8,); `makes` counts all makes so
+    far, `impulse` [N s] and `peak` [N] are those since the publication before; `q` [m, m, rad] and `v` have shape (3,).
     """
 
     stamp_ns: int
     penetration: Array
     rate: Array
     force: Array
-    touches: NDArray[np.int64]
+    makes: NDArray[np.int64]
     impulse: Array
     peak: Array
     q: Array
@@ -70,69 +70,69 @@ class Frame:
         return math.isfinite(total)
 
 
-def clearances(scene: Scene, depth: Array) -> Array:
+def clearances(scene: Scene, wear_depth: Array) -> Array:
     """Return total horizontal and vertical clearance and the eight pad depths, shape (10,) [m].
 
-    A side's walls move out by the mean depth of the two pads on it.
+    A side's walls move out by the mean wear depth of the two pads on it.
     """
-    horizontal = scene.clearance.horizontal_m + depth[_LEFT].mean() + depth[_RIGHT].mean()
-    vertical = scene.clearance.vertical_m + depth[_TOP].mean() + depth[_BOTTOM].mean()
-    return np.concatenate(((horizontal, vertical), depth))
+    horizontal = scene.clearance.horizontal_m + wear_depth[_LEFT].mean() + wear_depth[_RIGHT].mean()
+    vertical = scene.clearance.vertical_m + wear_depth[_TOP].mean() + wear_depth[_BOTTOM].mean()
+    return np.concatenate(((horizontal, vertical), wear_depth))
 
 
-def prior_points(scene: Scene, depth: Array) -> tuple[Array, Array]:
+def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
 
     Growth is proportional to k_s as long as it is small against the clearance. Without wear, or with k_s = 0, both
-    points equal the depth.
+    points equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
-        return depth, depth
+        return wear_depth, wear_depth
     initial = np.asarray(scene.wear.initial_depth_m)
     low, high = (point / scene.wear.coefficient_m2_n for point in scene.wear.prior_m2_n)
-    return initial + (depth - initial) * low, initial + (depth - initial) * high
+    return initial + (wear_depth - initial) * low, initial + (wear_depth - initial) * high
 
 
 class Outputs:
-    """Collect advances into frames. Touches, impulses and peaks survive any number of advances between two frames."""
+    """Collect advances into publications. Makes, impulses and peaks survive any number of advances between two."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
         self._advance: Advance | None = None
         self._stamp_ns = 0
-        self._touches = np.zeros(PAIR_COUNT, np.int64)
+        self._makes = np.zeros(PAIR_COUNT, np.int64)
         self._impulse = np.zeros(PAIR_COUNT)
         self._peak = np.zeros(PAIR_COUNT)
         #: stamp and pad depths of the last slow part; None before the first
         self._slow_ns: int | None = None
-        self._slow_depth = np.zeros(PAIR_COUNT)
+        self._slow_wear_depth = np.zeros(PAIR_COUNT)
 
     def add(self, stamp_ns: int, advance: Advance) -> None:
         """Take in one good advance that ended at `stamp_ns`."""
         self._advance = advance
         self._stamp_ns = stamp_ns
-        self._touches += advance.makes
+        self._makes += advance.makes
         self._impulse += advance.impulse
         np.maximum(self._peak, advance.peak, out=self._peak)
 
     def restart(self) -> None:
-        """Forget what has not been published; the touches go on counting."""
+        """Forget what has not been published; the makes go on counting."""
         self._advance = None
         self._slow_ns = None
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
 
-    def take(self) -> Frame | None:
-        """Return the frame of everything since the last one, or None when there was no advance since."""
+    def take(self) -> Publication | None:
+        """Return the publication of everything since the last one, or None when there was no advance since."""
         advance, self._advance = self._advance, None
         if advance is None:
             return None
-        frame = Frame(
+        publication = Publication(
             self._stamp_ns,
             advance.penetration,
             advance.rate,
             advance.force,
-            self._touches.copy(),
+            self._makes.copy(),
             self._impulse.copy(),
             self._peak.copy(),
             advance.q,
@@ -141,30 +141,30 @@ class Outputs:
         )
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
-        return frame
+        return publication
 
-    def _slow_part(self, depth: Array) -> Slow | None:
+    def _slow_part(self, wear_depth: Array) -> Slow | None:
         before_ns = self._slow_ns
         if before_ns is not None and self._stamp_ns // SLOW_PERIOD_NS == before_ns // SLOW_PERIOD_NS:
             return None
-        grown = np.zeros(PAIR_COUNT) if before_ns is None else depth - self._slow_depth
+        grown = np.zeros(PAIR_COUNT) if before_ns is None else wear_depth - self._slow_wear_depth
         elapsed_s = 1.0 if before_ns is None else (self._stamp_ns - before_ns) * 1e-9
-        self._slow_ns, self._slow_depth = self._stamp_ns, depth.copy()
-        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, depth))
+        self._slow_ns, self._slow_wear_depth = self._stamp_ns, wear_depth.copy()
+        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         intervals = np.stack((low, high), axis=1).ravel()
-        return Slow(np.concatenate((clearances(self._scene, depth), intervals)), grown / elapsed_s)
+        return Slow(np.concatenate((clearances(self._scene, wear_depth), intervals)), grown / elapsed_s)
 
     def state(self) -> bytes:
-        """Return what the next frame depends on beside the next advance, exactly."""
+        """Return what the next publication depends on beside the next advance, exactly."""
         slow_ns = -1 if self._slow_ns is None else self._slow_ns
-        numbers = (self._touches, self._impulse, self._peak, self._slow_depth, np.array([slow_ns]))
+        numbers = (self._makes, self._impulse, self._peak, self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)
 
     def set_state(self, data: bytes) -> None:
         """Go on from a state that `state` returned."""
         parts = np.frombuffer(data, np.float64, _STATE_SIZE).reshape(4, PAIR_COUNT)
-        self._touches = parts[0].view(np.int64).copy()
-        self._impulse, self._peak, self._slow_depth = (part.copy() for part in parts[1:])
+        self._makes = parts[0].view(np.int64).copy()
+        self._impulse, self._peak, self._slow_wear_depth = (part.copy() for part in parts[1:])
         slow_ns = int(np.frombuffer(data, np.int64, 1, offset=8 * _STATE_SIZE)[0])
         self._slow_ns = None if slow_ns < 0 else slow_ns
         self._advance = None

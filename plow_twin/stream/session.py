@@ -10,8 +10,8 @@ from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset
 from plow_twin.stream.outputs import Outputs
 
 if TYPE_CHECKING:
-    from plow_twin.advance import Advance
-    from plow_twin.twin import Twin
+    from plow_twin.run.advance import Advance
+    from plow_twin.run.twin import Twin
 
 #: A digest follows each so many advances.
 DIGEST_INTERVAL: Final = 100
@@ -25,8 +25,8 @@ def _ignore(entry: Entry) -> None:
 class Session:
     """One run of a twin under a journal.
 
-    The same entries in the same order give the same motion, the same frames (`outputs`) and the same digests, bit for
-    bit, whatever the clock did meanwhile. Model time is (stamp - origin), the origin being the first stamp.
+    The same entries in the same order give the same motion, the same publications (`outputs`) and the same digests, bit
+    for bit, whatever the clock did meanwhile. Model time is (stamp - origin), the origin being the first stamp.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.study.parameters import StudyError
-from plow_twin.study.sweep import Sweep, Table, chunks_of
+from plow_twin.study.sweep.table import Sweep, Table, chunks_of
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""What every compiled function stands on: the compiler, SIMD lanes, polynomials. Knows nothing of the machine."""

@@ -1,0 +1,53 @@
+"""The decorator of every compiled function: numba with a cache on disk that notices a change in any kernel.
+
+Numba's own cache looks at the file of the function that is called, not at those of the functions it calls: a change
+there would go unseen. Here the stamp of each cached function stands for the text of all kernels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numba
+
+#: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
+FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
+
+
+#: Rooms that hold compiled functions, with all their folders.
+KERNEL_FOLDERS: Final = ("kernel", "model", "solve")
+
+
+def _source_digest() -> str:
+    package = Path(__file__).resolve().parent.parent
+    digest = hashlib.blake2b(digest_size=16)
+    for folder in KERNEL_FOLDERS:
+        for source in sorted((package / folder).rglob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()
+
+
+SOURCE_DIGEST: Final = _source_digest()
+
+
+def kernel(*, fast: bool = False, inline: bool = False) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Compile a function; `fast` allows reordered and fused sums, `inline` inlines it into its callers."""
+    options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
+    if inline:
+        options["inline"] = "always"
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
+        # absent when numba is told not to compile
+        cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
+        if cache_file is not None:
+            cache_file._source_stamp = SOURCE_DIGEST
+            # read before the rest of an index, which cannot be read once a type that it names is gone
+            cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
+        compiled: Callable[..., Any] = dispatcher
+        return compiled
+
+    return decorate

@@ -1,0 +1,160 @@
+"""Polynomials on an interval: sure statements on sign, first root and maximum, from the Bernstein form.
+
+A polynomial lies within the hull of its Bernstein coefficients, and has no more roots than they have sign changes;
+halving the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.kernel.compiler import kernel
+
+Array = NDArray[np.float64]
+
+#: Halvings of an interval, at most, when a root or a maximum is isolated.
+MAX_HALVINGS: Final = 48
+
+
+@kernel()
+def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) -> None:
+    """Write the Bernstein coefficients of g on [0, h] to b[0..n]."""
+    power = 1.0
+    for k in range(n + 1):
+        b[k] = g[k] * power * inverse_binomial[k]
+        power *= h
+    for r in range(1, n + 1):
+        for j in range(n, r - 1, -1):
+            b[j] += b[j - 1]
+
+
+@kernel(inline=True)
+def _halve(left: Array, right: Array, n: int) -> None:
+    """Split Bernstein coefficients in `left` at the middle: left half in place, right half to `right`."""
+    for r in range(n + 1):
+        right[n - r] = left[n]
+        for j in range(n, r, -1):
+            left[j] = 0.5 * (left[j] + left[j - 1])
+    # the sweep above leaves the left half's coefficients in `left`, the right half's in `right`
+
+
+@kernel(fast=True)
+def _crossing(g: Array, n: int, low: float, high: float, start: float) -> float:
+    """Return the only root in [low, high], where g >= 0 at `low` side and < 0 at `high`: Halley within the bracket."""
+    x = min(max(start, low), high)
+    for _ in range(80):
+        value, slope, bend = g[n], 0.0, 0.0
+        for k in range(n - 1, -1, -1):
+            bend = bend * x + slope
+            slope = slope * x + value
+            value = value * x + g[k]
+        if value >= 0.0:
+            low = x
+        else:
+            high = x
+        steepness = slope * slope - value * bend
+        change = value * slope / steepness if slope < 0.0 and steepness > 0.0 else np.inf
+        new = x - change
+        if not (low <= new <= high):
+            new = 0.5 * (low + high)
+        elif abs(change) <= 1e-6 * new and abs(bend * change) <= 1e-3 * abs(slope):
+            # the next change would be of the order of its cube
+            return new
+        if abs(new - x) <= 2e-16 * high or high - low <= 2e-16 * high:
+            return new
+        x = new
+    return x
+
+
+@kernel()
+def first_root(g: Array, n: int, h: float, w) -> float:
+    """Return where g first turns negative in [0, h), or infinity; g[0] >= 0."""
+    to_bernstein(g, n, h, w.binomial[n], w.halves[0])
+    return first_root_within(g, n, h, w)
+
+
+@kernel()
+def first_root_within(g: Array, n: int, h: float, w) -> float:
+    """Do the work of `first_root` from the Bernstein coefficients in `w.halves[0]`.
+
+    Intervals whose Bernstein coefficients show no negative value are left out, one sign change is one root, the rest is
+    halved, left part first.
+    """
+    b, bounds = w.halves, w.bounds
+    bounds[0, 0], bounds[0, 1] = 0.0, h
+    top = 0
+    while top >= 0:
+        low, high = bounds[top, 0], bounds[top, 1]
+        changes, crossing, positive, lowest = 0, low, b[top, 0] >= 0.0, b[top, 0]
+        for k in range(1, n + 1):
+            lowest = min(lowest, b[top, k])
+            if (b[top, k] >= 0.0) != positive:
+                changes += 1
+                if changes == 1:
+                    span = b[top, k - 1] - b[top, k]
+                    crossing = low + (high - low) * (k - 1 + b[top, k - 1] / span) / n
+                positive = not positive
+        if lowest >= 0.0:
+            top -= 1
+        elif changes == 1 and b[top, 0] >= 0.0:
+            return _crossing(g, n, low, high, crossing)
+        elif b[top, 0] < 0.0:
+            return low
+        elif top >= MAX_HALVINGS or high - low <= 4e-16 * h:
+            if b[top, n] < 0.0:
+                return low
+            top -= 1
+        else:
+            middle = 0.5 * (low + high)
+            # the right half stays below the left one on the stack
+            for k in range(n + 1):
+                b[top + 1, k] = b[top, k]
+            _halve(b[top + 1], b[top], n)
+            bounds[top, 0] = middle
+            bounds[top + 1, 0], bounds[top + 1, 1] = low, middle
+            top += 1
+    return np.inf
+
+
+@kernel()
+def maximum(g: Array, n: int, h: float, floor: float, w) -> float:
+    """Return the larger of `floor` and the maximum of g on [0, h], to 1e-12 of it."""
+    end, steepest, power = g[n], 0.0, 1.0
+    for k in range(n - 1, -1, -1):
+        end = end * h + g[k]
+    for k in range(2, n + 1):
+        power *= h
+        steepest += k * abs(g[k]) * power
+    if abs(g[1]) >= steepest:
+        # monotonic
+        return max(floor, g[0], end)
+    b = w.halves
+    to_bernstein(g, n, h, w.binomial[n], b[0])
+    best = floor
+    top = 0
+    while top >= 0:
+        best = max(best, b[top, 0], b[top, n])
+        bound = b[top, 0]
+        for k in range(1, n + 1):
+            bound = max(bound, b[top, k])
+        if bound <= best * (1.0 + 1e-12) or top >= MAX_HALVINGS:
+            top -= 1
+        else:
+            for k in range(n + 1):
+                b[top + 1, k] = b[top, k]
+            _halve(b[top + 1], b[top], n)
+            top += 1
+    return best
+
+
+@kernel()
+def shift_column(g: Array, lane: int, n: int, x: float, out: Array) -> None:
+    """Write the coefficients of g(x + .) of one column to the same column of `out`."""
+    for k in range(n + 1):
+        out[k, lane] = g[k, lane]
+    for r in range(n):
+        for j in range(n - 1, r - 1, -1):
+            out[j, lane] += x * out[j + 1, lane]

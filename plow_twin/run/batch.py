@@ -1,0 +1,219 @@
+"""Many live twins under sampled loads, advanced together: scenes that differ in numbers share one compiled call."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.model.scene import Scene
+from plow_twin.run.advance import AdvanceBatch, check_times, columns, empty_batch
+from plow_twin.run.twin import DEFAULT_BUDGET
+from plow_twin.solve import loop
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
+from plow_twin.solve.method.implicit import new_implicit
+from plow_twin.solve.state import PARAMS, SEGMENT, STATE, TOTALS, WORK, Parts, Terms, new_records, new_work
+
+__all__ = ["TwinBatch"]
+
+_Array = NDArray[np.float64]
+#: Terms without which a scene computes the same as with them, where their numbers are zero.
+_OPTIONAL = ("wear", "offset", "free", "slip")
+
+
+class TwinBatch:
+    """Heads that are advanced in time together, each under its own sampled load: a live ensemble.
+
+    Parameters
+    ----------
+    scenes : sequence of Scene
+        One for each twin; their own loads are not used. The contact laws must have the same terms: all additive or all
+        not, and exponents that are all 1, all integers of at least 2, or all fractions.
+    tol : float
+        As for `Twin`.
+    start : float
+        Model time of the scenes' initial states in s.
+    workers : int, optional
+        Threads; one by default, for a call that advances by a sample takes less than it costs to wake a second one.
+
+    Raises
+    ------
+    ValueError
+        Without scenes, or where their laws differ in terms.
+
+    Notes
+    -----
+    Each member has the bits of a `Twin` of its own, where that has the same terms; else it agrees to the tolerance.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], *, tol: float = 1e-9, start: float = 0.0, workers: int = 1) -> None:
+        if not scenes:
+            raise ValueError("scenes: got none, expected at least one")
+        self.scenes = tuple(scenes)
+        self.tol = tol
+        self._compiled = [compile_scene(scene, tol, sampled=True) for scene in scenes]
+        self._params = new_records(PARAMS, len(scenes))
+        for index, compiled in enumerate(self._compiled):
+            self._params[index] = compiled.params
+        self._states = new_records(STATE, len(scenes))
+        self._wrench = np.zeros((len(scenes), 3))
+        self._masses = np.array([inertias(scene) for scene in scenes])[:, None]
+        terms = _merge(self._compiled)
+        self._workers = [_Worker.of(terms, self._compiled) for _ in range(max(1, min(workers, os.cpu_count() or 1)))]
+        self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
+        self._pool = ThreadPoolExecutor(len(self._workers)) if len(self._workers) > 1 else None
+        self.reset(start)
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    @property
+    def time(self) -> float:
+        """Model time in s."""
+        return float(self._states["time"][0])
+
+    def advance(self, t: float, wrench: ArrayLike | None = None) -> AdvanceBatch:
+        """Advance all twins to model time `t`; see `advance_samples`. Without `wrench` the last samples are held.
+
+        Parameters
+        ----------
+        t : float
+            Model time in s, not before the present one.
+        wrench : array_like, shape (m, 3) or (3,), optional
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t`, of each twin or of all.
+        """
+        sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
+        if sample.shape not in ((3,), (len(self), 3)):
+            raise ValueError(f"wrench: got shape {sample.shape}, expected (3,) or ({len(self)}, 3)")
+        return self.advance_samples(np.array([t], dtype=np.float64), sample[..., None, :])
+
+    def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceBatch:
+        """Advance all twins through many samples; the same bits as one `advance` each.
+
+        Parameters
+        ----------
+        t : array_like, shape (n,)
+            Model times in s, never falling.
+        wrench : array_like, shape (m, n, 3) or (n, 3)
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time, of each twin or of all.
+
+        Raises
+        ------
+        ValueError
+            For a time before the present one, or anything that is not finite; nothing has changed then.
+        """
+        times, samples = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
+        check_times(self.time, times)
+        shape = (len(self), len(times), 3)
+        if samples.shape not in (shape, shape[1:]) or not np.isfinite(samples).all():
+            raise ValueError(f"wrench: got {samples!r}, expected finite numbers of shape {shape} or {shape[1:]}")
+        ends = np.empty((len(self), len(times) + 1, 3))
+        ends[:, 0], ends[:, 1:] = self._wrench, samples
+        out = empty_batch(times, len(self))
+        self._run(times, ends / self._masses, columns(out))
+        self._wrench = ends[:, -1].copy()
+        return out
+
+    def reset(self, t: float) -> None:
+        """Go back to the scenes' initial states, at model time `t`."""
+        if not np.isfinite(t):
+            raise ValueError(f"t: got {t!r}, expected a finite time in s")
+        for index, compiled in enumerate(self._compiled):
+            self._states[index] = compiled.initial_state(t)
+        self._wrench = np.zeros((len(self), 3))
+
+    def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
+        """Set the speed along the face from here on, of each twin (m,) or of all; only wear depends on it."""
+        speeds = np.broadcast_to(np.abs(np.asarray(speed_m_s, dtype=np.float64)), len(self))
+        if not np.isfinite(speeds).all():
+            raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected finite speeds in m/s")
+        for index, (scene, speed) in enumerate(zip(self.scenes, speeds, strict=True)):
+            if scene.wear is not None:
+                self._params["wear_per_impulse"][index] = wear_rate(scene.wear, speed)
+
+    def snapshot(self) -> bytes:
+        """Return the exact state as bytes, to be restored by twins of the same scenes and tolerance."""
+        return self._states.tobytes() + self._wrench.tobytes() + self._params["wear_per_impulse"].tobytes()
+
+    def restore(self, data: bytes) -> None:
+        """Take over a state saved by `snapshot`.
+
+        Raises
+        ------
+        ValueError
+            When the data has not the size of a snapshot.
+        """
+        sizes = np.cumsum([self._states.nbytes, self._wrench.nbytes])
+        if len(data) != sizes[-1] + self._params["wear_per_impulse"].size * 8:
+            raise ValueError(f"snapshot: got {len(data)} bytes, expected {sizes[-1] + self._params['wear'].size * 8}")
+        self._states[...] = np.frombuffer(data[: sizes[0]], STATE)
+        self._wrench = np.frombuffer(data[sizes[0] : sizes[1]]).reshape(-1, 3).copy()
+        self._params["wear_per_impulse"] = np.frombuffer(data[sizes[1] :]).reshape(
+            self._params["wear_per_impulse"].shape
+        )
+
+    def digest(self) -> str:
+        """Return 16 hexadecimal digits that stand for the exact state."""
+        return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
+
+    def _run(
+        self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: tuple[NDArray[np.generic], ...]
+    ) -> None:
+        def run(index: int) -> None:
+            worker = self._workers[index]
+            loop.advance_batch(
+                self._params, worker.parts, self._states, worker.work, worker.totals, *self._edges[index : index + 2],
+                times, ends, DEFAULT_BUDGET, *rows, None,
+            )  # fmt: skip
+
+        if self._pool is None:
+            run(0)
+        else:
+            list(self._pool.map(run, range(len(self._workers))))
+
+
+class _Worker(NamedTuple):
+    """What each thread has for itself."""
+
+    parts: Parts
+    work: NDArray[np.void]
+    totals: NDArray[np.void]
+
+    @staticmethod
+    def of(terms: Terms, compiled: Sequence[CompiledScene]) -> _Worker:
+        # implicit steps do not follow wear
+        stiff = terms.wear is None and any(one.parts.implicit is not None for one in compiled)
+        parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit() if stiff else None)
+        work = new_records(WORK, 1)
+        work[0] = new_work()
+        return _Worker(parts, work, new_records(TOTALS, 1))
+
+
+def _merge(compiled: Sequence[CompiledScene]) -> Terms:
+    """Return the terms that some member has.
+
+    Raises
+    ------
+    ValueError
+        Where the members' laws do not have the same terms.
+    """
+    first = compiled[0].parts.terms
+    merged = first
+    for index, one in enumerate(compiled):
+        terms = one.parts.terms
+        for name in ("viscous", "hysteretic", "integer", "fraction", "ramp"):
+            if getattr(terms, name) != getattr(first, name):
+                raise ValueError(
+                    f"scenes[{index}].contact: got law {one.scene.contact.law} with exponent "
+                    f"{one.scene.contact.exponent:g}, expected the terms of scenes[0]: {compiled[0].scene.contact.law} "
+                    f"with exponent {compiled[0].scene.contact.exponent:g}"
+                )
+        merged = merged._replace(**{name: 1 for name in _OPTIONAL if getattr(terms, name) is not None})
+    if merged.wear is not None or merged.slip is not None:
+        merged = merged._replace(rest=None)
+    return merged

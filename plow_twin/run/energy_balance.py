@@ -1,0 +1,98 @@
+"""The balance of energy and momentum of one run, from what the solver summed up."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.scene import Scene
+from plow_twin.solve.compiled_scene import CompiledScene
+from plow_twin.solve.energy_balance import FRICTION, LOAD_X, LOADS, NORMAL, BalanceSums
+from plow_twin.solve.state import COS, SIN, THETA, State, X, Y
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EnergyBalance:
+    """The balance of energy and momentum of a run: forces evaluated anew and integrated, against the change of state.
+
+    Attributes
+    ----------
+    kinetic_j, stored_j : tuple of float
+        Kinetic energy, and elastic energy K d^(n+1) / (n+1) of the contacts, at the start and at the end in J.
+    load_work_j, gravity_work_j : float
+        Work of the loads without gravity, and of gravity with its constant moment, in J.
+    contact_work_j, friction_work_j : float
+        Energy taken from the head by normal contact forces and by friction in J.
+    dissipated_j : float
+        What of `contact_work_j` is not stored at the end, in J.
+    turnover_j : float
+        Integral of the magnitudes of all powers in J.
+    imbalance_j : float
+        Largest |change of kinetic energy - work| at any step's end in J.
+    momentum : ndarray, shape (3,)
+        Change of m vx, m vy [N s] and I omega [N m s], world axes, centre of mass.
+    impulse : ndarray, shape (2, 3)
+        Integrals of loads (with gravity) and of contact forces over time; without locked axes.
+    momentum_imbalance : ndarray, shape (3,)
+        Largest |change of momentum - impulse| at any step's end.
+    """
+
+    kinetic_j: tuple[float, float]
+    stored_j: tuple[float, float]
+    load_work_j: float
+    gravity_work_j: float
+    contact_work_j: float
+    friction_work_j: float
+    dissipated_j: float
+    turnover_j: float
+    imbalance_j: float
+    momentum: Array
+    impulse: Array
+    momentum_imbalance: Array
+
+    @property
+    def relative_imbalance(self) -> float:
+        """Imbalance of energy over turnover."""
+        return self.imbalance_j / self.turnover_j if self.turnover_j > 0.0 else 0.0
+
+
+def energy_balance_of(compiled: CompiledScene, last: State, summed: BalanceSums) -> EnergyBalance:
+    """Return the balance of a motion from its initial state to `last`."""
+    sums, scene, first = summed.sums, compiled.scene, compiled.initial_state()
+    gravity = _potential(scene, first) - _potential(scene, last)
+    stored = _stored_energy(compiled, first), _stored_energy(compiled, last)
+    contact = float(sums.work[NORMAL])
+    return EnergyBalance(
+        kinetic_j=(float(sums.energy[0]), float(sums.energy[1])),
+        stored_j=stored,
+        load_work_j=float(sums.work[LOADS]) - gravity,
+        gravity_work_j=gravity,
+        contact_work_j=contact,
+        friction_work_j=float(sums.work[FRICTION]),
+        dissipated_j=contact - (stored[1] - stored[0]),
+        turnover_j=float(sums.turnover),
+        imbalance_j=float(sums.residual),
+        momentum=sums.momentum[1] - sums.momentum[0],
+        impulse=sums.work[LOAD_X:].reshape(2, 3).copy(),
+        momentum_imbalance=sums.momentum_residual.copy(),
+    )
+
+
+def _potential(scene: Scene, state: State) -> float:
+    """Return the potential energy of gravity and of its constant moment in J."""
+    x, y, theta = state.y[X], state.y[Y], state.y[THETA]
+    height = math.sin(theta) * x + math.cos(theta) * y
+    return float(scene.head.mass_kg * scene.gravity.acceleration_m_s2 * (height + scene.gravity.arm_m * theta))
+
+
+def _stored_energy(compiled: CompiledScene, state: State) -> float:
+    """Return the elastic energy of all contacts in J."""
+    rows, contact = compiled.params.penetration_rows, compiled.scene.contact
+    penetration = rows.T @ np.array([state.y[COS], state.y[SIN], state.y[X], state.y[Y], 1.0]) - state.wear_depth
+    inside = np.where(compiled.params.enabled == 1, np.maximum(penetration, 0.0), 0.0)
+    return float(contact.stiffness * (inside ** (contact.exponent + 1.0)).sum() / (contact.exponent + 1.0))

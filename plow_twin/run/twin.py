@@ -1,0 +1,241 @@
+"""The live twin: one head, advanced by any interval under sampled or analytic loads; saved, restored and hashed."""
+
+from __future__ import annotations
+
+import hashlib
+import time as _time
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.scene import Scene
+from plow_twin.run.advance import Advance, AdvanceSeries, check_times, columns, empty_series
+from plow_twin.solve import loop
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, per_mass, wear_rate
+from plow_twin.solve.method.rest import AT_REST
+from plow_twin.solve.method.step_size import PARTING_ORDER
+from plow_twin.solve.state import PARAMS, STATE, TOTALS, WORK, Bound, State, Status, first_of, new_records, new_work
+
+__all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
+
+#: Steps one advance may take before it gives up.
+DEFAULT_BUDGET = 50_000_000
+#: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
+LEAST_EVALUATIONS = 16
+
+
+class Twin:
+    """One head that is advanced in time.
+
+    Parameters
+    ----------
+    scene : Scene
+    tol : float
+        Tolerance of the pose relative to the clearance.
+    excitation : {"scene", "sampled"}
+        `scene`: the scene's own loads. `sampled`: wrenches given to `advance`, joined by straight lines; the scene's
+        loads are not used.
+    start : float
+        Model time of the scene's initial state in s.
+    max_evaluations : int, optional
+        For hard real-time: an advance evaluates the equations of motion at most so often (an order of the series counts
+        as one). Where that is not enough the rest of the way is taken by a few Runge-Kutta steps, and
+        `error_estimate_m` of the advance is not zero. At least `LEAST_EVALUATIONS`.
+
+    Notes
+    -----
+    The motion does not depend on the times at which it is asked for, but a sample ends a step: the same samples give
+    the same bits.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        tol: float = 1e-9,
+        excitation: Literal["scene", "sampled"] = "scene",
+        start: float = 0.0,
+        max_evaluations: int | None = None,
+    ) -> None:
+        if excitation not in ("scene", "sampled"):
+            raise ValueError(f"excitation: got {excitation!r}, expected 'scene' or 'sampled'")
+        self.scene = scene
+        self.tol = tol
+        self.excitation = excitation
+        compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
+        self._params, self._states = new_records(PARAMS, 1), new_records(STATE, 1)
+        self._params[0] = compiled.params
+        self._state: State = first_of(self._states)
+        self._compiled: CompiledScene = replace(compiled, params=first_of(self._params))
+        self._parts = self._compiled.parts
+        self._budget, self._bound = _bounded(max_evaluations, int(compiled.params.order))
+        self._works, self._all_totals = new_records(WORK, 1), new_records(TOTALS, 1)
+        self._works[0] = new_work()
+        self._work, self._totals = first_of(self._works), first_of(self._all_totals)
+        self._states[0] = compiled.initial_state(start)
+        self._wrench = np.zeros(3)
+        self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
+
+    @property
+    def time(self) -> float:
+        """Model time in s."""
+        return float(self._state.time)
+
+    def warm_up(self) -> float:
+        """Compile every kernel that this scene uses, or load it from the cache on disk; return the seconds it took."""
+        begin = _time.perf_counter()
+        saved = self.snapshot()
+        self.advance(self.time + 1e-6)
+        self.restore(self.snapshot())
+        self._end_step()
+        self.restore(saved)
+        return _time.perf_counter() - begin
+
+    def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance:
+        """Advance to model time `t`.
+
+        Parameters
+        ----------
+        t : float
+            Model time in s, not before the present one.
+        wrench : array_like, shape (3,), optional
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only), reached on a straight
+            line from the sample before. Without it the last sample is held.
+
+        Raises
+        ------
+        ValueError
+            For a time before the present one, or anything that is not finite; nothing has changed then.
+        """
+        if self.excitation == "scene":
+            if wrench is not None:
+                raise ValueError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
+            return self._advance_scene(np.array([t], dtype=np.float64))[0]
+        sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
+        return self.advance_samples(np.array([t], dtype=np.float64), sample.reshape(1, -1))[0]
+
+    def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
+        """Advance through many samples; the same bits as one `advance` each.
+
+        Parameters
+        ----------
+        t : array_like, shape (n,)
+            Model times in s, never falling.
+        wrench : array_like, shape (n, 3)
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time.
+
+        Raises
+        ------
+        ValueError
+            As `advance`; nothing has changed then.
+        """
+        if self.excitation != "sampled":
+            raise ValueError("advance_samples: got excitation='scene', expected excitation='sampled'")
+        times, samples = np.asarray(t, dtype=np.float64), np.ascontiguousarray(wrench, dtype=np.float64)
+        check_times(self.time, times)
+        if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
+            raise ValueError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
+        out = empty_series(times)
+        ends = np.concatenate([self._wrench[None], samples])
+        loop.advance_batch(
+            self._params, self._parts, self._states, self._works, self._all_totals, 0, 1, times,
+            per_mass(self.scene, ends)[None], self._budget, *(rows[None] for rows in columns(out)), self._bound,
+        )  # fmt: skip
+        self._wrench = samples[-1].copy() if len(samples) else self._wrench
+        return out
+
+    def reset(self, t: float) -> None:
+        """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
+        if not np.isfinite(t):
+            raise ValueError(f"t: got {t!r}, expected a finite time in s")
+        self._states[0] = self._compiled.initial_state(t)
+        self._wrench = np.zeros(3)
+
+    def set_travel_speed(self, speed_m_s: float) -> None:
+        """Set the speed along the face from here on; only wear depends on it."""
+        if not np.isfinite(speed_m_s):
+            raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
+        if self._parts.terms.wear is not None:
+            self._end_step()
+            self._set_wear_rate(abs(float(speed_m_s)))
+
+    def snapshot(self) -> bytes:
+        """Return the exact state as bytes, to be restored by a twin of the same scene, tolerance and excitation."""
+        return self._state.tobytes() + self._wrench.tobytes() + np.float64(self._travel_speed).tobytes()
+
+    def restore(self, data: bytes) -> None:
+        """Take over a state saved by `snapshot`.
+
+        Raises
+        ------
+        ValueError
+            When the data has not the size of a snapshot.
+        """
+        if len(data) != STATE.itemsize + 32:
+            raise ValueError(f"snapshot: got {len(data)} bytes, expected {STATE.itemsize + 32}")
+        saved = np.frombuffer(data[: STATE.itemsize], STATE)[0]
+        for name in STATE.names or ():
+            self._state[name] = saved[name]
+        wrench_and_speed = np.frombuffer(data[STATE.itemsize :])
+        self._wrench = wrench_and_speed[:3].copy()
+        self._set_wear_rate(float(wrench_and_speed[3]))
+        if self._state.step_size >= 0.0:
+            loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
+
+    def digest(self) -> str:
+        """Return 16 hexadecimal digits that stand for the exact state."""
+        return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
+
+    @property
+    def steps(self) -> int:
+        """Steps taken so far."""
+        return int(self._state.steps)
+
+    @property
+    def evaluations(self) -> int:
+        """Evaluations of the equations of motion so far; an order of the series counts as one."""
+        return int(self._state.evaluations)
+
+    @property
+    def bounded(self) -> int:
+        """Advances so far whose end was coarse because of `max_evaluations`."""
+        return int(self._state.bounded)
+
+    def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
+        check_times(self.time, times)
+        out = empty_series(times)
+        loop.advance_times(
+            self._compiled.params,
+            self._parts,
+            self._state,
+            self._work,
+            self._totals,
+            times,
+            self._budget,
+            *columns(out),
+            self._bound,
+        )
+        return out
+
+    def _end_step(self) -> None:
+        loop.interrupt_step(self._compiled.params, self._parts, self._state, self._work, self._totals)
+
+    def _set_wear_rate(self, speed: float) -> None:
+        self._travel_speed = speed
+        wear = self.scene.wear
+        if wear is not None and self._parts.terms.wear is not None:
+            self._compiled.params.wear_per_impulse[:] = wear_rate(wear, speed)
+
+
+def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None]:
+    """Return the steps of the series that an advance may take, and what is kept for its coarse end."""
+    if max_evaluations is None:
+        return DEFAULT_BUDGET, None
+    if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:
+        raise ValueError(f"max_evaluations: got {max_evaluations!r}, expected an integer >= {LEAST_EVALUATIONS}")
+    coarse = max(LEAST_EVALUATIONS // 4, max_evaluations // 16)
+    budget = (int(max_evaluations) - 4 * coarse) // (order + PARTING_ORDER + AT_REST)
+    return budget, Bound(coarse, np.zeros(1), np.zeros((6, 6)), np.zeros(3), np.zeros((4, PAIR_COUNT)))

@@ -1,0 +1,36 @@
+"""Where the files of `config/` lie: in the source tree, or in share/plow_twin of whatever prefix the package is in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+#: Scenes that come with the package.
+PRESETS: Final = ("paper", "bench_kv", "bench_hc")
+
+
+def config_folder() -> Path:
+    """Return the folder of the package's configuration files.
+
+    Raises
+    ------
+    FileNotFoundError
+        When the package was installed without its data files.
+    """
+    package = Path(__file__).resolve().parent.parent
+    if (package.parent / "package.xml").is_file():
+        return package.parent / "config"
+    # lib/pythonX.Y/site-packages/plow_twin of pip, colcon or a user's home: share/ lies beside lib/
+    unresolved = Path(__file__).absolute().parent.parent
+    for prefix in (*package.parents, *unresolved.parents):
+        folder = prefix / "share" / "plow_twin" / "config"
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(
+        f"share/plow_twin/config: not found above {package}; was the package installed by pip or colcon?"
+    )
+
+
+def scene_path(name: str | Path) -> Path:
+    """Return the file of a preset (`paper`, `bench_kv`, `bench_hc`), or the path itself when it is none of them."""
+    return config_folder() / f"{name}.yaml" if str(name) in PRESETS else Path(name)

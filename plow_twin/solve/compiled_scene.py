@@ -1,0 +1,290 @@
+"""From a scene to what the kernels take: the one place where names and units of the scene meet the solver's arrays."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from plow_twin.model import geometry
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.loads import LoadSet, Pieces, compile_loads
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import DOF_NAMES, Contact, Scene, Wear
+from plow_twin.solve.method.implicit import new_implicit
+from plow_twin.solve.modes import settle_modes
+from plow_twin.solve.state import (
+    HARMONIC,
+    MAX_ORDER,
+    PARAMS,
+    SEGMENT,
+    STATE,
+    Array,
+    Harmonics,
+    Implicit,
+    Params,
+    Parts,
+    Segments,
+    State,
+    Terms,
+    new_record,
+)
+
+#: Tightest and loosest tolerance.
+TOLERANCE_RANGE = (1e-13, 1e-1)
+#: Share of the tolerance that one step may spend: hundreds of steps and impacts that amplify must stay within it.
+STEP_SHARE = 3e-4
+#: The same for exponents that are not integers: what follows the last term falls slower near a branch point.
+STEP_SHARE_FRACTION = 1e-6
+#: Mode changes at one instant before the solver goes on past it.
+MAX_EVENTS_AT_ONCE = 64
+#: Rate of decay over the spring's frequency from which implicit steps are compiled in.
+_OVERDAMPED = 200.0
+
+
+_NO_TERMS = Terms(*[None] * len(Terms._fields))
+
+
+@dataclass(frozen=True)
+class CompiledScene:
+    """A scene at one tolerance, ready for the kernels."""
+
+    scene: Scene
+    params: Params
+    parts: Parts
+    loads: LoadSet
+
+    def initial_state(self, time: float = 0.0) -> State:
+        """Return the scene's initial state."""
+        state = new_record(STATE)
+        state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
+        if self.parts.terms.hysteretic is not None:
+            state.damping_factor[:] = self.scene.contact.damping or 0.0
+        if self.scene.wear is not None:
+            state.wear_depth[:] = self.scene.wear.initial_depth_m
+        state.step_start = state.time = time
+        settle_modes(self.params, state)
+        return state
+
+
+def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> CompiledScene:
+    """Compile a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    tol : float
+        Tolerance of the pose relative to `geometry.length_scale`, 1e-13 .. 1e-1.
+    sampled : bool
+        Leave the scene's loads out: the load comes as samples.
+
+    Raises
+    ------
+    ValueError
+        For a tolerance out of range.
+    """
+    low, high = TOLERANCE_RANGE
+    if not low <= tol <= high:
+        raise ValueError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
+    loads = compile_loads(() if sampled else scene.loads)
+    mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
+    gravity = scene.gravity.acceleration_m_s2
+    constant = per_mass(scene, loads.constant)
+    constant[1] -= gravity
+    constant[2] -= mass * gravity * scene.gravity.arm_m / inertia
+    direction, harmonics = _harmonics(scene, loads)
+    terms, number = law_terms(scene.contact)
+    length = geometry.length_scale(scene)
+    speed = _velocity_scale(scene, loads, length)
+    admissible = tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION)
+    order, radius = order_for(admissible), geometry.half_diagonal(scene)
+    params, rows = new_record(PARAMS), geometry.penetration_rows(scene)
+    values: dict[str, Any] = dict(
+        penetration_rows=rows,
+        arm_rows=geometry.arm_rows(scene),
+        enabled=np.array([name in scene.pairs for name in PAIR_NAMES], dtype=np.int64),
+        inverse_mass=1.0 / mass,
+        inverse_inertia=1.0 / inertia,
+        stiffness=float(scene.contact.stiffness),
+        exponent=float(scene.contact.exponent),
+        viscous=float(scene.contact.damping or 0.0) if terms.viscous else 0.0,
+        damping_number=number,
+        speed_floor=float(scene.contact.impact_speed_floor_m_s),
+        ramp=float(scene.contact.ramp_m or 0.0) if terms.ramp else 0.0,
+        gravity=float(gravity),
+        constant=constant,
+        direction=direction,
+        order=order,
+        lacuna=_lacuna(scene.contact.exponent),
+        threshold=speed * admissible ** (np.arange(MAX_ORDER + 1) / order),
+        velocity_tolerance=tol * speed,
+        position_tolerance=tol * length,
+        weight=radius * speed / length,
+        radius=radius,
+        release=0.0 if terms.fraction is None else _release(scene, tol * speed, speed),
+        wear_per_impulse=0.0 if scene.wear is None else wear_rate(scene.wear, scene.wear.travel_speed_m_s),
+        offset=scene.head.com_offset_m,
+        free=np.array([float(name not in scene.locked) for name in DOF_NAMES]),
+        fastest=float(loads.omega.max(initial=0.0)),
+        leverage=float(np.hypot(rows[0], rows[1]).max()),
+        half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
+        max_events=MAX_EVENTS_AT_ONCE,
+    )
+    for name, value in (values | _slip(scene)).items():
+        params[name] = value
+    segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
+    if sampled:
+        segments = np.zeros(1, SEGMENT)
+    terms = _scene_terms(scene, terms, harmonics, segments)
+    return CompiledScene(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
+
+
+def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments: Segments | None) -> Terms:
+    """Return the terms of the law together with those of the rest of the scene."""
+    present = dict(
+        harmonics=harmonics is not None,
+        second=harmonics is not None and bool(harmonics["second"].any()),
+        segments=segments is not None,
+        wear=scene.wear is not None and scene.wear.coefficient_m2_n != 0.0,
+        offset=any(scene.head.com_offset_m),
+        free=bool(scene.locked),
+        slip=scene.friction is not None and scene.friction.coefficient != 0.0,
+    )
+    # with the loads' moment about another point than the centre of mass the flight has no elementary integral
+    present["flight"] = present["harmonics"] and not present["offset"]
+    present["rest"] = not (present["harmonics"] or present["wear"] or present["slip"])
+    return law._replace(**_flags(present))
+
+
+def order_for(admissible: float) -> int:
+    """Return the order for the error admissible in a step: what measured fastest on the bench scenes."""
+    return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
+
+
+def _lacuna(exponent: float) -> int:
+    """Return how many orders in a row can vanish: d^n adds n + 1 orders at a time while nothing else acts."""
+    if not float(exponent).is_integer():
+        return 6
+    return 2 if exponent == 1.0 else int(exponent) + 1
+
+
+def per_mass(scene: Scene, wrench: Array) -> Array:
+    """Divide wrenches, shape (..., 3), by mass and inertia."""
+    share: Array = np.asarray(wrench) / inertias(scene)
+    return share
+
+
+def inertias(scene: Scene) -> Array:
+    """Return mass, mass and inertia, shape (3,)."""
+    return np.array([scene.head.mass_kg, scene.head.mass_kg, scene.head.inertia_kg_m2])
+
+
+def _segments(scene: Scene, pieces: Pieces) -> Segments:
+    """Return linear pieces per mass and inertia."""
+    segments = np.zeros(len(pieces.knots), SEGMENT)
+    segments["knot"] = pieces.knots
+    segments["start"], segments["slope"] = per_mass(scene, pieces.start), per_mass(scene, pieces.slope)
+    return segments
+
+
+def law_terms(contact: Contact) -> tuple[Terms, float]:
+    """Return which terms the law has, all others absent, and D where lambda = D / v0 (else -1)."""
+    law, exponent = LAWS[contact.law], float(contact.exponent)
+    viscous = law.additive and bool(contact.damping)
+    number = -1.0 if contact.restitution is None else law.damping_number(contact.restitution)
+    damped = not law.additive and (number > 0.0 or bool(contact.damping))
+    present = dict(
+        viscous=viscous,
+        hysteretic=damped,
+        integer=exponent != 1.0 and exponent.is_integer(),
+        fraction=not exponent.is_integer(),
+        ramp=viscous and contact.ramp_m is not None,
+    )
+    return _NO_TERMS._replace(**_flags(present)), number if damped else -1.0
+
+
+def _flags(present: dict[str, bool]) -> dict[str, int]:
+    return {name: 1 for name, there in present.items() if there}
+
+
+def _harmonics(scene: Scene, loads: LoadSet) -> tuple[Array, Harmonics | None]:
+    """Return directions and harmonic loads: one direction (no S2) when all forces are parallel, else x and y."""
+    if loads.omega.size == 0:
+        return np.eye(2), None
+    # (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M
+    amplitudes = np.stack([per_mass(scene, loads.sine), per_mass(scene, loads.cosine)], axis=1)
+    forces = amplitudes[:, :, :2].reshape(-1, 2)
+    largest = forces[np.argmax(np.hypot(forces[:, 0], forces[:, 1]))]
+    size = float(np.hypot(*largest))
+    unit = largest / size if size > 0.0 else np.array([1.0, 0.0])
+    across = np.abs(forces @ np.array([-unit[1], unit[0]]))
+    directions = np.array([unit, [0.0, 0.0]]) if across.max() <= 1e-15 * size else np.eye(2)
+    harmonics = np.zeros(len(amplitudes), HARMONIC)
+    harmonics["omega"], harmonics["moment"] = loads.omega, amplitudes[:, :, 2]
+    for i, name in enumerate(("first", "second")):
+        harmonics[name] = amplitudes[:, :, :2] @ directions[i]
+    return directions, harmonics
+
+
+def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
+    """Return the speed in m/s that the largest steady load gives the head over half the length scale."""
+    force = np.abs(loads.constant) + np.abs(loads.sine).sum(axis=0) + np.abs(loads.cosine).sum(axis=0)
+    if loads.pieces is not None:
+        force = force + np.abs(loads.pieces.start).max(axis=0)
+    acceleration = per_mass(scene, force)
+    radius = geometry.half_diagonal(scene)
+    total = (
+        abs(scene.gravity.acceleration_m_s2)
+        + float(np.hypot(acceleration[0], acceleration[1]))
+        + radius * acceleration[2]
+    )
+    initial = float(np.hypot(*scene.initial.v[:2])) + radius * abs(scene.initial.v[2])
+    return max(math.sqrt(length * total), initial, 1e-3 * length)
+
+
+def _release(scene: Scene, velocity_tolerance: float, speed: float) -> float:
+    """Return the penetration from which the impulse to separation is below 1e-5 of the velocity tolerance.
+
+    integral F dt = K d^(n+1) / ((n+1) v) at the speed v.
+    """
+    exponent = scene.contact.exponent
+    impulse = 1e-5 * velocity_tolerance * scene.head.mass_kg
+    return float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
+
+
+def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
+    """Return what implicit steps need, where a contact's damping can outweigh its spring far enough to pay."""
+    contact = scene.contact
+    if terms.ramp is not None or terms.wear is not None:
+        return None
+    mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
+    largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
+    depth = (largest_force / contact.stiffness) ** (1.0 / contact.exponent)
+    spring = contact.exponent * largest_force / depth
+    if terms.viscous is not None:
+        damping = params.viscous
+    elif terms.hysteretic is not None:
+        damping = largest_force * (contact.damping or params.damping_number / params.speed_floor)
+    else:
+        return None
+    return new_implicit() if damping * mobility > _OVERDAMPED * math.sqrt(spring * mobility) else None
+
+
+def _slip(scene: Scene) -> dict[str, Any]:
+    """Return what friction needs; without it nothing but a speed to divide by, for scenes that run together."""
+    friction = scene.friction
+    if friction is None:
+        return {"slip_speed": 1.0}
+    return dict(
+        slip_rows=geometry.slip_rows(scene),
+        slip_arm_rows=geometry.slip_arm_rows(scene),
+        friction=friction.coefficient,
+        slip_speed=friction.regularisation_speed_m_s,
+    )
+
+
+def wear_rate(wear: Wear, speed: float) -> float:
+    """Return the depth per impulse of a pad in m/(N s) at a speed along the face:  dh/dt = k_s F v / A (Archard)."""
+    return wear.coefficient_m2_n * speed / wear.pad_area_m2

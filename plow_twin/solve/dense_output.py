@@ -1,0 +1,74 @@
+"""What a step under way tells at any of its times: state, pose, wear, penetrations and forces."""
+
+from __future__ import annotations
+
+import math
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import row, set_row
+from plow_twin.model.contact import normal_force
+from plow_twin.solve.kinematics import row_values
+from plow_twin.solve.method.flight import fly
+from plow_twin.solve.modes import any_penetrates
+from plow_twin.solve.state import COS, OMEGA, ON, SIN, VX, VY, X, Y
+
+
+@kernel(inline=True)
+def sigma_at(state, used):
+    """Return sigma at `used` seconds into the step."""
+    if used >= state.step_size:
+        return state.sigma_end
+    if state.beta == 0.0:
+        return used
+    # the root of alpha sigma + beta sigma^2 / 2 = used that suffers no cancellation
+    return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * state.beta * used, 0.0)))
+
+
+@kernel(fast=True)
+def sum_series(state, w, sigma, out) -> None:
+    """Write the sum of the state's series at sigma to `out`, shape (8,)."""
+    order, series = state.order, w.series
+    value = row(series, order)
+    for k in range(order - 1, -1, -1):
+        value = value * sigma + row(series, k)
+    set_row(out, 0, value)
+
+
+@kernel(inline=True)
+def evaluate(p, parts, state, w, sigma, out) -> None:
+    """Write the body-coordinate state at sigma to `out`, shape (8,)."""
+    if state.in_flight == 1:
+        fly(p, parts.harmonics, parts.terms.flight, state, w, sigma, out)
+    else:
+        sum_series(state, w, sigma, out)
+
+
+@kernel(fast=True)
+def wear_depth_at(state, w, sigma, out) -> None:
+    """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
+    wear_depth = row(state.wear_depth, 0)
+    if any_penetrates(state):
+        # row 0 would be the wear depth itself; pairs without force do not wear
+        order = state.order
+        growth = row(w.wear, order)
+        for k in range(order - 1, 0, -1):
+            growth = growth * sigma + row(w.wear, k)
+        wear_depth = wear_depth + growth * sigma
+    set_row(out, 0, wear_depth)
+
+
+@kernel(fast=True)
+def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
+    """Write penetration, rate and force of the eight pairs, shape (8,) each, in body coordinates y."""
+    c, s, om = y[COS], y[SIN], y[OMEGA]
+    set_row(
+        penetration,
+        0,
+        row_values(p.penetration_rows, c, s, y[X], y[Y]) + (row(p.penetration_rows, 4) - row(wear_depth, 0)),
+    )
+    set_row(rate, 0, row_values(p.penetration_rows, -om * s, om * c, y[VX] + om * y[Y], y[VY] - om * y[X]))
+    for pair in range(8):
+        force[pair] = 0.0
+        if state.mode[pair] == ON:
+            d, r = penetration[pair], rate[pair]
+            force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)

@@ -1,0 +1,82 @@
+"""The equations of motion (paper, eq. 5) as they stand: values in world axes about the centre of mass."""
+
+from __future__ import annotations
+
+import math
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.model.contact import free_force
+from plow_twin.model.friction import friction_force
+from plow_twin.solve.kinematics import penetration_at, rate_at, row_rate, row_value, to_body_axes, to_world_axes
+from plow_twin.solve.loads import load_at
+from plow_twin.solve.state import ON
+
+
+@kernel()
+def push(p, slip, pair, force, c, s, omega, x, y, vx, vy):
+    """Return what a pair that pushes with `force` does in body axes: its force, its moment, the power of its friction.
+
+    The wall's tangent is its normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal.
+    """
+    fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
+    torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
+    if slip is not None:
+        rate = row_rate(p.slip_rows, pair, c, s, omega, x, y, vx, vy)
+        drag = friction_force(force, rate, p.friction, p.slip_speed)
+        fx += p.penetration_rows[3, pair] * drag
+        fy -= p.penetration_rows[2, pair] * drag
+        torque += row_value(p.slip_arm_rows, pair, c, s, x, y) * drag
+        power = drag * rate
+    return fx, fy, torque, power
+
+
+@kernel(inline=True)
+def about_mass(p, c, s, load):
+    """Return the angular acceleration that a load through the cavity's centre gives about the centre of mass.
+
+    Gravity, which is part of the load, acts at the centre of mass.
+    """
+    across = (c * p.offset[0] - s * p.offset[1]) * (load[1] + p.gravity)
+    return -(across - (s * p.offset[0] + c * p.offset[1]) * load[0]) * p.inverse_inertia / p.inverse_mass
+
+
+@kernel()
+def accelerate(p, parts, frozen, state, t, z, load, out) -> None:
+    """Write the rate of z = (x, y, theta, vx, vy, omega).
+
+    `frozen`: the pairs that are on act by their law, also where it would pull; else those that penetrate push.
+    """
+    terms = parts.terms
+    load_at(p, parts.harmonics, parts.segments, t, load)
+    _accelerate(p, terms.offset, terms.free, terms.slip, frozen, state, z, load, out)
+
+
+@kernel()
+def _accelerate(p, offset, free, slip, frozen, state, z, load, out) -> None:
+    c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
+    x, y = to_body_axes(c, s, z[0], z[1])
+    vx, vy = to_body_axes(c, s, z[3], z[4])
+    fx = fy = torque = 0.0
+    for pair in range(8):
+        if p.enabled[pair] == 0:
+            continue
+        d = penetration_at(p, state, pair, c, s, x, y)
+        if (frozen and state.mode[pair] == ON) or (not frozen and d > 0.0):
+            r = rate_at(p, pair, c, s, om, x, y, vx, vy)
+            f = free_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+            if not frozen:
+                f = max(f, 0.0)
+            push_x, push_y, moment, _ = push(p, slip, pair, f, c, s, om, x, y, vx, vy)
+            fx += push_x
+            fy += push_y
+            torque += moment
+    out[0], out[1], out[2] = z[3], z[4], z[5]
+    along_x, along_y = to_world_axes(c, s, fx, fy)
+    out[3] = load[0] + along_x * p.inverse_mass
+    out[4] = load[1] + along_y * p.inverse_mass
+    out[5] = load[2] + torque * p.inverse_inertia
+    if offset is not None:
+        out[5] += about_mass(p, c, s, load)
+    if free is not None:
+        for j in range(3):
+            out[3 + j] *= p.free[j]

@@ -1,0 +1,170 @@
+"""The energy balance of a run: is the change of energy and momentum what the forces did?
+
+Forces are evaluated anew as values, not taken from the series: loads at their time, contacts by `model.contact` and
+`model.friction`. Their power and impulse are integrated by Gauss-Legendre quadrature over each step of the series, by
+the trapezoidal rule over fixed steps. Kinetic energy and momentum come from the state alone.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import row, set_row
+from plow_twin.model.geometry import STATE_SIZE
+from plow_twin.solve.dense_output import evaluate, pair_outputs, wear_depth_at
+from plow_twin.solve.dynamics import about_mass, push
+from plow_twin.solve.kinematics import to_world_axes
+from plow_twin.solve.loads import load_at
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Array, new_record
+
+#: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
+_NODES = 24
+#: Radians of the fastest harmonic in one panel of a flight.
+_PANEL_PHASE = 8.0
+# indices into the powers and impulses at one instant
+LOADS, NORMAL, FRICTION, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(10)
+
+#: What is summed over a run.
+SUMS = np.dtype(
+    [
+        ("work", "f8", (SIZE,)),  # integrals of the powers and forces
+        ("turnover", "f8"),  # integral of the powers' magnitudes
+        ("energy", "f8", (2,)),  # kinetic energy at the start and now
+        ("momentum", "f8", (2, 3)),  # m vx, m vy, I omega in world axes, at the start and now
+        ("residual", "f8"),  # largest imbalance of energy so far
+        ("momentum_residual", "f8", (3,)),  # largest imbalances of momentum so far
+    ]
+)
+
+
+class BalanceSums(NamedTuple):
+    """Quadrature and sums; `None` in its place leaves the balance out of the compiled code."""
+
+    nodes: Array
+    weights: Array
+    now: Array  #: (SIZE,) powers and forces at one instant
+    before: Array  #: (SIZE,) the same a step before
+    body: Array  #: (8,) body coordinates at a node
+    wear_depth: Array  #: (8,) wear depth at a node
+    pairs: Array  #: (3, 8) penetration, rate, force
+    sums: np.record
+
+
+def new_balance() -> BalanceSums:
+    """Return an balance that has seen nothing."""
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    return BalanceSums(
+        0.5 * (nodes + 1.0), 0.5 * weights, np.zeros(SIZE), np.zeros(SIZE), np.zeros(STATE_SIZE), np.zeros(8),
+        np.zeros((3, 8)), new_record(SUMS),
+    )  # fmt: skip
+
+
+@kernel()
+def _powers(p, parts, state, wear_depth, y, t, balance, out) -> None:
+    """Write powers and forces at time t in body coordinates y."""
+    terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
+    load_at(p, parts.harmonics, parts.segments, t, load)
+    _powers_under(p, terms.offset, terms.free, terms.slip, state, wear_depth, y, load, balance.pairs, out)
+
+
+@kernel()
+def _powers_under(p, offset, free, slip, state, wear_depth, y, load, pairs, out) -> None:
+    c, s, om = math.cos(y[THETA]), math.sin(y[THETA]), y[OMEGA]
+    y[COS], y[SIN] = c, s
+    out[LOADS] = out[NORMAL] = out[FRICTION] = 0.0
+    m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
+    if offset is not None:
+        load[2] += about_mass(p, c, s, load)
+    load[0], load[1], load[2] = m * load[0], m * load[1], inertia * load[2]
+    pair_outputs(p, state, wear_depth, y, pairs[0], pairs[1], pairs[2])
+    fx = fy = torque = 0.0
+    for pair in range(8):
+        force = pairs[2, pair]
+        push_x, push_y, moment, power = push(p, slip, pair, force, c, s, om, y[0], y[1], y[VX], y[VY])
+        fx += push_x
+        fy += push_y
+        torque += moment
+        out[NORMAL] += force * pairs[1, pair]
+        out[FRICTION] += power
+    out[CONTACT_X], out[CONTACT_Y] = to_world_axes(c, s, fx, fy)
+    out[CONTACT_M] = torque
+    if free is not None:
+        for j in range(3):
+            load[j] *= p.free[j]
+            out[CONTACT_X + j] *= p.free[j]
+    vx, vy = to_world_axes(c, s, y[VX], y[VY])
+    out[LOADS] = load[0] * vx + load[1] * vy + load[2] * om
+
+
+@kernel()
+def _balance(p, y, balance, start) -> None:
+    """Take energy and momentum from the state; note the largest imbalances."""
+    sums = balance.sums
+    m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
+    c, s = math.cos(y[THETA]), math.sin(y[THETA])
+    sums.energy[1] = 0.5 * m * (y[VX] * y[VX] + y[VY] * y[VY]) + 0.5 * inertia * y[OMEGA] * y[OMEGA]
+    vx, vy = to_world_axes(c, s, y[VX], y[VY])
+    sums.momentum[1, 0], sums.momentum[1, 1] = m * vx, m * vy
+    sums.momentum[1, 2] = inertia * y[OMEGA]
+    if start:
+        sums.energy[0] = sums.energy[1]
+        for j in range(3):
+            sums.momentum[0, j] = sums.momentum[1, j]
+    gained = sums.work[LOADS] - sums.work[NORMAL] - sums.work[FRICTION]
+    sums.residual = max(sums.residual, abs(sums.energy[1] - sums.energy[0] - gained))
+    for j in range(3):
+        pushed = sums.work[LOAD_X + j] + sums.work[CONTACT_X + j]
+        change = sums.momentum[1, j] - sums.momentum[0, j]
+        sums.momentum_residual[j] = max(sums.momentum_residual[j], abs(change - pushed))
+
+
+@kernel()
+def start_balance(p, parts, state, y, t, balance) -> None:
+    """Take the state that a run starts from."""
+    _balance(p, y, balance, True)
+    _powers(p, parts, state, state.wear_depth, y, t, balance, balance.before)
+
+
+@kernel()
+def _add(balance, powers, weight) -> None:
+    sums = balance.sums
+    for i in range(SIZE):
+        sums.work[i] += weight * powers[i]
+    sums.turnover += weight * (abs(powers[LOADS]) + abs(powers[NORMAL]) + abs(powers[FRICTION]))
+
+
+@kernel()
+def balance_step(p, parts, wear, flight, state, w, balance) -> None:
+    """Add the step under way, before it is finished."""
+    y, wear_depth, end = balance.body, balance.wear_depth, state.sigma_end
+    set_row(wear_depth, 0, row(state.wear_depth, 0))
+    panels = 1
+    if flight is not None and state.in_flight == 1:
+        panels += int(end * p.fastest / _PANEL_PHASE)
+    width = end / panels
+    for panel in range(panels):
+        for i in range(balance.nodes.size):
+            sigma = width * (panel + balance.nodes[i])
+            evaluate(p, parts, state, w, sigma, y)
+            if wear is not None:
+                wear_depth_at(state, w, sigma, wear_depth)
+            t = state.step_start + state.alpha * sigma + 0.5 * state.beta * sigma * sigma
+            _powers(p, parts, state, wear_depth, y, t, balance, balance.now)
+            _add(balance, balance.now, balance.weights[i] * width * (state.alpha + state.beta * sigma))
+    evaluate(p, parts, state, w, end, y)
+    _balance(p, y, balance, False)
+
+
+@kernel()
+def balance_fixed_step(p, parts, state, y, t, dt, balance) -> None:
+    """Add a fixed step that ends at body coordinates y and time t."""
+    _powers(p, parts, state, state.wear_depth, y, t, balance, balance.now)
+    _add(balance, balance.before, 0.5 * dt)
+    _add(balance, balance.now, 0.5 * dt)
+    for i in range(SIZE):
+        balance.before[i] = balance.now[i]
+    _balance(p, y, balance, False)

@@ -1,0 +1,179 @@
+"""Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
+
+They evaluate the equations of motion (paper, eq. 5) as they stand, in world axes about the centre of mass,
+independently of the series: a check on them as much as a method.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.dense_output import pair_outputs
+from plow_twin.solve.dynamics import accelerate
+from plow_twin.solve.energy_balance import balance_fixed_step, start_balance
+from plow_twin.solve.kinematics import pose_of, to_body, to_world
+from plow_twin.solve.modes import mode_inside, touch, within_range
+from plow_twin.solve.state import OFF, ON, Status
+
+_OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
+_LOG_FULL = int(Status.LOG_FULL)
+
+
+@kernel()
+def _switch(p, state, penetration, rate, time, totals, log) -> None:
+    """Note which pairs touch or part, at the step's resolution."""
+    for pair in range(8):
+        inside = p.enabled[pair] == 1 and penetration[pair] > 0.0
+        mode = ON if inside else OFF
+        if mode == state.mode[pair]:
+            continue
+        if mode == ON:
+            touch(p, state, pair)
+            totals.makes[pair] += 1
+        if log is not None:
+            i = log.length[0]
+            log.time[i], log.pair[i], log.rate[i] = time, pair, rate[pair]
+            log.mode_from[i], log.mode_to[i] = state.mode[pair], mode
+            log.length[0] = i + 1
+        state.mode[pair] = mode
+        state.events += 1
+
+
+@kernel()
+def _add_to_totals(state, force_before, force, dt, totals) -> None:
+    """Add one step to the totals by the trapezoidal rule."""
+    sets = np.zeros(2, np.int64)
+    for pair in range(8):
+        totals.peak[pair] = max(totals.peak[pair], force[pair])
+        totals.impulse[pair] += 0.5 * dt * (force_before[pair] + force[pair])
+        if force[pair] > 0.0:
+            totals.time_in_contact[pair] += dt
+            corner = pair // 2
+            sets[(pair + corner) % 2] |= 1 << corner
+    for sense in range(2):
+        if sets[sense] != 0:
+            totals.set_time[sense, sets[sense]] += dt
+
+
+@kernel()
+def _runge_kutta(p, parts, state, t, dt, z, trial, k, load) -> None:
+    """Take one step of the classical Runge-Kutta method; z (6,) in place, the four stages stay in k (4, 6)."""
+    accelerate(p, parts, False, state, t, z, load, k[0])
+    for stage in range(1, 4):
+        part = dt if stage == 3 else 0.5 * dt
+        for j in range(6):
+            trial[j] = z[j] + part * k[stage - 1, j]
+        accelerate(p, parts, False, state, t + part, trial, load, k[stage])
+    for j in range(6):
+        z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
+    state.evaluations += 4
+
+
+@kernel()
+def end_coarsely(p, parts, state, totals, target, bound) -> int:
+    """Bring the state to `target` by the bound's few Runge-Kutta steps; estimate the error. Returns a `Status`.
+
+    The estimate is the two middle stages' difference, |k2 - k3| dt / 3, of the order below the method's, with errors of
+    the velocity counted over the time left; and where a pair has touched or parted within a step the impulse in doubt,
+    F dt / 2, over the time in which the largest load crosses the clearance.
+    """
+    y, z, k = state.y, bound.z[0], bound.z[2:]
+    pen, rate, now, before = bound.pairs[0], bound.pairs[1], bound.pairs[2], bound.pairs[3]
+    start = state.step_start
+    dt = (target - start) / bound.steps
+    to_world(y, z)
+    for pair in range(8):
+        # a pair that was clipped or released is inside all the same
+        state.mode[pair] = OFF if state.mode[pair] == OFF else ON
+    pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+    state.bounded += 1
+    for n in range(bound.steps):
+        _runge_kutta(p, parts, state, start + n * dt, dt, z, bound.z[1], k, bound.load)
+        left = target - start - (n + 1) * dt
+        for j in range(3):
+            radius = p.radius if j == 2 else 1.0
+            off, drift = abs(k[1, j] - k[2, j]), abs(k[1, 3 + j] - k[2, 3 + j])
+            bound.error[0] += radius * dt / 3.0 * (off + (left + dt) * drift)
+        if not np.isfinite(z).all():
+            return _NON_FINITE
+        state.steps += 1
+        to_body(z, y)
+        _wear(p, parts.terms.wear, state, now, dt)
+        for pair in range(8):
+            before[pair] = now[pair]
+        pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+        _switch(p, state, pen, rate, start + (n + 1) * dt, totals, None)
+        pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+        for pair in range(8):
+            if (before[pair] > 0.0) != (now[pair] > 0.0):
+                doubt = 0.5 * dt * (before[pair] + now[pair]) * p.inverse_mass
+                bound.error[0] += doubt * p.position_tolerance / p.velocity_tolerance
+        _add_to_totals(state, before, now, dt, totals)
+        if not within_range(p, state, y):
+            return _RANGE
+    state.step_start = state.time = target
+    state.last_step_size, state.touch_time = 0.0, -np.inf
+    state.touching = state.events_at_once = 0
+    for pair in range(8):
+        if state.mode[pair] == ON:
+            state.mode[pair] = mode_inside(p, state, pair)
+    return _OK
+
+
+@kernel()
+def integrate_fixed(
+    p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force, balance
+) -> int:
+    """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
+    z, trial = np.empty(6), np.empty(6)
+    k = np.empty((4, 6))
+    load, y = np.empty(3), state.y
+    pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
+    to_world(y, z)
+    pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+    if balance is not None and done[0] == 0:
+        start_balance(p, parts, state, y, 0.0, balance)
+    while True:
+        n = done[0]
+        if not within_range(p, state, y):
+            return _RANGE
+        if n % stride == 0 or n == steps:
+            # the last row may lie closer than the others
+            row = (n + stride - 1) // stride
+            pose_of(p, y, parts.terms.offset, q[row], v[row])
+            if force is not None:
+                pair_outputs(p, state, state.wear_depth, y, penetration[row], rate, force[row])
+        if n >= steps:
+            return _OK
+        if log.length[0] + 8 > log.time.size:
+            return _LOG_FULL
+        t = n * dt
+        if euler:
+            accelerate(p, parts, False, state, t, z, load, k[0])
+            for j in range(3):
+                z[3 + j] += dt * k[0, 3 + j]
+                z[j] += dt * z[3 + j]
+            state.evaluations += 1
+        else:
+            _runge_kutta(p, parts, state, t, dt, z, trial, k, load)
+        if not np.isfinite(z).all():
+            return _NON_FINITE
+        state.steps += 1
+        to_body(z, y)
+        _wear(p, parts.terms.wear, state, now, dt)
+        before[:] = now
+        pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+        _switch(p, state, pen, rate, t + dt, totals, log)
+        pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+        _add_to_totals(state, before, now, dt, totals)
+        if balance is not None:
+            balance_fixed_step(p, parts, state, y, t + dt, dt, balance)
+        done[0] = n + 1
+
+
+@kernel()
+def _wear(p, wear, state, force, dt) -> None:
+    if wear is not None:
+        for pair in range(8):
+            state.wear_depth[pair] += p.wear_per_impulse[pair] * force[pair] * dt

@@ -1,0 +1,332 @@
+"""The loop: steps one after the other, read out wherever output is wanted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import row, set_row, splat
+from plow_twin.solve.dense_output import evaluate, pair_outputs, sigma_at, sum_series, wear_depth_at
+from plow_twin.solve.energy_balance import balance_step, start_balance
+from plow_twin.solve.fixed_step import end_coarsely
+from plow_twin.solve.kinematics import pose_of
+from plow_twin.solve.method.flight import fly
+from plow_twin.solve.method.rest import write_rest
+from plow_twin.solve.method.taylor import one_by_one
+from plow_twin.solve.modes import within_range
+from plow_twin.solve.state import Status
+from plow_twin.solve.step import complete_step, lay_out_step
+from plow_twin.solve.totals import add_to_totals
+
+_OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
+_BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
+
+
+@kernel(inline=True)
+def _lay_out(p, parts, state, w, stop_time) -> bool:
+    terms = one_by_one(parts.terms)
+    return lay_out_step(p, parts, state, w, stop_time, *terms, parts.implicit, parts.terms.flight, parts.terms.rest)
+
+
+@kernel(inline=True)
+def _end(p, parts, state, w, totals, log) -> None:
+    terms = parts.terms
+    complete_step(p, parts, state, w, totals, log, terms.wear, terms.fraction)
+
+
+@kernel(inline=True)
+def _next(p, parts, state, w, stop_time, budget) -> int:
+    """Lay out the next step unless one is under way."""
+    if state.step_size >= 0.0:
+        return _OK
+    if state.steps >= budget:
+        return _BUDGET
+    if not within_range(p, state, state.y):
+        return _RANGE
+    return _OK if _lay_out(p, parts, state, w, stop_time) else _NON_FINITE
+
+
+@kernel()
+def _present(p, parts, state, w, y) -> None:
+    """Write the body coordinates at the present time to y, also within a step."""
+    if state.step_size >= 0.0:
+        evaluate(p, parts, state, w, sigma_at(state, state.elapsed), y)
+    else:
+        set_row(y, 0, row(state.y, 0))
+
+
+@kernel()
+def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
+    """Bring the motion to `target`; steps may reach beyond it, up to `stop_time`. Returns a `Status`."""
+    while True:
+        t0 = state.step_start
+        if t0 >= target and state.step_size < 0.0:
+            return _OK if within_range(p, state, state.y) else _RANGE
+        code = _next(p, parts, state, w, stop_time, budget)
+        if code != _OK:
+            return code
+        low = sigma_at(state, state.elapsed)
+        if target < t0 + state.step_size:
+            add_to_totals(state, w, low, sigma_at(state, target - t0), totals)
+            state.elapsed, state.time = target - t0, target
+            _present(p, parts, state, w, w.moved)
+            return _OK if within_range(p, state, w.moved) else _RANGE
+        add_to_totals(state, w, low, sigma_at(state, state.step_size), totals)
+        _end(p, parts, state, w, totals, None)
+
+
+@kernel()
+def _worn_at(state, w, wear, sigma, out) -> None:
+    """Write each pad's wear depth at sigma of the step under way."""
+    if wear is not None:
+        wear_depth_at(state, w, sigma, out)
+    else:
+        set_row(out, 0, row(state.wear_depth, 0))
+
+
+@kernel()
+def _worn_now(state, w, wear, out) -> None:
+    """Write each pad's wear depth at the present time, also within a step."""
+    if state.step_size >= 0.0:
+        _worn_at(state, w, wear, sigma_at(state, state.elapsed), out)
+    else:
+        set_row(out, 0, row(state.wear_depth, 0))
+
+
+@kernel()
+def _clear(totals) -> None:
+    """Begin to count anew what an advance reports."""
+    set_row(totals.peak, 0, splat(0.0))
+    set_row(totals.impulse, 0, splat(0.0))
+    for pair in range(8):
+        totals.makes[pair] = 0
+
+
+@kernel()
+def _advance(p, parts, state, w, totals, target, stop_time, budget, bound) -> int:
+    """Proceed to `target`; when that fails, time goes on but the head stays as it was, and nothing is counted.
+
+    With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
+    """
+    saved = w.saved
+    _present(p, parts, state, w, saved[0])
+    set_row(saved, 1, row(state.damping_factor, 0))
+    set_row(saved, 2, row(state.wear_depth, 0))
+    for pair in range(8):
+        w.modes[pair] = state.mode[pair]
+    code = _proceed(p, parts, state, w, totals, target, stop_time, budget)
+    if bound is not None:
+        bound.error[0] = 0.0
+        if code == _BUDGET:
+            code = end_coarsely(p, parts, state, totals, target, bound)
+    if code != _OK:
+        set_row(state.y, 0, row(saved, 0))
+        set_row(state.damping_factor, 0, row(saved, 1))
+        set_row(state.wear_depth, 0, row(saved, 2))
+        for pair in range(8):
+            state.mode[pair] = w.modes[pair]
+        state.step_start, state.step_size, state.elapsed, state.time = target, -1.0, 0.0, target
+        state.touching = state.events_at_once = 0
+        _clear(totals)
+    return code
+
+
+@kernel()
+def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth) -> None:
+    """Write row i: the state at the present time and the totals, which are cleared."""
+    y = w.moved
+    _present(p, parts, state, w, y)
+    pose_of(p, y, parts.terms.offset, q[i], v[i])
+    _worn_now(state, w, parts.terms.wear, wear_depth[i])
+    pair_outputs(p, state, wear_depth[i], y, penetration[i], rate[i], force[i])
+    for pair in range(8):
+        peak[i, pair] = max(totals.peak[pair], force[i, pair])
+        impulse[i, pair], makes[i, pair] = totals.impulse[pair], totals.makes[pair]
+    _clear(totals)
+
+
+@kernel()
+def advance_times(
+    p,
+    parts,
+    state,
+    w,
+    totals,
+    times,
+    budget,
+    q,
+    v,
+    penetration,
+    rate,
+    force,
+    peak,
+    impulse,
+    makes,
+    wear_depth,
+    steps,
+    status,
+    error_estimate,
+    bound,
+) -> None:
+    """Advance to each time under the scene's own loads and write a row for each."""
+    for i in range(times.size):
+        before = state.steps
+        status[i] = _advance(p, parts, state, w, totals, times[i], np.inf, before + budget, bound)
+        if bound is not None:
+            error_estimate[i] = bound.error[0]
+        steps[i] = state.steps - before
+        _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth)
+
+
+@kernel()
+def advance_batch(
+    params,
+    parts,
+    states,
+    work,
+    totals,
+    first,
+    last,
+    times,
+    wrench,
+    budget,
+    q,
+    v,
+    penetration,
+    rate,
+    force,
+    peak,
+    impulse,
+    makes,
+    wear_depth,
+    steps,
+    status,
+    error_estimate,
+    bound,
+) -> None:
+    """Advance members `first` to `last` - 1 to each time: arrays but times have an axis of members in front.
+
+    A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
+    bits alone. `work` and `totals` are arrays of one.
+    """
+    w, sums, piece = work[0], totals[0], parts.segments[0]
+    for m in range(first, last):
+        p, state = params[m], states[m]
+        state.piece = 0
+        for i in range(times.size):
+            before = state.steps
+            span = times[i] - state.step_start
+            piece.knot = state.step_start
+            for j in range(3):
+                piece.start[j] = wrench[m, i, j]
+                piece.slope[j] = (wrench[m, i + 1, j] - wrench[m, i, j]) / span if span > 1e-100 else 0.0
+            status[m, i] = _advance(p, parts, state, w, sums, times[i], times[i], before + budget, bound)
+            if bound is not None:
+                error_estimate[m, i] = bound.error[0]
+            steps[m, i] = state.steps - before
+            _read_row(
+                p, parts, state, w, sums, i, q[m], v[m], penetration[m], rate[m], force[m], peak[m], impulse[m],
+                makes[m], wear_depth[m],
+            )  # fmt: skip
+
+
+@kernel()
+def interrupt_step(p, parts, state, w, totals) -> None:
+    """End the step under way at the present time: something changes from outside."""
+    if state.step_size < 0.0:
+        return
+    state.sigma_end = sigma_at(state, state.elapsed)
+    state.step_size = state.elapsed
+    state.event_pair = -1
+    state.ends_at_stop = 0
+    now = state.time
+    _end(p, parts, state, w, totals, None)
+    state.step_start = state.time = now
+
+
+@kernel()
+def lay_out_again(p, parts, state, w) -> None:
+    """Compute the step under way once more after a restore: its series are not part of the state.
+
+    Only the scene's own loads leave a step under way, and there it has no hard end.
+    """
+    if state.at_rest == 1:
+        write_rest(p, state, w)
+        return
+    used, implicit = state.elapsed, parts.implicit
+    if implicit is not None:
+        # what laying it out has changed
+        state.implicit_size, state.explicit_size = (
+            state.implicit_size_before,
+            state.explicit_size_before,
+        )
+        state.overdamped = state.overdamped_before
+    steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
+    recoveries, implicit_steps = state.recoveries, state.implicit_steps
+    _lay_out(p, parts, state, w, np.inf)
+    state.steps, state.evaluations, state.guard_roots = steps, evaluations, guard_roots
+    state.recoveries, state.implicit_steps = recoveries, implicit_steps
+    state.elapsed = used
+
+
+@kernel()
+def _rows_in_flight(p, parts, flight, state, w, t, i, q, v, penetration, force):
+    """Fill the rows within a step of free flight from row i on; return the first row after it.
+
+    Apart from `integrate`, whose loop over rows is a tenth faster without the choice.
+    """
+    if flight is not None:
+        t0, y, rate = state.step_start, np.empty(8), np.empty(8)
+        while i < t.size and t[i] < t0 + state.step_size:
+            fly(p, parts.harmonics, flight, state, w, max(t[i] - t0, 0.0), y)
+            pose_of(p, y, None, q[i], v[i])
+            if force is not None:
+                pair_outputs(p, state, state.wear_depth, y, penetration[i], rate, force[i])
+            i += 1
+    return i
+
+
+@kernel()
+def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force, balance) -> int:
+    """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
+
+    `penetration`, `force` and `balance` may be None. The rows' times do not change the steps.
+    """
+    rate, y, wear_depth, wear = np.empty(8), np.empty(8), np.empty(8), parts.terms.wear
+    i = first[0]
+    if balance is not None and state.steps == 0:
+        start_balance(p, parts, state, state.y, state.step_start, balance)
+    while True:
+        if state.step_start >= t_end:
+            break
+        if log.length[0] >= log.time.size:
+            return _LOG_FULL
+        code = _next(p, parts, state, w, t_end, budget)
+        if code != _OK:
+            return code
+        t0, length = state.step_start, state.step_size
+        end = t0 + length
+        if state.in_flight == 1:
+            i = _rows_in_flight(p, parts, parts.terms.flight, state, w, t, i, q, v, penetration, force)
+        while i < t.size and t[i] < end:
+            sigma = sigma_at(state, max(t[i] - t0, 0.0))
+            sum_series(state, w, sigma, y)
+            pose_of(p, y, parts.terms.offset, q[i], v[i])
+            if force is not None:
+                _worn_at(state, w, wear, sigma, wear_depth)
+                pair_outputs(p, state, wear_depth, y, penetration[i], rate, force[i])
+            i += 1
+        first[0] = i
+        add_to_totals(state, w, 0.0, sigma_at(state, length), totals)
+        if balance is not None:
+            balance_step(p, parts, wear, parts.terms.flight, state, w, balance)
+        _end(p, parts, state, w, totals, log)
+    if not within_range(p, state, state.y):
+        return _RANGE
+    while i < t.size:
+        pose_of(p, state.y, parts.terms.offset, q[i], v[i])
+        if force is not None:
+            pair_outputs(p, state, state.wear_depth, state.y, penetration[i], rate, force[i])
+        i += 1
+    first[0] = i
+    return _OK

@@ -1,0 +1,1 @@
+"""Ways to lay out a step: free flight, rest, implicit, Taylor series."""

@@ -1,0 +1,120 @@
+"""Free flight in closed form: where no wall can be reached, a step of any length.
+
+While no pair touches, the centre of mass and the angle follow from integrating the load twice: constants, linear pieces
+and harmonics have elementary integrals. How far the head can get within a time is bounded without following it
+(conservative advancement): the bound decides how long the step may be. Near a wall the series take over, and meet it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.kinematics import penetration_of, to_body, to_world
+
+#: Radians of the fastest harmonic that a flight must span; a series gets some two of them into a step.
+_LEAST_PHASE = 8.0
+#: Part of the clearance that the bound may use up.
+_SAFE = 0.9
+
+
+@kernel(inline=True)
+def _amplitudes(p, one, j):
+    """Return sine and cosine amplitude of a harmonic's acceleration along x, y or theta."""
+    if j == 2:
+        return one.moment[0], one.moment[1]
+    sine = p.direction[0, j] * one.first[0] + p.direction[1, j] * one.second[0]
+    return sine, p.direction[0, j] * one.first[1] + p.direction[1, j] * one.second[1]
+
+
+@kernel()
+def _clearance(p, state) -> float:
+    """Return the distance of the pair that is nearest to touching."""
+    y, nearest = state.y, np.inf
+    for pair in range(8):
+        if p.enabled[pair] == 1:
+            penetration = penetration_of(p, state, pair, y)
+            nearest = min(nearest, -penetration)
+    return nearest
+
+
+@kernel()
+def _bounds(p, harmonics, t, z, w) -> None:
+    """Write what bounds the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
+
+    Rows: speed now; speed without what swings; acceleration of the harmonics at most; how far their swing reaches.
+    """
+    for j in range(3):
+        drift, push, swing = z[3 + j], 0.0, 0.0
+        for i in range(harmonics.size):
+            one = harmonics[i]
+            sine, cosine = _amplitudes(p, one, j)
+            phase, size = one.omega * t, p.free[j] * math.hypot(sine, cosine)
+            drift += p.free[j] * (sine * math.cos(phase) - cosine * math.sin(phase)) / one.omega
+            push += size
+            swing += 2.0 * size / (one.omega * one.omega)
+        w.flight[1, j], w.flight[2, j] = abs(z[3 + j]), abs(drift)
+        w.flight[3, j], w.flight[4, j] = push, swing
+
+
+@kernel()
+def _reach(p, w, time, leverage) -> float:
+    """Return how far a point at most `leverage` from the centre of mass can get within `time`."""
+    place = 0.0
+    for j in range(3):
+        steady = p.free[j] * (abs(w.wrench[0, j]) + abs(w.wrench[1, j]) * time / 3.0) * time * time / 2.0
+        pushed = w.flight[1, j] * time + w.flight[3, j] * time * time / 2.0
+        way = steady + min(pushed, w.flight[2, j] * time + w.flight[4, j])
+        place += (leverage if j == 2 else 1.0) * way
+    return place
+
+
+@kernel()
+def take_off(p, harmonics, state, w, span) -> float:
+    """Lay out a step of free flight of at most `span`; return its length, or 0 where a series serves as well."""
+    least = _LEAST_PHASE / p.fastest
+    if span < least:
+        return 0.0
+    clearance = _clearance(p, state)
+    z = w.flight[0]
+    to_world(state.y, z)
+    _bounds(p, harmonics, state.step_start, z, w)
+    # the walls' rows turn with the head: a place counts like a point of it
+    leverage = p.leverage + math.hypot(z[0], z[1]) + max(clearance, 0.0)
+    length = span
+    while length >= least:
+        if _reach(p, w, length, leverage) < _SAFE * clearance:
+            return length
+        length *= 0.5
+    return 0.0
+
+
+@kernel()
+def fly(p, harmonics, flight, state, w, time, y) -> None:
+    """Write the body coordinates `time` after the start of a flight to y."""
+    if flight is not None:
+        start, z = w.flight[0], w.flight[5]
+        for j in range(3):
+            rate = w.wrench[0, j] * time + w.wrench[1, j] * time * time / 2.0
+            way = w.wrench[0, j] * time * time / 2.0 + w.wrench[1, j] * time * time * time / 6.0
+            swing_rate, swing = _swing(p, harmonics, j, state.step_start, time)
+            z[j] = start[j] + start[3 + j] * time + p.free[j] * (way + swing)
+            z[3 + j] = start[3 + j] + p.free[j] * (rate + swing_rate)
+        to_body(z, y)
+
+
+@kernel()
+def _swing(p, harmonics, j, t, time):
+    """Return rate and way that the harmonics give along x, y or theta from t on within `time`."""
+    rate = way = 0.0
+    for i in range(harmonics.size):
+        one = harmonics[i]
+        sine, cosine = _amplitudes(p, one, j)
+        before, after = one.omega * t, one.omega * (t + time)
+        rise, fall = math.sin(after) - math.sin(before), math.cos(after) - math.cos(before)
+        rate += (cosine * rise - sine * fall) / one.omega
+        steady = sine * math.cos(before) - cosine * math.sin(before)
+        way += (steady * time - (sine * rise + cosine * fall) / one.omega) / one.omega
+    return rate, way

@@ -1,0 +1,100 @@
+"""How far a step reaches: where the series stops being accurate, and what shortens steps without showing in them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
+from plow_twin.solve.modes import penetration_and_rate
+from plow_twin.solve.state import ON
+
+#: A pair that would part within so many steps like the last is looked at, by a series of this order.
+_PARTING_REACH, PARTING_ORDER = 1.3, 6
+
+
+@kernel()
+def accurate_step(p, w, order, sigma_limit):
+    """Return the sigma over which the series meets its share of the tolerance; NaN if it is not finite.
+
+    Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
+    test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are looked at, since single ones can vanish.
+    """
+    least = np.inf
+    for k in range(order, order - max(p.lacuna, 2), -1):
+        size = w.term_size[k]
+        if not (size <= 1e300):
+            return math.nan
+        if size > 0.0:
+            least = min(least, math.log(p.threshold[k] / size) / k)
+    length = min(sigma_limit, math.exp(least))
+    # an error of velocity becomes one of position over a long step
+    stretch = length * p.velocity_tolerance / (p.position_tolerance * (order + 1))
+    if stretch > 1.0 and length < sigma_limit:
+        length *= math.exp(-math.log(stretch) / order)
+    return length
+
+
+@kernel()
+def before_sticking(p, state, w, order, sigma) -> float:
+    """Return the part of `sigma` over which the series of tanh r converges well enough.
+
+    Far from sticking tanh r is constant to the last bit: no coefficient tells that its poles at r = +-i pi/2 come near.
+    With |r - r_0| at most theta times their distance what the series leaves out is below theta^order.
+    """
+    theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
+    length = sigma
+    for pair in range(8):
+        if state.mode[pair] != ON:
+            continue
+        change = 0.0
+        for k in range(order - 1, 0, -1):
+            change = (change + abs(w.slip[0, k, pair])) * length
+        limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
+        if change > limit:
+            # the change is convex in sigma
+            length *= limit / change
+    return length
+
+
+@kernel()
+def time_to_separation(p, parts, state, w, span, harmonics):
+    """Return the time until the first pair parts, where that is what shortens steps; else 0.
+
+    The root of a short series is enough: what it misses is left to the next step.
+    """
+    near = False
+    for pair in range(8):
+        if state.mode[pair] == ON:
+            penetration, rate = penetration_and_rate(p, state, pair)
+            if rate < 0.0 and penetration < -rate * _PARTING_REACH * state.last_step_size:
+                near = True
+    if not near:
+        return 0.0
+    if harmonics is not None:
+        expand_harmonics(parts.harmonics, parts.terms.second, state.step_start, 1.0, 0.0, PARTING_ORDER, w)
+    terms = one_by_one(parts.terms)
+    order = expand(p, state, w, PARTING_ORDER, True, span, *terms)
+    state.evaluations += order
+    first = np.inf
+    for pair in range(8):
+        if state.mode[pair] != ON or w.penetration[1, pair] >= 0.0:
+            continue
+        t = -w.penetration[0, pair] / w.penetration[1, pair]
+        if t > _PARTING_REACH * state.last_step_size:
+            continue
+        for _ in range(6):
+            value, slope = w.penetration[order, pair], 0.0
+            for k in range(order - 1, -1, -1):
+                slope = slope * t + value
+                value = value * t + w.penetration[k, pair]
+            if not slope < 0.0:
+                break
+            change = value / slope
+            t -= change
+            if abs(change) < 1e-9 * t:
+                first = min(first, t)
+                break
+    return first if 0.0 < first < np.inf else 0.0

@@ -1,0 +1,115 @@
+"""The eight pairs: how deep they are, in which mode, what they contribute, and the range in which the model holds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.model.contact import free_force
+from plow_twin.solve.kinematics import penetration_of, rate_of
+from plow_twin.solve.state import (
+    ACTS,
+    BASE,
+    CLIPPED,
+    DAMPS,
+    OFF,
+    ON,
+    RAMPS,
+    RELEASED,
+    THETA,
+)
+
+#: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees.
+LARGEST_ANGLE = 0.25 * math.pi
+
+
+@kernel(inline=True)
+def penetration_and_rate(p, state, pair):
+    """Return penetration and its rate of one pair at the step's start."""
+    return penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y)
+
+
+@kernel()
+def touch(p, state, pair) -> None:
+    """Start a contact: read its impact speed, lambda = D / v0."""
+    if p.damping_number >= 0.0:
+        _, speed = penetration_and_rate(p, state, pair)
+        state.damping_factor[pair] = p.damping_number / max(speed, p.speed_floor)
+
+
+@kernel()
+def mode_inside(p, state, pair):
+    """Return the mode of a pair that penetrates, and note on which side of its ramp's end it is."""
+    penetration, rate = penetration_and_rate(p, state, pair)
+    state.beyond_ramp[pair] = 1 if penetration > p.ramp else 0
+    if free_force(penetration, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp) < 0.0:
+        return CLIPPED
+    return ON if penetration >= p.release else RELEASED
+
+
+@kernel()
+def settle_modes(p, state) -> None:
+    """Choose each pair's mode from its penetration, where a motion starts or is changed from outside."""
+    for pair in range(8):
+        state.mode[pair] = OFF
+        state.beyond_ramp[pair] = 0
+        if p.enabled[pair] == 1 and penetration_and_rate(p, state, pair)[0] > 0.0:
+            touch(p, state, pair)
+            state.mode[pair] = mode_inside(p, state, pair)
+    state.elapsed = 0.0
+    state.step_size = -1.0
+    state.last_step_size = 0.0
+    state.touch_time = -np.inf
+    state.touching = 0
+    state.events_at_once = 0
+
+
+@kernel(inline=True)
+def any_penetrates(state) -> bool:
+    """Tell whether any pair is inside its wall, with or without force."""
+    inside = 0
+    for pair in range(8):
+        inside += 0 if state.mode[pair] == OFF else 1
+    return inside > 0
+
+
+@kernel()
+def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
+    """Write what each pair that acts contributes per order to `w.per_pair`; return whether any pair penetrates."""
+    mode, lanes = state.mode, w.per_pair
+    for pair in range(8):
+        lanes[BASE, pair] = 0.0
+        lanes[RAMPS, pair] = 1.0 - state.beyond_ramp[pair]
+        raised = mode[pair] == ON or (ramp is not None and mode[pair] == CLIPPED)
+        if fraction is not None and raised and state.touching >> pair & 1 == 0:
+            penetration = penetration_and_rate(p, state, pair)[0]
+            if penetration > 1e-3 * p.release:
+                lanes[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
+            else:
+                # interrupted right after its touch: too shallow for a series of its power
+                mode[pair] = RELEASED
+        acts = mode[pair] == ON
+        lanes[ACTS, pair] = p.stiffness if acts else 0.0
+        lanes[DAMPS, pair] = 0.0
+        if acts:
+            lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.damping_factor[pair]
+    return any_penetrates(state)
+
+
+@kernel(inline=True)
+def slow_touch(p) -> float:
+    """Return the speed below which a pair cannot reach the release penetration by the speed of its touch alone."""
+    acceleration = p.threshold[0] * p.weight / p.radius
+    return 1e-3 * math.sqrt(2.0 * acceleration * p.release)
+
+
+@kernel()
+def within_range(p, state, y) -> bool:
+    """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
+    deepest = 0.0
+    for pair in range(8):
+        if p.enabled[pair] == 1:
+            deepest = max(deepest, penetration_of(p, state, pair, y))
+    return abs(y[THETA]) <= LARGEST_ANGLE and deepest <= p.half_cavity

@@ -1,0 +1,341 @@
+"""What the compiled kernels pass around: constants of a scene, dynamic state, scratch space and what is counted.
+
+Parts that a scene does not have are `None`: the compiled signature then holds `none` in their place and the code that
+would serve them is not compiled at all.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import IntEnum
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.kernel.polynomial import MAX_HALVINGS
+from plow_twin.model.geometry import STATE_SIZE
+from plow_twin.model.pairs import PAIR_COUNT
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+#: Highest order of the series; the tolerance decides how many terms are used.
+MAX_ORDER: Final = 30
+
+# indices into Work.per_pair
+ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
+
+# contact modes; the first three are public
+OFF: Final = 0
+ON: Final = 1
+CLIPPED: Final = 2
+#: Not a mode: a pair crosses the end of its damping's ramp.
+CROSSING: Final = 4
+#: Penetrating less than `Params.release`, where the force is negligible (exponents that are not integers).
+RELEASED: Final = 3
+
+# indices into State.y
+X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
+
+
+class Status(IntEnum):
+    """How an advance ended."""
+
+    OK = 0
+    OUT_OF_RANGE = 1
+    NON_FINITE = 2
+    BUDGET = 3
+    #: internal: the event log is full, the caller makes room and goes on
+    LOG_FULL = 4
+
+    @property
+    def text(self) -> str:
+        """Say it in a sentence."""
+        return _STATUS_TEXT[self]
+
+
+_STATUS_TEXT: Final = {
+    Status.OK: "done",
+    Status.OUT_OF_RANGE: "the head left the model's range: |theta| above 45 degrees or half the cavity penetrated",
+    Status.NON_FINITE: "the motion became non-finite; load, stiffness or damping is too large for double precision",
+    Status.BUDGET: "the budget of steps was used up before the time asked for",
+    Status.LOG_FULL: "the event log is full",
+}
+
+
+# Records rather than tuples of arrays: a kernel gets one pointer, shapes are constants, and nothing is reference
+# counted.
+
+_ROWS: Final = MAX_ORDER + 1
+_WIDE: Final = (_ROWS, PAIR_COUNT)
+#: Size of a cache line in bytes.
+_LINE: Final = 64
+
+
+def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
+    """Return a record type that fills whole cache lines, so that each of many begins at one."""
+    packed = np.dtype(fields)
+    names = packed.names or ()
+    parts: Any = packed.fields
+    return np.dtype(
+        {
+            "names": names,
+            "formats": [parts[name][0] for name in names],
+            "offsets": [parts[name][1] for name in names],
+            "itemsize": -(-packed.itemsize // _LINE) * _LINE,
+        }
+    )
+
+
+#: Constants of one scene and one tolerance, per mass and inertia where that saves work.
+PARAMS: Final = _in_lines(
+    [
+        ("penetration_rows", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
+        ("arm_rows", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
+        ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
+        ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # its arm about G
+        ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
+        ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
+        ("inverse_mass", "f8"),
+        ("inverse_inertia", "f8"),
+        ("stiffness", "f8"),
+        ("exponent", "f8"),
+        ("viscous", "f8"),  # C in N s/m, 0 without
+        ("damping_number", "f8"),  # D of lambda = D / v0, or a negative number when lambda is constant
+        ("speed_floor", "f8"),  # smallest v0
+        ("ramp", "f8"),  # penetration over which C grows, 0 without
+        ("gravity", "f8"),
+        ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
+        ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
+        ("offset", "f8", (2,)),  # centre of mass from the cavity's centre
+        ("free", "f8", (3,)),  # 1 free, 0 locked
+        ("friction", "f8"),  # mu
+        ("slip_speed", "f8"),  # regularisation speed in m/s
+        ("order", "i8"),
+        ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
+        ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
+        ("velocity_tolerance", "f8"),  # admissible error of a velocity
+        ("position_tolerance", "f8"),  # admissible error of a position
+        ("weight", "f8"),  # turns cos and sin into velocities
+        ("radius", "f8"),  # turns angles into lengths
+        ("release", "f8"),  # penetration below which the force is negligible
+        ("fastest", "f8"),  # largest angular frequency of the harmonics
+        ("leverage", "f8"),  # distance of a corner of the frame from its centre
+        ("half_cavity", "f8"),  # penetration that ends the model's range
+        ("max_events", "i8"),  # events at one instant before recovery
+    ]
+)
+
+#: Everything that the future depends on, and the step under way. Times in s.
+STATE: Final = _in_lines(
+    [
+        ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
+        ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
+        ("wear_depth", "f8", (PAIR_COUNT,)),  # of each pad in m
+        ("mode", "i8", (PAIR_COUNT,)),
+        ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
+        ("step_start", "f8"),
+        ("elapsed", "f8"),  # time into the step under way
+        ("step_size", "f8"),  # of the step under way, negative without one
+        ("sigma_end", "f8"),  # the series' variable at the step's end
+        ("alpha", "f8"),  # time runs as t = alpha sigma + beta sigma^2 / 2
+        ("beta", "f8"),
+        ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
+        ("last_step_size", "f8"),
+        ("touch_time", "f8"),  # of the last touch
+        ("time", "f8"),  # the present, bit for bit as it was asked for
+        ("implicit_size", "f8"),  # of the next implicit step
+        ("explicit_size", "f8"),  # of the last explicit step
+        ("implicit_size_before", "f8"),  # both as they were before the step under way was laid out
+        ("explicit_size_before", "f8"),
+        ("order", "i8"),  # of the series of the step under way
+        ("event_pair", "i8"),  # the pair whose event ends the step, or -1
+        ("event_mode", "i8"),  # the mode that follows
+        ("touching", "i8"),  # a bit for each pair that touches at the step's start and needs the root of time
+        ("events_at_once", "i8"),  # events so far at one instant
+        ("piece", "i8"),  # of the sampled load
+        ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
+        ("overdamped", "i8"),  # explicit steps in a row that stability has bound
+        ("overdamped_before", "i8"),  # the same before the step under way was laid out
+        ("in_flight", "i8"),  # 1 during a step of free flight
+        ("at_rest", "i8"),  # 1 during a step of rest
+        # counted since the start
+        ("steps", "i8"),
+        ("evaluations", "i8"),  # of the equations of motion; an order of a series counts as one
+        ("events", "i8"),
+        ("guard_roots", "i8"),  # guards whose roots were searched for
+        ("recoveries", "i8"),  # times that modes flipped at one instant
+        ("bounded", "i8"),  # advances whose end was coarse
+        ("implicit_steps", "i8"),
+    ]
+)
+
+#: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes.
+WORK: Final = np.dtype(
+    [
+        ("series", "f8", _WIDE),  # state
+        ("left", "f8", _WIDE),  # factors of the Cauchy products
+        ("right", "f8", _WIDE),
+        ("penetration", "f8", _WIDE),  # penetration
+        ("rate", "f8", _WIDE),  # its rate in time
+        ("arm", "f8", _WIDE),
+        ("damped", "f8", _WIDE),  # elastic part times rate
+        ("force", "f8", _WIDE),
+        ("wear", "f8", _WIDE),  # growth of the wear depth
+        ("guard", "f8", _WIDE),
+        ("bernstein", "f8", _WIDE),
+        ("power", "f8", (4, *_WIDE)),  # powers of the penetration
+        ("ramp", "f8", (3, *_WIDE)),  # square and cube of the penetration, share of C
+        ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
+        ("load", "f8", (3, _ROWS)),  # S1, S2, M
+        ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
+        ("column", "f8", (2, _ROWS)),  # one polynomial
+        ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
+        ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
+        ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
+        ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
+        ("flight", "f8", (6, 6)),  # start of a flight, what bounds it, scratch (`solve.method.flight`)
+        ("rest", "f8", (4, 6)),  # place, rates and load at rest (`solve.method.rest`)
+        ("hessian", "f8", (3, 3)),
+        ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
+        ("moved", "f8", (STATE_SIZE,)),
+        ("saved", "f8", (3, PAIR_COUNT)),  # y, damping factors and wear depths before an advance
+        ("modes", "i8", (PAIR_COUNT,)),  # and the modes
+        ("inverse", "f8", (_ROWS + 2,)),  # 1/k
+        ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
+    ]
+)
+
+#: What is summed over the motion since it was last cleared.
+TOTALS: Final = np.dtype(
+    [
+        ("peak", "f8", (PAIR_COUNT,)),
+        ("impulse", "f8", (PAIR_COUNT,)),
+        ("time_in_contact", "f8", (PAIR_COUNT,)),
+        ("makes", "i8", (PAIR_COUNT,)),
+        ("set_time", "f8", (2, 16)),  # time in each set of corners, counter-clockwise and clockwise pairs
+    ]
+)
+
+Params: TypeAlias = np.record
+State: TypeAlias = np.record
+Work: TypeAlias = np.record
+Totals: TypeAlias = np.record
+
+
+#: Harmonic loads, per mass and inertia, sine and cosine amplitudes: forces S1 and S2 along `direction`, moment M.
+HARMONIC: Final = np.dtype([("omega", "f8"), ("first", "f8", (2,)), ("second", "f8", (2,)), ("moment", "f8", (2,))])
+
+#: Linear pieces of a sampled load, per mass and inertia: value at the knot and slope from there.
+SEGMENT: Final = np.dtype([("knot", "f8"), ("start", "f8", (3,)), ("slope", "f8", (3,))])
+
+Harmonics: TypeAlias = NDArray[np.void]
+Segments: TypeAlias = NDArray[np.void]
+
+
+class Terms(NamedTuple):
+    """Which terms the equations of motion have: 1, or `None` for one that is absent. Their numbers are in `Params`.
+
+    The types are part of the compiled signature. A kernel takes them one by one, since a branch is left out of the
+    compiled code only by an argument of its own that is `None`.
+    """
+
+    harmonics: int | None
+    second: int | None  #: harmonic forces in two directions
+    segments: int | None  #: linear pieces
+    viscous: int | None  #: C d'
+    hysteretic: int | None  #: lambda d', lambda from State.damping_factor
+    integer: int | None  #: an integer exponent of at least 2
+    fraction: int | None  #: an exponent that is not an integer
+    ramp: int | None  #: the viscous part grows with the penetration
+    wear: int | None
+    offset: int | None  #: the centre of mass is not the cavity's
+    free: int | None  #: some degree of freedom is locked
+    slip: int | None  #: friction
+    flight: int | None  #: free flight in closed form (`solve.method.flight`)
+    rest: int | None  #: rest can be recognised (`solve.method.rest`)
+
+
+class Implicit(NamedTuple):
+    """Nodes, weights and scratch space of an implicit step with s stages (`solve.method.implicit`)."""
+
+    nodes: Array  #: (s,)
+    weights: Array  #: (s, s)
+    from_values: Array  #: (s + 1, s + 1) coefficients from values at the start and at the nodes
+    from_stages: Array  #: (s, s) the same from values at the nodes
+    z: Array  #: (s + 1, 6) state at the start and at the nodes
+    rate: Array  #: (2, 6) rates for a difference
+    accelerations: Array  #: (s, 3)
+    jacobians: Array  #: (s, 2, 3, 3) of the accelerations, by place and by velocity
+    matrix: Array  #: (3 s, 3 s)
+    residual: Array  #: (3 s,)
+    body: Array  #: (s + 1, 8) body coordinates
+    forces: Array  #: (s, 8)
+    load: Array  #: (3,)
+
+
+class Parts(NamedTuple):
+    """What a scene may lack: terms of the equations, and the data of those whose size differs from scene to scene."""
+
+    terms: Terms
+    harmonics: Harmonics | None
+    segments: Segments | None
+    implicit: Implicit | None
+
+
+class Bound(NamedTuple):
+    """What bounds the work of an advance, and scratch space for its coarse end."""
+
+    steps: int  #: Runge-Kutta steps that are kept for the end
+    error: Array  #: (1,) error estimate in m of the advance, 0 while the bound does not bite
+    z: Array  #: (6, 6) state, trial state, four stages
+    load: Array  #: (3,)
+    pairs: Array  #: (4, 8) penetration, rate, force, force before
+
+
+class Log(NamedTuple):
+    """Contact events in order of time."""
+
+    time: Array
+    pair: IntArray
+    mode_from: IntArray
+    mode_to: IntArray
+    rate: Array
+    length: IntArray  #: (1,)
+
+
+def new_record(dtype: np.dtype[np.void]) -> np.record:
+    """Return a record of zeros."""
+    return first_of(new_records(dtype, 1))
+
+
+def first_of(records: NDArray[np.void]) -> np.record:
+    """Return the first of some records, in place."""
+    record: np.record = records.view(np.recarray)[0]
+    return record
+
+
+def new_records(dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
+    """Return records of zeros that start at a cache line: rows of eight numbers then lie in one line each."""
+    memory = np.zeros(count * dtype.itemsize + _LINE, np.uint8)
+    start = -memory.ctypes.data % _LINE
+    records: NDArray[np.void] = memory[start : start + count * dtype.itemsize].view(dtype)
+    return records
+
+
+def new_work() -> Work:
+    """Return scratch space for series up to `MAX_ORDER`."""
+    work = new_record(WORK)
+    work.inverse[1:] = 1.0 / np.arange(1, _ROWS + 2)
+    for order in range(_ROWS):
+        work.binomial[order, : order + 1] = [1.0 / math.comb(order, k) for k in range(order + 1)]
+    return work
+
+
+def new_log(size: int) -> Log:
+    """Return an event log with room for `size` events."""
+    return Log(
+        np.zeros(size), np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size),
+        np.zeros(1, np.int64),
+    )  # fmt: skip

@@ -1,0 +1,74 @@
+"""What is summed over the motion, from the force polynomials: peaks, impulses, times, sets of corners."""
+
+from __future__ import annotations
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.polynomial import maximum, shift_column
+from plow_twin.kernel.simd import magnitude, row, set_row, splat
+from plow_twin.solve.state import FIRST, ON, SECOND, SUM
+
+
+@kernel(fast=True)
+def _sums(w, order, h) -> None:
+    """Write a bound of each force over [0, h] and its integrals: sum f_k h^k / (k+1), sum f_k h^k / (k+2).
+
+    Between its ends a function exceeds them by h^2 / 8 times its largest curvature at most.
+    """
+    end = bend = first = second = splat(0.0)
+    for k in range(order, -1, -1):
+        force = row(w.force, k)
+        end = end * h + force
+        bend = bend * h + magnitude(force) * (0.125 * k * (k - 1))
+        first = first * h + force * w.inverse[k + 1]
+        second = second * h + force * w.inverse[k + 2]
+    start = row(w.force, 0)
+    set_row(w.per_pair, SUM, (start + end + magnitude(start - end)) * 0.5 + bend)
+    set_row(w.per_pair, FIRST, first)
+    set_row(w.per_pair, SECOND, second)
+
+
+@kernel()
+def add_to_totals(state, w, low, high, totals) -> None:
+    """Add what happened between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
+    mode = state.mode
+    acting = 0
+    for pair in range(8):
+        acting += 1 if mode[pair] == ON else 0
+    if acting == 0:
+        return
+    order = state.order - 1
+    alpha, beta = state.alpha + state.beta * low, state.beta
+    h = high - low
+    elapsed = alpha * h + 0.5 * beta * h * h
+    if low > 0.0:
+        for pair in range(8):
+            shift_column(w.force, pair, order, low, w.bernstein)
+        _swap_rows(w.force, w.bernstein, order)
+    _sums(w, order, h)
+    ccw = cw = 0
+    for pair in range(8):
+        if mode[pair] != ON:
+            continue
+        totals.impulse[pair] += max(0.0, (alpha * w.per_pair[FIRST, pair] + beta * h * w.per_pair[SECOND, pair]) * h)
+        if w.per_pair[SUM, pair] > totals.peak[pair]:
+            for k in range(order + 1):
+                w.column[0, k] = w.force[k, pair]
+            totals.peak[pair] = maximum(w.column[0], order, h, totals.peak[pair], w)
+        totals.time_in_contact[pair] += elapsed
+        # pairs 0, 3, 4, 7 stop a counter-clockwise swing, the others a clockwise one
+        corner = pair // 2
+        if (pair + corner) % 2 == 0:
+            ccw |= 1 << corner
+        else:
+            cw |= 1 << corner
+    if low > 0.0:
+        _swap_rows(w.force, w.bernstein, order)
+    totals.set_time[0, ccw] += elapsed if ccw != 0 else 0.0
+    totals.set_time[1, cw] += elapsed if cw != 0 else 0.0
+
+
+@kernel()
+def _swap_rows(a, b, order) -> None:
+    for k in range(order + 1):
+        for lane in range(8):
+            a[k, lane], b[k, lane] = b[k, lane], a[k, lane]

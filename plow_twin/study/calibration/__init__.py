@@ -1,0 +1,1 @@
+"""Unknowns of a scene fitted to figures or to a recording."""

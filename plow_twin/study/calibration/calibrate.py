@@ -1,0 +1,222 @@
+"""Fit unknowns of a scene to an objective: many independent starts, each global first, then local.
+
+One start: (1) `screen` random points of the unit cube, the best of them become the first population of (2) a
+differential evolution (Storn and Price, J. Global Optim. 11 (1997) 341; scipy), whose every generation is one ensemble
+of runs; (3) its best point is polished in the unknowns that have a range: least squares (trust region reflective,
+scipy) with a finite-difference Jacobian from one ensemble, then, where the residuals have kinks, Nelder and Mead's
+simplex. Every start draws from a generator of its own, spawned from the seed: the same seed gives the same bits,
+whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.study.calibration.objective import Objective
+from plow_twin.study.calibration.unknowns import Space
+from plow_twin.study.parameters import Value
+
+Array = NDArray[np.float64]
+#: Called with the share of the work done, 0..1, and the best objective so far.
+OnProgress = Callable[[float, float], None]
+
+
+@dataclass(frozen=True)
+class Search:
+    """Effort of one start: points screened, population, generations, evaluations of the simplex (0: none)."""
+
+    screen: int = 200
+    population: int = 30
+    generations: int = 40
+    simplex: int = 0
+    #: spread of the population's objective, relative to its mean, at which the evolution ends
+    spread: float = 1e-3
+    #: step of the Jacobian in the unit cube
+    step: float = 1e-6
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where one start has led: its point in the cube, the values there, the objective before and after polishing."""
+
+    number: int
+    point: Array
+    values: dict[str, Value]
+    objective: float
+    before_polish: float
+    runs: int
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The result of a calibration; `starts` in the order of their objective, best first."""
+
+    starts: tuple[Start, ...]
+    seed: int
+    runs: int
+    #: every point of a last population, with its objective: what else fits almost as well
+    population: Array = field(repr=False)
+    population_objective: Array = field(repr=False)
+
+    @property
+    def best(self) -> Start:
+        """The start with the smallest objective."""
+        return self.starts[0]
+
+
+def calibrate(
+    space: Space,
+    objective: Objective,
+    *,
+    seed: int,
+    starts: int,
+    search: Search | None = None,
+    first: Array | None = None,
+    on_progress: OnProgress | None = None,
+) -> Calibration:
+    """Minimise the objective over the space from independent random starts.
+
+    Parameters
+    ----------
+    space : Space
+    objective : Objective
+    seed, starts : int
+    search : Search, optional
+        Effort of each start.
+    first : ndarray, shape (n,), optional
+        A point that joins the first population of the first start: the scene as it stands.
+    on_progress : callable, optional
+        Called after every generation.
+    """
+    search = search or Search()
+    done: list[Start] = []
+    populations: list[tuple[Array, Array]] = []
+    for number, child in enumerate(np.random.SeedSequence(seed).spawn(starts)):
+        rng = np.random.default_rng(child)
+
+        def report(share: float, best: float, number: int = number) -> None:
+            if on_progress is not None:
+                on_progress((number + share) / starts, min([best, *(start.objective for start in done)]))
+
+        before = objective.runs
+        known = first if number == 0 else None
+        points, values = _evolve(space, objective, rng, search, known, report)
+        point, best = polish(space, objective, points[np.argmin(values)], search)
+        populations.append((points, values))
+        # a polish that does not help leaves the best of the population
+        if values.min() < best:
+            point, best = points[np.argmin(values)], float(values.min())
+        point = space.settled(point)
+        done.append(Start(number, point, space.values(point), best, float(values.min()), objective.runs - before))
+    order = sorted(done, key=lambda start: (start.objective, start.number))
+    return Calibration(
+        tuple(order), seed, objective.runs,
+        np.concatenate([points for points, _ in populations]), np.concatenate([values for _, values in populations]),
+    )  # fmt: skip
+
+
+def _evolve(
+    space: Space,
+    objective: Objective,
+    rng: np.random.Generator,
+    search: Search,
+    first: Array | None,
+    report: Callable[[float, float], None],
+) -> tuple[Array, Array]:
+    """Return the last population of one start, shape (p, n), and its objectives."""
+    from scipy.optimize import differential_evolution
+
+    points = rng.random((max(search.screen, search.population), space.size))
+    if first is not None:
+        points[0] = first
+    values = _screened(space, objective, points, search.population)
+    order = np.argsort(values, kind="stable")[: search.population]
+    points, values = points[order], values[order]
+    report(0.1, float(values.min()))
+    if search.generations == 0:
+        return points, values
+    cut, generation = float(values.max()), [0]
+
+    def evaluate(columns: Array) -> Array:
+        # a trial above the worst of the population is never accepted: it need not be run to the end
+        return sums(objective.residuals(space.values_of(np.atleast_2d(columns.T)), cut))
+
+    def after(intermediate_result: object) -> None:
+        generation[0] += 1
+        best = float(getattr(intermediate_result, "fun", np.inf))
+        report(0.1 + 0.8 * min(1.0, generation[0] / search.generations), best)
+
+    result = differential_evolution(
+        evaluate, [(0.0, 1.0)] * space.size, init=points, rng=rng, maxiter=search.generations, tol=search.spread,
+        polish=False, vectorized=True, updating="deferred", callback=after,
+    )  # fmt: skip
+    return np.asarray(result.population), np.asarray(result.population_energies)
+
+
+def _screened(space: Space, objective: Objective, points: Array, keep: int) -> Array:
+    """Return the objective of every point; only those are run to the end that can be among the best `keep`."""
+    batch = max(keep, 64)
+    values = np.zeros(0)
+    for begin in range(0, len(points), batch):
+        cut = np.inf if len(values) < keep else float(np.sort(values)[keep - 1])
+        found = sums(objective.residuals(space.values_of(points[begin : begin + batch]), cut))
+        values = np.concatenate([values, found])
+    return values
+
+
+def polish(space: Space, objective: Objective, point: Array, search: Search) -> tuple[Array, float]:
+    """Improve a point in its continuous unknowns; return it and its objective."""
+    from scipy.optimize import least_squares, minimize
+
+    free = space.continuous
+    point = space.settled(point)
+    if free.size == 0:
+        return point, float(sums(objective.residuals([space.values(point)]))[0])
+
+    def full(x: Array) -> Array:
+        whole = point.copy()
+        whole[free] = x
+        return whole
+
+    result = least_squares(
+        lambda x: objective.residuals([space.values(full(x))])[0], point[free],
+        jac=lambda x: jacobian(space, objective, full(x), search.step)[:, free], bounds=(0.0, 1.0),
+        xtol=1e-12, ftol=1e-12, gtol=1e-14, max_nfev=30,
+    )  # fmt: skip
+    best, value = full(result.x), float(2.0 * result.cost)
+    if search.simplex > 0:
+        simplex = minimize(
+            lambda x: float(sums(objective.residuals([space.values(full(x))]))[0]), best[free], method="Nelder-Mead",
+            bounds=[(0.0, 1.0)] * free.size,
+            options={"maxfev": search.simplex, "xatol": 1e-7, "fatol": 1e-7, "adaptive": True},
+        )  # fmt: skip
+        if float(simplex.fun) < value:
+            best, value = full(simplex.x), float(simplex.fun)
+    return best, value
+
+
+def jacobian(space: Space, objective: Objective, point: Array, step: float) -> Array:
+    """Return dr/dz in the unit cube, shape (r, n), by central differences (one-sided at the walls of the cube).
+
+    Columns of choices are zero.
+    """
+    free = space.continuous
+    moved = np.repeat(point[None], 2 * free.size, axis=0)
+    for row, index in enumerate(free):
+        moved[2 * row, index] = max(point[index] - step, 0.0)
+        moved[2 * row + 1, index] = min(point[index] + step, 1.0)
+    residuals = objective.residuals(space.values_of(moved))
+    result = np.zeros((residuals.shape[1], space.size))
+    for row, index in enumerate(free):
+        width = moved[2 * row + 1, index] - moved[2 * row, index]
+        result[:, index] = (residuals[2 * row + 1] - residuals[2 * row]) / width
+    return result
+
+
+def sums(residuals: Array) -> Array:
+    """Return the objective of each row of residuals."""
+    return np.asarray((residuals**2).sum(axis=1))

@@ -1,0 +1,137 @@
+"""A calibration's result for people and files: the fitted scene with its marks, what it meets, how unique it is."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from plow_twin.build import build_fingerprint, package_version
+from plow_twin.model.scene import Mark, Provenance, Scene
+from plow_twin.scene_file import dump_scene
+from plow_twin.study.calibration.calibrate import Calibration, Search
+from plow_twin.study.calibration.objective import Objective, TargetObjective
+from plow_twin.study.calibration.uniqueness import Cluster, Identifiability
+from plow_twin.study.calibration.unknowns import Space
+from plow_twin.study.parameters import Value, with_parameters
+from plow_twin.study.store import write_atomically
+
+_NOT_NUMBERS: Final = ("sign", "scale", "labels", "law", "rotation")
+
+
+@dataclass(frozen=True)
+class TargetRow:
+    """One target at the best fit: statistics of its runs, residual, met or not."""
+
+    name: str
+    kind: str
+    statistic: str
+    asked: str
+    got: tuple[float, ...]
+    residual: float
+    met: bool
+    mark: str
+    source: str
+
+
+def fitted_scene(scene: Scene, values: Mapping[str, Value], source: str) -> Scene:
+    """Return the scene with the fitted values; every number that they change is marked as reconstructed.
+
+    A number that is as it was keeps its mark, one whose sign alone has changed the source of its size.
+    """
+    fit = with_parameters(scene, values)
+    marks = dict(fit.marks)
+    index = {load.name: number for number, load in enumerate(scene.loads)}
+    keys = set(scene.marks) - set(fit.marks)
+    for path in values:
+        match = re.fullmatch(r"loads\.(.+)\.(\w+(?:\[\d+\])?)", path)
+        key = f"loads[{index[match[1]]}].{match[2]}" if match else path
+        if not key.endswith(_NOT_NUMBERS):
+            keys.add(key)
+    for key in sorted(keys):
+        marks[key] = _mark(_number_at(scene, key), _number_at(fit, key), scene.marks.get(key), source)
+    return replace(fit, marks=MappingProxyType(marks))
+
+
+def _mark(before: Any, after: Any, old: Provenance | None, source: str) -> Provenance:
+    if old is not None and before == after:
+        return old
+    same_size = isinstance(before, float) and isinstance(after, float) and abs(before) == abs(after)
+    if old is not None and same_size:
+        size = old.source if old.mark is Mark.RECONSTRUCTED else f"size {old.mark.value}: {old.source}"
+        return Provenance(Mark.RECONSTRUCTED, size)
+    return Provenance(Mark.RECONSTRUCTED, f"fitted to {source}")
+
+
+def _number_at(scene: Scene, key: str) -> Any:
+    """Return what stands at a key of `Scene.marks`, such as `loads[0].force_n[1]`."""
+    value: Any = scene
+    for name, place in re.findall(r"(\w+)|\[(\d+)\]", key):
+        value = getattr(value, name) if name else value[int(place)]
+    return value
+
+
+def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list[TargetRow]:
+    """Return every target with what the candidate has of it."""
+    numbers, paths = objective.table(values)
+    settings = list(objective.targets.settings)
+    rows = []
+    for target, residual in zip(objective.targets.targets, objective.unweighted(values), strict=True):
+        columns = [paths.index(path) for path in target.statistics]
+        got = tuple(float(numbers[settings.index(setting), columns].min()) for setting in target.settings)
+        asked = {
+            "value": f"{target.number:g} within {target.tolerance:.0%}",
+            "above": f"above {', '.join(target.others)}",
+            "trend": f"{target.shape.replace('_', ' ')}",
+        }.get(target.kind, f"{target.kind.replace('_', ' ')} {target.number:g}")
+        met = target.met(float(residual))
+        kind, first = target.kind, target.statistics[0]
+        rows.append(TargetRow(target.name, kind, first, asked, got, float(residual), met, target.mark, target.source))
+    return rows
+
+
+@dataclass(frozen=True)
+class Fit:
+    """All that a calibration has found."""
+
+    scene: Scene
+    calibration: Calibration
+    search: Search
+    source: str
+    identifiability: Identifiability
+    clusters: list[Cluster]
+    #: objective of the scene as it stood, None when it lies outside of the unknowns' ranges
+    before: float | None
+    targets: list[TargetRow]
+
+    def plain(self, space: Space, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Return everything as plain data, for JSON."""
+        found = self.calibration
+        starts = [
+            {key: getattr(start, key) for key in ("number", "objective", "before_polish", "runs", "values")}
+            for start in found.starts
+        ]
+        return {
+            "arguments": dict(arguments), "seed": found.seed, "search": asdict(self.search),
+            "unknowns": [asdict(unknown) for unknown in space.unknowns], "source": self.source, "runs": found.runs,
+            "objective_before": self.before, "objective": found.best.objective, "values": found.best.values,
+            "targets": [asdict(row) for row in self.targets], "starts": starts,
+            "identifiability": asdict(self.identifiability), "clusters": [asdict(one) for one in self.clusters],
+            "package_version": package_version(), "build": dict(build_fingerprint()),
+        }  # fmt: skip
+
+
+def write_fit(fit: Fit, space: Space, arguments: Mapping[str, Any], folder: Path) -> None:
+    """Write fit.yaml (the fitted scene) and calibration.json (everything else)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_atomically(folder / "fit.yaml", dump_scene(fit.scene).encode())
+    write_atomically(folder / "calibration.json", json.dumps(fit.plain(space, arguments), indent=1).encode())
+
+
+def objective_of(objective: Objective, values: Mapping[str, Value]) -> float:
+    """Return the objective of one candidate."""
+    return float((objective.residuals([values])[0] ** 2).sum())

@@ -1,0 +1,145 @@
+"""Objectives of a calibration: what a candidate misses of targets or of a recorded motion, as one row of residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import SceneError
+from plow_twin.model.geometry import half_diagonal, length_scale
+from plow_twin.model.scene import Scene
+from plow_twin.study.calibration.pose_recording import PoseRecording
+from plow_twin.study.calibration.targets import FAILED_RESIDUAL, TargetSet
+from plow_twin.study.members import run_members
+from plow_twin.study.parameters import Value, with_parameters
+from plow_twin.study.statistics import statistics_of
+
+Array = NDArray[np.float64]
+Values = Mapping[str, Value]
+
+
+class Objective(Protocol):
+    """What a calibration needs to know of an objective."""
+
+    #: runs made so far
+    runs: int
+
+    def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
+        """Return the weighted residuals of m candidates, shape (m, r); the objective is their sum of squares.
+
+        A candidate whose objective is certain to exceed `cut` need not be evaluated to the end.
+        """
+
+
+@dataclass
+class TargetObjective:
+    """Residuals of targets (see `plow_twin.study.calibration.targets`)."""
+
+    scene: Scene
+    targets: TargetSet
+    workers: int | None = None
+    runs: int = 0
+
+    def __post_init__(self) -> None:
+        # nobody reads the marks of a candidate: without them it is made in a third of the time
+        self.scene = replace(self.scene, marks={})
+
+    def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
+        """Return sqrt(weight) r of every target and candidate, shape (m, targets)."""
+        targets, settings = self.targets.targets, self.targets.settings
+        paths = sorted({path for target in targets for path in target.paths})
+        table = np.full((len(candidates), len(settings), len(paths)), np.nan)
+        everyone = np.arange(len(candidates))
+        self._fill(table, candidates, everyone, [0], paths)
+        if len(settings) > 1:
+            first = np.nansum(self._rows(table, paths, missing=np.nan) ** 2, axis=1)
+            left = np.flatnonzero(np.where(np.isfinite(table[:, 0].sum(axis=1)), first <= cut, False))
+            self._fill(table, candidates, left, list(range(1, len(settings))), paths)
+        return self._rows(table, paths, missing=FAILED_RESIDUAL)
+
+    def unweighted(self, candidate: Values) -> Array:
+        """Return r of every target for one candidate, shape (targets,)."""
+        weights = np.sqrt([target.weight for target in self.targets.targets])
+        return np.asarray(self.residuals([candidate])[0] / np.where(weights > 0.0, weights, 1.0))
+
+    def table(self, candidate: Values) -> tuple[Array, list[str]]:
+        """Return the statistics of one candidate, shape (settings, paths), and the paths."""
+        paths = sorted({path for target in self.targets.targets for path in target.paths})
+        table = np.full((1, len(self.targets.settings), len(paths)), np.nan)
+        self._fill(table, [candidate], np.arange(1), list(range(len(self.targets.settings))), paths)
+        return table[0], paths
+
+    def _fill(
+        self, table: Array, candidates: Sequence[Values], rows: NDArray[np.int64], columns: list[int], paths: list[str]
+    ) -> None:
+        """Run the candidates `rows` at the settings `columns` and put their statistics into the table."""
+        scenes, places = [], []
+        for row in rows:
+            for column in columns:
+                try:
+                    scenes.append(with_parameters(self.scene, {**self.targets.settings[column], **candidates[row]}))
+                except SceneError:
+                    continue  # a candidate that no scene can have: its residuals are those of a failure
+                places.append((row, column))
+        if not scenes:
+            return
+        members = run_members(scenes, self.targets.t_end_s, self.targets.tol, workers=self.workers)
+        self.runs += len(scenes)
+        statistics = statistics_of(members, scenes, paths)
+        for place, numbers in zip(places, statistics, strict=True):
+            table[place] = numbers
+
+    def _rows(self, table: Array, paths: list[str], missing: float) -> Array:
+        settings = list(self.targets.settings)
+        rows = np.zeros((len(table), len(self.targets.targets)))
+        for index, target in enumerate(self.targets.targets):
+            columns = [settings.index(setting) for setting in target.settings]
+            part = table[:, columns][:, :, [paths.index(path) for path in target.paths]]
+            bad = np.asarray(np.isnan(part).any(axis=(1, 2)))
+            r = target.residual(np.where(bad[:, None, None], 1.0, part))
+            rows[:, index] = np.sqrt(target.weight) * np.where(bad, missing, r)
+        return rows
+
+
+@dataclass
+class RecordingObjective:
+    """Distance from a recorded motion: (q - q recorded) / clearance at every row, angles by the half diagonal.
+
+    The rows are divided by the square root of their number: the objective is the mean square error of x, y and theta
+    together, in clearances of the scene before the fit.
+    """
+
+    scene: Scene
+    recording: PoseRecording
+    tol: float = 1e-8
+    workers: int | None = None
+    runs: int = 0
+
+    def __post_init__(self) -> None:
+        self.scene = replace(self.scene, marks={})
+
+    def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
+        """Return the residuals of m candidates, shape (m, 3 rows)."""
+        del cut
+        rows = self.recording.q.size
+        result = np.full((len(candidates), rows), FAILED_RESIDUAL / np.sqrt(rows))
+        scenes, places = [], []
+        for index, candidate in enumerate(candidates):
+            try:
+                scenes.append(with_parameters(self.scene, candidate))
+            except SceneError:
+                continue
+            places.append(index)
+        if scenes:
+            t_end, dt = float(self.recording.t[-1]), self.recording.output_dt
+            members = run_members(scenes, t_end, self.tol, dt, self.workers)
+            self.runs += len(scenes)
+            scale = np.array([1.0, 1.0, half_diagonal(self.scene)]) / length_scale(self.scene) / np.sqrt(rows)
+            errors = (self.recording.sampled(members) - self.recording.q) * scale
+            sound = ~members.failed
+            result[np.array(places)[sound]] = errors[sound].reshape(int(sound.sum()), rows)
+        return result

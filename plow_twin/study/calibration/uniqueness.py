@@ -1,0 +1,99 @@
+"""How well a fit is determined: singular values of the Jacobian, and what else fits almost as well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.study.calibration.calibrate import Calibration, jacobian
+from plow_twin.study.calibration.objective import Objective
+from plow_twin.study.calibration.unknowns import Space
+from plow_twin.study.parameters import Value
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """Singular values of dr/dz at the optimum over the unknowns with a range (z: places 0..1 of their ranges).
+
+    `weakest` is the direction of the smallest one: the combination of unknowns that the data say least about.
+    """
+
+    paths: tuple[str, ...]
+    singular_values: tuple[float, ...]
+    weakest: dict[str, float]
+
+    @property
+    def condition(self) -> float:
+        """Largest over smallest singular value."""
+        return float(np.divide(self.singular_values[0], self.singular_values[-1])) if self.singular_values else 1.0
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Near-optimal points that agree in every choice and lie close together in the rest."""
+
+    members: int
+    objective: float
+    values: dict[str, Value]
+    #: by unknown: smallest and largest value among the members
+    spread: dict[str, tuple[float, float]]
+
+
+def identifiability(space: Space, objective: Objective, point: Array, step: float = 1e-5) -> Identifiability:
+    """Return the singular values of the Jacobian at a point."""
+    free = space.continuous
+    paths = tuple(space.unknowns[index].path for index in free)
+    if free.size == 0:
+        return Identifiability((), (), {})
+    _, singular, right = np.linalg.svd(jacobian(space, objective, point, step)[:, free], full_matrices=False)
+    # the sign of a singular vector is free: the largest component positive
+    weakest = right[-1] * np.sign(right[-1][np.argmax(np.abs(right[-1]))])
+    return Identifiability(
+        paths, tuple(map(float, singular)), {path: float(x) for path, x in zip(paths, weakest, strict=True)}
+    )
+
+
+def near_optimal(space: Space, found: Calibration, excess: float, distance: float = 0.1) -> list[Cluster]:
+    """Cluster every point found whose objective exceeds the best by at most `excess`.
+
+    Points belong together when their choices are equal and no unknown differs by more than `distance` of its range
+    (complete linkage). The clusters come best first.
+    """
+    points = np.concatenate([[start.point for start in found.starts], found.population])
+    values = np.concatenate([[start.objective for start in found.starts], found.population_objective])
+    keep = values <= found.best.objective + excess
+    points = np.array([space.settled(point) for point in points[keep]])
+    values = values[keep]
+    groups: dict[tuple[float, ...], list[int]] = {}
+    choices = [index for index, unknown in enumerate(space.unknowns) if unknown.choices]
+    for row, point in enumerate(points):
+        groups.setdefault(tuple(point[choices]), []).append(row)
+    clusters = [
+        _cluster(space, points[rows], values[rows])
+        for members in groups.values()
+        for rows in _linked(points, np.array(members), distance)
+    ]
+    return sorted(clusters, key=lambda cluster: cluster.objective)
+
+
+def _linked(points: Array, rows: NDArray[np.int64], distance: float) -> list[NDArray[np.int64]]:
+    from scipy.cluster.hierarchy import fcluster, linkage
+
+    if len(rows) == 1:
+        return [rows]
+    labels = fcluster(linkage(points[rows], "complete", metric="chebyshev"), distance, "distance")
+    return [rows[labels == label] for label in np.unique(labels)]
+
+
+def _cluster(space: Space, points: Array, values: Array) -> Cluster:
+    best = int(np.argmin(values))
+    spread = {}
+    for index in space.continuous:
+        unknown = space.unknowns[index]
+        ends = [unknown.value(float(points[:, index].min())), unknown.value(float(points[:, index].max()))]
+        spread[unknown.path] = (float(ends[0]), float(ends[1]))
+    return Cluster(len(points), float(values[best]), space.values(points[best]), spread)

@@ -1,0 +1,112 @@
+"""A scene's run as a recording and as a rerun file, as the live node would leave them.
+
+Needs the extras `record` and `view`. The twin takes the scene's loads as samples joined by straight lines, so that the
+recording holds the load too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import SolverError
+from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import Scene
+from plow_twin.run.simulate import output_times
+from plow_twin.run.twin import Twin
+from plow_twin.stream.journal import Entry, Sample
+from plow_twin.stream.session import Session
+
+if TYPE_CHECKING:
+    from plow_twin.record.writer import RunWriter
+
+Array = NDArray[np.float64]
+#: Distance of the samples [s]; a message follows each so many of them. Peaks between messages are in the messages.
+SAMPLE_S: Final = 1e-3
+MESSAGE_EVERY: Final = 4
+_CHUNK_B: Final = 256 * 1024
+_MIN_FREE_B: Final = 64 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The files of a recorded run, and the pose of its head at the samples, shape (n, 3) at t, shape (n,)."""
+
+    mcap: Path
+    rrd: Path
+    t: Array
+    q: Array
+
+
+def record(
+    scene: Scene, t_end: float, folder: Path, on_progress: Callable[[float], object] = lambda share: None
+) -> Recording:
+    """Run a scene, write `folder`/..._0.mcap and `folder`.rrd.
+
+    Raises
+    ------
+    ModuleNotFoundError
+        One of the extras `record` and `view` is not installed.
+    SolverError
+        The motion could not be continued.
+    RecordingError
+        The folder holds something already or cannot be written.
+    """
+    from plow_twin.record.header import RunHeader
+    from plow_twin.record.writer import RunWriter
+    from plow_twin.scene_file import dump_scene
+    from plow_twin.view import to_rrd
+
+    writer = RunWriter(folder, RunHeader(dump_scene(scene)), _CHUNK_B, _MIN_FREE_B)
+    times = output_times(t_end, SAMPLE_S)
+    try:
+        q = _drive(scene, times, writer, lambda share: on_progress(0.6 * share))
+    except BaseException:
+        writer.abandon()
+        raise
+    writer.close({})
+    rrd = folder.with_suffix(".rrd")
+    to_rrd(writer.path, rrd, on_progress=lambda share: on_progress(0.6 + 0.4 * share))
+    return Recording(writer.path, rrd, times, q)
+
+
+def _drive(
+    scene: Scene,
+    times: Array,
+    writer: RunWriter,
+    on_progress: Callable[[float], object],
+) -> Array:
+    """Feed the scene's loads to a twin, write what it took and said, and return its poses, shape (n, 3)."""
+    from plow_twin.record.outputs import publication_messages
+
+    header, sequence = writer.header, -1
+    stamps = np.rint(1e9 * times).astype(np.int64).tolist()
+    poses = np.zeros((len(times), 3))
+    stamp_ns = 0
+
+    def journal(entry: Entry) -> None:
+        nonlocal sequence
+        sequence += 1
+        writer.write_entry(sequence, stamp_ns, entry)
+
+    session = Session(Twin(scene, excitation="sampled"), on_entry=journal)
+    session.start()
+    for index, (stamp_ns, wrench) in enumerate(zip(stamps, compile_loads(scene.loads).at(times).tolist(), strict=True)):
+        advance = session.apply(Sample(stamp_ns, (wrench[0], wrench[1], wrench[2])))
+        assert advance is not None
+        if advance.status:
+            raise SolverError(f"recorded run at t = {times[index]:.9g} s: {advance.status.text}")
+        poses[index] = advance.q
+        frame = session.outputs.take() if index % MESSAGE_EVERY == 0 else None
+        messages = {} if frame is None else publication_messages(frame, header.frame_id, header.child_frame_id)
+        for name, message in messages.items():
+            writer.write_output(header.topic(name), sequence, stamp_ns, stamp_ns, message)
+        if index % 1000 == 0:
+            on_progress(index / len(times))
+    session.close()
+    return poses

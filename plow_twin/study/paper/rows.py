@@ -1,0 +1,69 @@
+"""What a row of the table published / reconstructed / difference / agrees is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+#: What stands behind a row beside the numbers of the scene.
+FITTED: Final = "fitted to this"
+CHECK: Final = "not fitted to this"
+ASSUMED: Final = "not fitted to this; other clearance assumed 20 mm"
+UNKNOWN: Final = "the scene does not say"
+
+
+class Verdict(Enum):
+    """Whether a row agrees by its criterion; `NOT_COMPUTED` when the run behind it failed."""
+
+    AGREES = "yes"
+    DISAGREES = "no"
+    NOT_COMPUTED = "not computed"
+
+    @staticmethod
+    def of(agrees: bool) -> Verdict:
+        """Return the verdict of a criterion that could be applied."""
+        return Verdict.AGREES if agrees else Verdict.DISAGREES
+
+
+@dataclass(frozen=True)
+class Row:
+    """One published statement beside what was computed.
+
+    Attributes
+    ----------
+    group, source : str
+        Heading of the row and place of the statement in the paper.
+    what, published, computed : str
+        The statement, what the paper says, what this run gives, for people.
+    verdict, criterion
+        Whether it agrees, and the rule that decides it.
+    inputs : str
+        Whether the scene's fitted numbers were fitted to this very statement.
+    published_value, value : float, optional
+        The two as numbers in `unit`, for statements that are a number.
+    """
+
+    group: str
+    source: str
+    what: str
+    published: str
+    computed: str
+    verdict: Verdict
+    criterion: str
+    inputs: str
+    unit: str = ""
+    published_value: float | None = field(default=None)
+    value: float | None = field(default=None)
+
+    @property
+    def difference(self) -> float | None:
+        """Computed minus published as a share of the published value; None without numbers."""
+        if self.published_value is None or self.value is None:
+            return None
+        return (self.value - self.published_value) / abs(self.published_value)
+
+
+def braces(corners: str) -> str:
+    """Write a set of corners as people do: {a,d}; none for the empty one."""
+    return "{" + ",".join(corners) + "}" if corners else "none"

@@ -1,0 +1,105 @@
+"""Which corners carry force together, and for how long: read from the list of contact events, exact in time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKWISE
+from plow_twin.model.scene import Scene
+from plow_twin.run.simulate import Result
+from plow_twin.study.paper.values import SHORTEST_HOLD_S, Sense
+
+#: Mode of a pair that carries force; 0 is apart, 2 in contact with its force clipped at zero.
+_CARRIES = 1
+
+
+@dataclass(frozen=True)
+class Hold:
+    """One set of corners, e.g. `abd`, that carries force without a change from `start_s` to `end_s`; "" is none."""
+
+    start_s: float
+    end_s: float
+    corners: str
+
+    @property
+    def duration_s(self) -> float:
+        """Length in s."""
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True)
+class SetFigures:
+    """One set over a run: share of the contact time of its sense, all of it and longest hold [s], holds that count."""
+
+    share: float
+    total_s: float
+    longest_s: float
+    count: int
+
+
+def letters_of_pairs(scene: Scene) -> list[str]:
+    """Return the letter of each pair's corner, shape (8,)."""
+    letters = {corner: letter for letter, corner in scene.frame.labels.items()}
+    return [letters[CORNER_NAMES[pair // 2]] for pair in range(PAIR_COUNT)]
+
+
+def of_sense(sense: Sense) -> NDArray[np.bool_]:
+    """Tell of each pair whether it belongs to a sense, shape (8,)."""
+    return STOPS_COUNTER_CLOCKWISE if sense == "ccw" else ~STOPS_COUNTER_CLOCKWISE
+
+
+def holds(scene: Scene, result: Result, sense: Sense) -> list[Hold]:
+    """Return the sets of one sense in order of time, without gaps, from 0 to the end of the run."""
+    letters, chosen = letters_of_pairs(scene), of_sense(sense)
+    carries = result.force[0] > 0.0  # what penetrates at t = 0 is in contact without an event
+    found: list[Hold] = []
+    start, now = 0.0, _name(letters, carries & chosen)
+    for event in result.events:
+        carries[event["pair"]] = event["mode_to"] == _CARRIES
+        name, time = _name(letters, carries & chosen), float(event["time"])
+        if name != now:
+            if time > start:
+                found.append(Hold(start, time, now))
+            start, now = time, name
+    found.append(Hold(start, float(result.t[-1]), now))
+    return found
+
+
+def _name(letters: Sequence[str], carries: NDArray[np.bool_]) -> str:
+    return "".join(sorted(letter for letter, on in zip(letters, carries, strict=True) if on))
+
+
+def figures(timeline: Sequence[Hold]) -> dict[str, SetFigures]:
+    """Return the figures of every set that occurs at all, largest share first."""
+    total = sum(hold.duration_s for hold in timeline if hold.corners)
+    table = {}
+    for name in {hold.corners for hold in timeline} - {""}:
+        durations = [hold.duration_s for hold in timeline if hold.corners == name]
+        long_enough = sum(duration >= SHORTEST_HOLD_S for duration in durations)
+        table[name] = SetFigures(sum(durations) / total, sum(durations), max(durations), long_enough)
+    return dict(sorted(table.items(), key=lambda item: -item[1].share))
+
+
+def share_by_size(timeline: Sequence[Hold]) -> list[float]:
+    """Return the share of the contact time with one, two, three and four points, shape (4,)."""
+    table = figures(timeline)
+    return [sum(row.share for name, row in table.items() if len(name) == size) for size in (1, 2, 3, 4)]
+
+
+def at(timeline: Sequence[Hold], time_s: float) -> str:
+    """Return the set at a time."""
+    return next((hold.corners for hold in timeline if hold.start_s <= time_s < hold.end_s), timeline[-1].corners)
+
+
+def nearest(timeline: Sequence[Hold], time_s: float, corners: str) -> tuple[float, Hold] | None:
+    """Return how far in s (negative: earlier) the nearest hold of a set lies from a time, and that hold."""
+    found = [hold for hold in timeline if hold.corners == corners]
+    if not found:
+        return None
+    distance = [min(max(time_s, hold.start_s), hold.end_s) - time_s for hold in found]
+    best = int(np.argmin(np.abs(distance)))
+    return distance[best], found[best]

@@ -1,0 +1,208 @@
+"""The study of the paper: every published figure and number computed again, compared and written down."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plow_twin.model.scene import Mark, Scene
+from plow_twin.study.paper.comparison import all_rows, one_run_rows
+from plow_twin.study.paper.contradictions import Contradiction, contradictions
+from plow_twin.study.paper.figures import Picture, draw_all, draw_rotation
+from plow_twin.study.paper.recording import Recording, record
+from plow_twin.study.paper.rotation import RotationRow, rotation_rows
+from plow_twin.study.paper.rows import FITTED, Row, Verdict
+from plow_twin.study.paper.runs import PaperRuns, run_all
+from plow_twin.study.report import require
+
+OnProgress = Callable[[float], object]
+#: Form of the head's rotation in words, by its place in `Rotation.scenes`.
+FORMS = ("constant moment", "exact, I about the centre of mass", "exact, I about the cavity's centre")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A statement whose verdict another form of the head's rotation changes."""
+
+    form: str
+    row: Row
+
+
+@dataclass(frozen=True)
+class PaperStudy:
+    """All that was found; the files of it too when they were written."""
+
+    runs: PaperRuns
+    rows: list[Row]
+    rotation: list[RotationRow]
+    changes: list[Change]
+    contradictions: list[Contradiction]
+    wall_s: float
+    name: str = ""
+    pictures: list[Picture] = field(default_factory=list)
+    rotation_picture: Picture | None = None
+    recording: Recording | None = None
+
+    @property
+    def verdicts(self) -> dict[str, int]:
+        """Number of rows by verdict."""
+        return {verdict.value: sum(row.verdict is verdict for row in self.rows) for verdict in Verdict}
+
+    @property
+    def recording_error_m(self) -> float | None:
+        """Largest distance in m of the recorded head from that of the report's run; None without a recording."""
+        if self.recording is None:
+            return None
+        apart = self.recording.q[:, :2] - self.runs.case.q[:, :2]
+        return float(np.hypot(*apart.T).max())
+
+
+def compare(
+    scene: Scene, t_end: float, workers: int | None = None, on_progress: OnProgress | None = None
+) -> PaperStudy:
+    """Compute the whole comparison, without a file.
+
+    Parameters
+    ----------
+    scene, t_end, workers, on_progress
+        As in `run_all`.
+
+    Raises
+    ------
+    SceneError
+        The scene cannot be compared with the paper.
+    SolverError
+        The run of Figs 6 to 9 could not be continued.
+    """
+    begin = time.perf_counter()
+    runs = run_all(scene, t_end, workers, on_progress)
+    rotation = [] if runs.rotation is None else rotation_rows(runs.rotation)
+    wall_s = time.perf_counter() - begin
+    return PaperStudy(runs, all_rows(runs), rotation, _changes(runs), contradictions(runs), wall_s)
+
+
+def study_paper(
+    scene: Scene,
+    name: str,
+    out: Path,
+    t_end: float,
+    workers: int | None = None,
+    recording: bool = True,
+    on_progress: OnProgress = lambda share: None,
+) -> PaperStudy:
+    """Compare a scene with the paper and leave report.html, table.json, table.csv, figures/, run/ and run.rrd in `out`.
+
+    Raises
+    ------
+    SceneError, SolverError
+        As in `compare`.
+    ModuleNotFoundError
+        One of the extras `study`, `record`, `view` is not installed (the last two with `recording`).
+    OSError
+        A file cannot be written.
+    """
+    begin = time.perf_counter()
+    require("matplotlib", "jinja2", *(("mcap", "rosbags", "rerun") if recording else ()))
+    found = compare(scene, t_end, workers, lambda share: on_progress(0.2 * share))
+    figures = out / "figures"
+    figures.mkdir(parents=True, exist_ok=True)
+    pictures = draw_all(found.runs, figures, lambda share: on_progress(0.2 + 0.2 * share))
+    rotation_picture = draw_rotation(found.runs, figures)
+    recorded = record(scene, t_end, out / "run", lambda share: on_progress(0.4 + 0.6 * share)) if recording else None
+    study = replace(
+        found,
+        name=name,
+        pictures=pictures,
+        rotation_picture=rotation_picture,
+        recording=recorded,
+        wall_s=time.perf_counter() - begin,
+    )
+    _write(study, out)
+    on_progress(1.0)
+    return study
+
+
+def _changes(runs: PaperRuns) -> list[Change]:
+    if runs.rotation is None:
+        return []
+    first = one_run_rows(runs, 0)
+    return [
+        Change(FORMS[index], row)
+        for index in (1, 2)
+        for before, row in zip(first, one_run_rows(runs, index), strict=True)
+        if before.verdict is not row.verdict
+    ]
+
+
+def row_as_plain(row: Row) -> dict[str, Any]:
+    """Return a row as it stands in JSON and CSV; the difference is a share, what is published is `given`."""
+    return asdict(row) | {
+        "difference": row.difference,
+        "verdict": row.verdict.value,
+        "published_mark": Mark.GIVEN.value,
+    }
+
+
+def _write(study: PaperStudy, out: Path) -> None:
+    from plow_twin.study.report import write_csv, write_html, write_json
+
+    rows = [row_as_plain(row) for row in study.rows]
+    write_csv(out / "table.csv", rows)
+    write_json(out / "table.json", as_plain(study))
+    write_html(out / "report.html", "paper.html.j2", _context(study))
+
+
+def as_plain(study: PaperStudy) -> dict[str, Any]:
+    """Return the study without its series as plain values."""
+    from plow_twin.build import build_fingerprint
+    from plow_twin.scene_file import dump_scene
+
+    runs, rotation = study.runs, study.runs.rotation
+    return {
+        "scene": study.name,
+        "t_end_s": runs.t_end,
+        "clearance_scale": runs.scale,
+        "verdicts": study.verdicts,
+        "rows": [row_as_plain(row) for row in study.rows],
+        "rotation": {
+            "offset_m": None if rotation is None else rotation.offset_m,
+            "parted_s": None if rotation is None else rotation.parted_s,
+            "rows": [asdict(row) for row in study.rotation],
+            "changed_verdicts": [{"form": change.form, **row_as_plain(change.row)} for change in study.changes],
+        },
+        "contradictions": [asdict(entry) for entry in study.contradictions],
+        "failed_runs": runs.failed,
+        "recording_error_m": study.recording_error_m,
+        "wall_s": study.wall_s,
+        "build": dict(build_fingerprint()),
+        "scene_yaml": dump_scene(runs.scene),
+    }
+
+
+def _context(study: PaperStudy) -> dict[str, Any]:
+    marks = study.runs.scene.marks
+    return {
+        **as_plain(study),
+        "study": study,
+        "groups": _grouped(study.rows),
+        "disagreeing": [row for row in study.rows if row.verdict is Verdict.DISAGREES],
+        "fitted": [row for row in study.rows if row.inputs == FITTED],
+        "checks": [row for row in study.rows if row.inputs != FITTED],
+        "yes": Verdict.AGREES,
+        "marks": [(path, entry.mark.value, entry.source) for path, entry in marks.items()],
+        "mark_counts": Counter(entry.mark.value for entry in marks.values()),
+        "forms": FORMS,
+    }
+
+
+def _grouped(rows: Sequence[Row]) -> Mapping[str, list[Row]]:
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row.group, []).append(row)
+    return groups

@@ -1,0 +1,51 @@
+"""How the figures of the report look: colours that colour-blind readers tell apart (Okabe and Ito), one type size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from plow_twin.study.paper.values import Sense
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: Colour and marker of each corner, and of each inner face.
+CORNER_STYLE: Final = {"a": ("#0072B2", "o"), "b": ("#D55E00", "s"), "c": ("#009E73", "^"), "d": ("#CC79A7", "D")}
+FACE_STYLE: Final = {
+    "top": ("#D55E00", "s"), "right": ("#0072B2", "o"), "bottom": ("#CC79A7", "D"), "left": ("#009E73", "^"),
+}  # fmt: skip
+SENSE_COLOR: Final[dict[Sense, str]] = {"ccw": "#0072B2", "cw": "#D55E00"}
+DARK: Final = "#333333"
+LIGHT: Final = "#B0B0B0"
+_SETTINGS: Final[Any] = {
+    "font.size": 9.5,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E4E4E4",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "legend.frameon": False,
+    "lines.linewidth": 1.1,
+}
+_DPI: Final = 130
+
+
+@contextmanager
+def sheet(width: float, height: float) -> Iterator[Figure]:
+    """Give an empty figure of that size [inch] in the report's style."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(_SETTINGS):
+        yield Figure(figsize=(width, height), layout="constrained")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
+    figure.savefig(path, dpi=_DPI, facecolor="white")

@@ -1,0 +1,1 @@
+"""Statistics over a grid of two parameters."""

@@ -1,0 +1,136 @@
+"""A sweep as a Parquet file and as a picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from plow_twin.build import package_version
+from plow_twin.study.statistics import unit_of
+from plow_twin.study.sweep.table import Axis, Table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+#: Key of the Parquet file's metadata.
+METADATA_KEY: Final = "plow_twin"
+
+
+def write_parquet(table: Table, path: Path) -> None:
+    """Write one row for each member: its parameters, status (0: done), how it ended, the statistics.
+
+    The metadata under `plow_twin` is JSON: arguments with the scene as YAML text, package version, builds.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    sweep = table.sweep
+    values = [sweep.values(member) for member in range(sweep.size)]
+    failed = set(table.failed)
+    columns: dict[str, Any] = {axis.path: [one[axis.path] for one in values] for axis in sweep.axes}
+    columns["status"] = table.status
+    columns["ended"] = [table.reason(member) if member in failed else "done" for member in range(sweep.size)]
+    columns |= {name: table.numbers[:, index] for index, name in enumerate(sweep.statistics)}
+    facts = {
+        "arguments": sweep.arguments(),
+        "units": {name: unit_of(name) for name in sweep.statistics},
+        "package_version": package_version(),
+        "builds": [json.loads(build) for build in table.builds],
+    }
+    # metadata is written with the schema: the same table gives the same bytes
+    arrow = pa.table(columns).replace_schema_metadata({METADATA_KEY: json.dumps(facts, sort_keys=True)})
+    beside = path.with_name(f".{path.name}")
+    pq.write_table(arrow, beside)
+    beside.replace(path)
+
+
+def draw(table: Table, path: Path) -> None:
+    """Draw a curve (one parameter) or a heat map (two) for each statistic; members that failed are crosses."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    count = len(table.sweep.statistics)
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(4.6 * columns + 0.4, 3.8 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    for index, name in enumerate(table.sweep.statistics):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        if len(table.sweep.axes) == 1:
+            _curve(axes, table, index)
+        else:
+            _heat_map(axes, table, index)
+        unit = _scaled(table, index)[1]
+        axes.set_title(name if unit == "1" else f"{name} [{unit}]", fontsize=10)
+    figure.savefig(path, dpi=150)
+
+
+def _scaled(table: Table, index: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:
+    """Return a statistic in the unit in which it is drawn, and that unit."""
+    unit = unit_of(table.sweep.statistics[index])
+    numbers = table.numbers[:, index]
+    return (numbers / 1e3, f"k{unit}") if unit in ("N", "N s") else (numbers, unit)
+
+
+def _curve(axes: Axes, table: Table, index: int) -> None:
+    (axis,) = table.sweep.axes
+    numbers, unit = _scaled(table, index)
+    places = _places(axis)
+    # between words there is nothing
+    style = "none" if isinstance(axis.values[0], str) else "-"
+    axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
+    for member in table.failed:
+        axes.axvline(
+            places[member], color="tab:red", linestyle=":", label="failed" if member == table.failed[0] else ""
+        )
+    if table.failed:
+        axes.legend(fontsize=8)
+    _label(axes, axis, "x")
+    axes.set_ylabel("" if unit == "1" else unit)
+    axes.grid(alpha=0.3)
+
+
+def _heat_map(axes: Axes, table: Table, index: int) -> None:
+    first, second = table.sweep.axes
+    numbers, _ = _scaled(table, index)
+    grid = numbers.reshape(table.sweep.shape).T
+    mesh = axes.pcolormesh(_edges(first), _edges(second), np.ma.masked_invalid(grid), shading="flat")
+    for axis, which in ((first, "x"), (second, "y")):
+        _label(axes, axis, which)
+    if table.failed:
+        x, y = np.unravel_index(table.failed, table.sweep.shape)
+        axes.plot(_places(first)[x], _places(second)[y], "x", color="tab:red", label="failed")
+        axes.legend(fontsize=8)
+    figure = axes.figure
+    figure.colorbar(mesh, ax=axes)
+
+
+def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
+    if isinstance(axis.values[0], str):
+        return np.arange(len(axis.values), dtype=np.float64)
+    return np.array(axis.values, dtype=np.float64)
+
+
+def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return the borders of the fields around the values, halfway between them (in the logarithm on a log axis)."""
+    places = np.log(_places(axis)) if axis.log else _places(axis)
+    if len(places) == 1:
+        half = 0.5 * abs(places[0]) or 0.5
+        edges = np.array([places[0] - half, places[0] + half])
+    else:
+        middle = 0.5 * (places[1:] + places[:-1])
+        edges = np.concatenate([[2.0 * places[0] - middle[0]], middle, [2.0 * places[-1] - middle[-1]]])
+    return np.asarray(np.exp(edges) if axis.log else edges)
+
+
+def _label(axes: Axes, axis: Axis, which: str) -> None:
+    getattr(axes, f"set_{which}label")(axis.path)
+    if axis.log:
+        getattr(axes, f"set_{which}scale")("log")
+    if isinstance(axis.values[0], str):
+        getattr(axes, f"set_{which}ticks")(range(len(axis.values)), axis.values)
+        if which == "x" and len(axis.values) > 3:
+            axes.tick_params("x", labelsize=8, labelrotation=40)

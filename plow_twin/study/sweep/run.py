@@ -1,0 +1,85 @@
+"""Compute what a sweep's folder lacks: on this machine, or on a Dask cluster; the same code for each chunk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.build import build_fingerprint
+from plow_twin.study.parameters import StudyError
+from plow_twin.study.store import Store
+from plow_twin.study.sweep.table import Sweep, Table, run_members_of
+
+Array = NDArray[np.float64]
+#: Called with the number of members that are done.
+OnProgress = Callable[[int], None]
+#: Time to wait for a scheduler [s].
+CONNECT_TIMEOUT_S = 20.0
+
+
+def run_here(store: Store, workers: int | None = None, on_progress: OnProgress | None = None) -> Table:
+    """Compute the missing chunks with threads of this process, store each as it comes, and return the whole table."""
+    chunks, missing = store.chunks, store.missing()
+    done = store.sweep.size - sum(len(chunks[index]) for index in missing)
+    build = _build()
+    for index in missing:
+
+        def report(count: int, before: int = done) -> None:
+            if on_progress is not None:
+                on_progress(before + count)
+
+        store.write(index, run_members_of(store.sweep, chunks[index], workers, report), build)
+        done += len(chunks[index])
+        report(0, done)
+    return store.table()
+
+
+def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = None) -> Table:
+    """Compute the missing chunks on the Dask cluster at `address`, one task each; return the whole table.
+
+    The scheduler gives the tasks of a worker that dies to another one; a result is stored as soon as it arrives.
+
+    Raises
+    ------
+    StudyError
+        When the cluster cannot be reached or gives a task up.
+    """
+    from distributed import Client, as_completed
+
+    chunks, missing = store.chunks, store.missing()
+    done = store.sweep.size - sum(len(chunks[index]) for index in missing)
+    if not missing:
+        return store.table()
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise StudyError(f"dask: got {address!r}, expected the address of a scheduler ({error})") from None
+    with client:
+        futures: dict[Any, int] = {
+            client.submit(_task, store.sweep, list(chunks[index]), pure=False, retries=2): index for index in missing
+        }
+        for future in as_completed(list(futures), loop=client.loop):
+            index = futures[future]
+            try:
+                table, build = future.result()
+            except Exception as error:
+                # whatever a worker raised: the stored chunks stay, and the call can be repeated
+                raise StudyError(f"dask: chunk {index}: {type(error).__name__}: {error}") from error
+            store.write(index, table, build)
+            done += len(chunks[index])
+            if on_progress is not None:
+                on_progress(done)
+    return store.table()
+
+
+def _task(sweep: Sweep, members: list[int]) -> tuple[Array, str]:
+    """Compute a chunk on a worker; its threads run one task each."""
+    return run_members_of(sweep, members, workers=1), _build()
+
+
+def _build() -> str:
+    return json.dumps(dict(build_fingerprint()), sort_keys=True)

@@ -1,0 +1,181 @@
+"""Sweep one or two parameters of a scene against statistics of its motion."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import SceneError
+from plow_twin.model.scene import Scene
+from plow_twin.scene_file import loads_scene
+from plow_twin.solve.state import Status
+from plow_twin.study.members import run_members
+from plow_twin.study.parameters import WORDS, StudyError, Value, check_path, check_word, with_parameters
+from plow_twin.study.statistics import statistic, statistics_of
+
+Array = NDArray[np.float64]
+
+#: Status of a member whose values no scene can have.
+UNUSABLE: Final = -1
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A parameter and the values that it takes."""
+
+    path: str
+    values: tuple[Value, ...]
+    log: bool = False
+
+
+def parse_axis(text: str, scene: Scene) -> Axis:
+    """Read `PATH=LOW:HIGH:COUNT[:log]` or `PATH=VALUE,VALUE..`.
+
+    Raises
+    ------
+    StudyError
+        Naming the axis, what was got and what is expected.
+    """
+    path, _, rest = text.partition("=")
+    check_path(scene, path)
+    expected = f"{path}=LOW:HIGH:COUNT[:log] or {path}=VALUE,VALUE.."
+    if path in WORDS:
+        words = tuple(check_word(path, word.strip()) for word in rest.split(",") if word.strip())
+        if not words or len(set(words)) < len(words):
+            raise StudyError(f"axis: got {text!r}, expected {path}=WORD,WORD.., each once")
+        return Axis(path, words)
+    try:
+        if ":" not in rest:
+            values = tuple(float(item) for item in rest.split(","))
+            log = False
+        else:
+            low, high, count, *scale = rest.split(":")
+            log = scale == ["log"]
+            if scale not in ([], ["lin"], ["log"]) or (log and min(float(low), float(high)) <= 0.0) or int(count) < 1:
+                raise ValueError
+            # numpy's spacing ends at the bounds exactly
+            spaced = (np.geomspace if log else np.linspace)(float(low), float(high), int(count))
+            values = tuple(map(float, spaced))
+    except ValueError:
+        raise StudyError(f"axis: got {text!r}, expected {expected} (log: bounds > 0)") from None
+    if not values or not all(math.isfinite(value) for value in values) or len(set(values)) < len(values):
+        raise StudyError(f"axis: got {text!r}, expected {expected}, finite numbers, each once")
+    return Axis(path, values, log)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What to compute: plain data, so that it can be stored and sent; `scene_yaml` is self-contained."""
+
+    scene_yaml: str
+    axes: tuple[Axis, ...]
+    statistics: tuple[str, ...]
+    t_end_s: float
+    tol: float = 1e-9
+
+    def __post_init__(self) -> None:
+        scene = self.scene()
+        paths = [axis.path for axis in self.axes]
+        if not 1 <= len(paths) <= 2 or len(set(paths)) < len(paths):
+            raise StudyError(f"axes: got {paths}, expected one parameter or two different ones")
+        if not self.statistics or len(set(self.statistics)) < len(self.statistics):
+            raise StudyError(f"statistics: got {list(self.statistics)}, expected at least one, each once")
+        for name in self.statistics:
+            statistic(scene, name)
+
+    def scene(self) -> Scene:
+        """Return the scene."""
+        return loads_scene(self.scene_yaml)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of values of each axis; the last axis runs fastest in the order of the members."""
+        return tuple(len(axis.values) for axis in self.axes)
+
+    @property
+    def size(self) -> int:
+        """Number of members."""
+        return math.prod(self.shape)
+
+    def values(self, member: int) -> dict[str, Value]:
+        """Return the parameters of a member."""
+        places = np.unravel_index(member, self.shape)
+        return {axis.path: axis.values[int(place)] for axis, place in zip(self.axes, places, strict=True)}
+
+    def arguments(self) -> dict[str, Any]:
+        """Return all that decides the result, as plain data that JSON keeps."""
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return plain
+
+
+@dataclass(frozen=True)
+class Table:
+    """Results of a sweep: one row for each member, in order.
+
+    Attributes
+    ----------
+    status : ndarray of int64, shape (m,)
+        `plow_twin.solve.state.Status`, or `UNUSABLE`.
+    numbers : ndarray, shape (m, statistics)
+        NaN where the status is not 0.
+    builds : tuple of str
+        The builds (versions, processor, platform) that computed the members.
+    """
+
+    sweep: Sweep
+    status: NDArray[np.int64]
+    numbers: Array
+    builds: tuple[str, ...] = field(default=())
+
+    @property
+    def failed(self) -> list[int]:
+        """Members without a result."""
+        return [int(member) for member in np.flatnonzero(self.status)]
+
+    def reason(self, member: int) -> str:
+        """Say how a member ended."""
+        status = int(self.status[member])
+        if status != UNUSABLE:
+            return Status(status).text
+        try:
+            with_parameters(self.sweep.scene(), self.sweep.values(member))
+        except (SceneError, StudyError) as error:
+            return " ".join(str(error).split())
+        return "no usable scene"
+
+
+def run_members_of(
+    sweep: Sweep, members: Sequence[int], workers: int | None = None, on_done: Callable[[int], None] | None = None
+) -> Array:
+    """Compute members, by number; return shape (k, 1 + statistics): status, then the statistics.
+
+    Every member has the bits of its single run, whichever chunk, thread or machine of the same build computes it.
+    """
+    scene = replace(sweep.scene(), marks={})
+    table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)
+    table[:, 0] = UNUSABLE
+    scenes, rows = [], []
+    for row, member in enumerate(members):
+        try:
+            scenes.append(with_parameters(scene, sweep.values(member)))
+        except SceneError:
+            continue
+        rows.append(row)
+    if not scenes:
+        return table
+    result = run_members(scenes, sweep.t_end_s, sweep.tol, workers=workers, on_done=on_done)
+    table[rows, 0] = result.motions.status
+    table[rows, 1:] = statistics_of(result, scenes, sweep.statistics)
+    return table
+
+
+def chunks_of(size: int, chunk: int) -> Iterator[range]:
+    """Yield the members of each chunk."""
+    for begin in range(0, size, chunk):
+        yield range(begin, min(begin + chunk, size))

@@ -1,0 +1,29 @@
+"""The cache of compiled kernels on disk."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+CALL = (
+    "import numpy as np; from plow_twin.solve.kinematics import to_body; to_body(np.zeros(6), np.zeros(8)); print({})"
+)
+MISSES = CALL.format("sum(to_body.stats.cache_misses.values())")
+
+
+def run(cache: Path) -> str:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", MISSES], env=environment, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
+    """After an upgrade an index may name types that are gone: reading it would raise."""
+    assert run(tmp_path) == "1" and run(tmp_path) == "0"
+    (index,) = tmp_path.rglob("kinematics.to_body*.nbi")
+    index.write_bytes(pickle.dumps("another version") + b"cannot be read")
+    assert run(tmp_path) == "1" and run(tmp_path) == "0"

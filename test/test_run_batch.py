@@ -1,0 +1,112 @@
+"""Many twins in one call: each is its single run, in numbers, in saving and in what it says."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scenes import preset
+
+from plow_twin import Friction, Head, Scene, Twin, TwinBatch, Wear
+from plow_twin.model.loads import compile_loads
+
+TIMES = np.arange(1, 401) * 1e-3
+FIELDS = ("q", "v", "penetration", "rate", "force", "peak", "impulse", "makes", "wear_depth", "steps", "status")
+
+
+def members() -> list[Scene]:
+    """Scenes that differ in clearance, stiffness, damping, mass and place."""
+    scene, rng = preset("bench_kv"), np.random.default_rng(5)
+    found = []
+    for _ in range(9):
+        gaps = dataclasses.replace(scene.clearance, horizontal_m=rng.uniform(0.02, 0.03))
+        contact = dataclasses.replace(scene.contact, stiffness=rng.uniform(1e7, 4e7), damping=rng.uniform(3e4, 9e4))
+        head = Head(rng.uniform(2000.0, 3000.0), rng.uniform(1000.0, 1500.0))
+        initial = dataclasses.replace(scene.initial, q=tuple(rng.uniform(-2e-3, 2e-3, 3)))
+        found.append(dataclasses.replace(scene, clearance=gaps, contact=contact, head=head, initial=initial))
+    return found
+
+
+def samples(count: int) -> np.ndarray:
+    wrench = compile_loads(preset("bench_kv").loads).at(TIMES)
+    return wrench * np.linspace(0.8, 1.2, count)[:, None, None]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
+    scenes = members()
+    wrench = samples(len(scenes))
+    together = TwinBatch(scenes, tol=1e-7, workers=workers).advance_samples(TIMES, wrench)
+    assert len(together) == len(scenes)
+    for index, scene in enumerate(scenes):
+        alone = Twin(scene, tol=1e-7, excitation="sampled").advance_samples(TIMES, wrench[index])
+        for name in FIELDS:
+            assert np.array_equal(getattr(together[index], name), getattr(alone, name)), (index, name)
+    assert together.makes.sum() > 0
+
+
+def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> None:
+    scenes = members()[:4]
+    wrench = samples(len(scenes))
+    whole = TwinBatch(scenes).advance_samples(TIMES, wrench)
+    one = TwinBatch(scenes)
+    for i in range(200):
+        row = one.advance(TIMES[i], wrench[:, i])
+        assert np.array_equal(row.q[:, 0], whole.q[:, i])
+    other = TwinBatch(scenes)
+    other.restore(one.snapshot())
+    assert other.digest() == one.digest() and other.time == one.time
+    rest = other.advance_samples(TIMES[200:], wrench[:, 200:])
+    assert np.array_equal(rest.force, whole.force[:, 200:])
+    held = one.advance(TIMES[200])
+    assert np.isfinite(held.q).all()
+    one.reset(0.0)
+    assert np.array_equal(one.advance_samples(TIMES, wrench).q, whole.q)
+
+
+def test_members_may_lack_what_others_have() -> None:
+    """Friction and wear of one member are zero for the other."""
+    plain = preset("bench_kv")
+    scenes = [plain, dataclasses.replace(plain, friction=Friction(0.2, 0.02), wear=Wear(1e-9, 0.015, 2.0))]
+    wrench = samples(1)[0]
+    twins = TwinBatch(scenes, tol=1e-10)
+    twins.set_travel_speed(1.5)
+    together = twins.advance_samples(TIMES, wrench)
+    for index, scene in enumerate(scenes):
+        alone = Twin(scene, tol=1e-10, excitation="sampled")
+        alone.set_travel_speed(1.5)
+        rows = alone.advance_samples(TIMES, wrench)
+        assert np.abs(together[index].q - rows.q).max() < 1e-9
+        assert together[index].wear_depth == pytest.approx(rows.wear_depth, rel=1e-6, abs=1e-18)
+    assert together.wear_depth[1].any() and not together.wear_depth[0].any()
+
+
+def test_bad_input_is_named_and_changes_nothing() -> None:
+    scenes = members()[:2]
+    twins = TwinBatch(scenes)
+    before = twins.digest()
+    with pytest.raises(ValueError, match=r"t: got .*0.5.*, expected a time not before"):
+        twins.advance_samples([1.0, 0.5], np.zeros((2, 3)))
+    with pytest.raises(ValueError, match=r"wrench: got shape \(3, 3\), expected \(3,\) or \(2, 3\)"):
+        twins.advance(1.0, np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"wrench: got .*nan"):
+        twins.advance(1.0, (np.nan, 0.0, 0.0))
+    with pytest.raises(ValueError, match="snapshot: got 3 bytes"):
+        twins.restore(b"abc")
+    with pytest.raises(ValueError, match="speed_m_s: got inf"):
+        twins.set_travel_speed(np.inf)
+    assert twins.digest() == before
+    with pytest.raises(ValueError, match="scenes: got none"):
+        TwinBatch([])
+    with pytest.raises(ValueError, match=r"scenes\[1\].contact: got law .* exponent 1.5, expected the terms of scenes"):
+        TwinBatch([scenes[0], preset("bench_hc")])
+
+
+def test_a_member_that_fails_does_not_stop_the_others() -> None:
+    scenes = members()[:3]
+    wrench = np.zeros((3, len(TIMES), 3))
+    wrench[1] = [1e9, 0.0, 0.0]
+    together = TwinBatch(scenes).advance_samples(TIMES, wrench)
+    assert together.status[1].any() and not together.status[[0, 2]].any()
+    assert all(np.isfinite(getattr(together, name)).all() for name in FIELDS)

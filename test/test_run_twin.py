@@ -1,0 +1,191 @@
+"""The twin: same bits however it is asked, saved and restored; bad input changes nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import pose_error, preset, reference, wall_and_point
+
+from plow_twin import Constant, SolverError, Status, Twin, Wear, simulate
+from plow_twin.model.loads import compile_loads
+from plow_twin.solve import loop
+
+TIMES = np.arange(1, 3001) * 1e-3
+
+
+def samples() -> np.ndarray:
+    return compile_loads(preset("paper").loads).at(TIMES)
+
+
+def test_sampled_at_1_khz_follows_the_analytic_motion() -> None:
+    """Linear interpolation of the sine at 1 kHz is off by (omega dt)^2 / 8 = 5e-7 of the load."""
+    twin = Twin(preset("paper"), excitation="sampled")
+    series = twin.advance_samples(TIMES, samples())
+    assert (series.status == Status.OK).all()
+    assert pose_error(twin.scene, series.q[9::10], reference("paper_r1")["q"][1:301]) < 1e-5
+    exact = simulate(preset("paper"), 3.0)
+    for pair, row in enumerate(exact.statistics.values()):
+        assert series.peak[:, pair].max() == pytest.approx(row["max"], rel=1e-4)
+        assert series.impulse[:, pair].sum() == pytest.approx(row["impulse"], rel=1e-4, abs=1e-9)
+        assert series.makes[:, pair].sum() == row["makes"]
+
+
+@settings(max_examples=10)
+@given(st.lists(st.integers(1, 2999), max_size=6, unique=True))
+def test_samples_in_any_batches_give_the_same_bits(cuts: list[int]) -> None:
+    whole = Twin(preset("paper"), excitation="sampled")
+    expected = whole.advance_samples(TIMES, samples())
+    parts = Twin(preset("paper"), excitation="sampled")
+    edges = [0, *sorted(cuts), len(TIMES)]
+    rows = [parts.advance_samples(TIMES[a:b], samples()[a:b]) for a, b in itertools.pairwise(edges)]
+    for name in ("q", "force", "peak", "impulse", "makes"):
+        assert np.array_equal(np.concatenate([getattr(row, name) for row in rows]), getattr(expected, name))
+    assert parts.digest() == whole.digest()
+    single = Twin(preset("paper"), excitation="sampled")
+    one_by_one = [single.advance(t, w) for t, w in zip(TIMES[:50], samples()[:50], strict=True)]
+    assert np.array_equal([row.peak for row in one_by_one], expected.peak[:50])
+
+
+def test_the_same_time_can_be_asked_for_twice() -> None:
+    twin = Twin(preset("bench_kv"))
+    for t in np.random.default_rng(1).uniform(0.0, 2e-3, 500).cumsum():
+        assert twin.advance(t).q.tolist() == twin.advance(t).q.tolist()
+        assert twin.time == t
+
+
+@settings(max_examples=10)
+@given(st.lists(st.floats(0.0, 2.0), max_size=20))
+def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> None:
+    asked, direct = Twin(preset("paper")), Twin(preset("paper"))
+    rows = [asked.advance(t) for t in sorted(times)]
+    last, expected = asked.advance(2.0), direct.advance(2.0)
+    assert np.array_equal(last.q, expected.q) and np.array_equal(last.force, expected.force)
+    assert asked.digest() == direct.digest()
+    impulse = sum((row.impulse for row in rows), last.impulse)
+    assert impulse == pytest.approx(expected.impulse, rel=1e-10, abs=1e-9)
+    assert np.max([row.peak for row in [*rows, last]], axis=0) == pytest.approx(expected.peak, rel=1e-10)
+
+
+@pytest.mark.parametrize("excitation", ["scene", "sampled"])
+def test_a_restored_twin_goes_on_with_the_same_bits(excitation: str) -> None:
+    scene = dataclasses.replace(preset("bench_hc"), wear=Wear(1e-12, 0.015, 2.0))
+    first, second = (Twin(scene, excitation=excitation) for _ in range(2))  # type: ignore[arg-type]
+
+    def go(twin: Twin, t: float) -> np.ndarray:
+        return twin.advance(t, None if excitation == "scene" else np.array([4e4, 1.1e4, 3e4]) * np.sin(2 * t)).q
+
+    for t in (0.31, 0.77, 1.03):
+        go(first, t)
+    first.set_travel_speed(1.5)
+    go(first, 1.21)
+    second.restore(first.snapshot())
+    assert second.digest() == first.digest() and second.time == first.time
+    assert np.array_equal(go(first, 2.5), go(second, 2.5))
+    assert second.digest() == first.digest()
+    second.reset(3.0)
+    assert second.time == 3.0 and second.digest() != first.digest()
+
+
+@pytest.mark.parametrize(
+    ("t", "wrench", "words"),
+    [
+        (0.1, (0.0, 0.0, 0.0), "expected a time not before"),
+        (np.nan, (0.0, 0.0, 0.0), "expected finite times"),
+        (np.inf, (0.0, 0.0, 0.0), "expected finite times"),
+        (1.0, (0.0, np.nan, 0.0), "wrench: got"),
+        (1.0, (0.0, 0.0), "wrench: got"),
+    ],
+)
+def test_bad_input_is_named_and_changes_nothing(t: float, wrench: tuple[float, ...], words: str) -> None:
+    twin = Twin(preset("paper"), excitation="sampled")
+    twin.advance(0.5, (1e3, 2e3, 3e3))
+    before = twin.digest()
+    with pytest.raises(ValueError, match=words):
+        twin.advance(t, wrench)
+    assert twin.digest() == before
+
+
+@pytest.mark.parametrize("wrench", [(0.0, 0.0, 1e7), (1e12, 0.0, 0.0), (1e300, 0.0, 0.0)])
+def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wrench: tuple[float, ...]) -> None:
+    twin = Twin(preset("paper"), excitation="sampled")
+    good = twin.advance(0.5, (0.0, 0.0, 0.0))
+    bad = twin.advance(0.6, wrench)
+    assert bad.status in (Status.OUT_OF_RANGE, Status.NON_FINITE) and len(bad.status.text) > 10
+    for name in ("q", "v", "penetration", "force", "wear_depth"):
+        assert np.array_equal(getattr(bad, name), getattr(good, name)), name
+    assert not bad.impulse.any() and not bad.makes.any() and twin.time == 0.6
+    assert twin.advance(0.6, (0.0, 0.0, 0.0)).status is Status.OK
+    after = twin.advance(0.7, (0.0, 0.0, 0.0))
+    assert after.status is Status.OK and abs(after.q - good.q).max() < 0.05
+
+
+def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
+    """A step that ends at the time asked for is checked too."""
+    for dt in (1e-3, 7e-4):
+        twin = Twin(preset("paper"), excitation="sampled")
+        rows = [twin.advance(k * dt, (0.0, 0.0, 1e6)) for k in range(1, 100)]
+        assert any(row.status is Status.OUT_OF_RANGE for row in rows)
+        assert all(abs(row.q[2]) <= np.pi / 4 for row in rows)
+    analytic = Twin(dataclasses.replace(preset("paper"), loads=(Constant("turn", (0.0, 0.0), 1e6),)))
+    for t in np.linspace(0.0, 0.1, 57):
+        assert abs(analytic.advance(t).q[2]) <= np.pi / 4
+    with pytest.raises(SolverError, match="left the model's range"):
+        simulate(analytic.scene, 0.0465)
+
+
+def test_a_scene_compiles_only_what_it_needs() -> None:
+    """Parts that a scene lacks are None in the compiled signature of the step."""
+    twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
+    twin.advance(0.01)
+    compiled = [str(signature[1]) for signature in loop.advance_times.signatures]  # type: ignore[attr-defined]
+    # harmonics, second, segments, viscous, factor, integer, fraction, ramp, wear, offset, free, slip, flight, rest
+    terms = "Terms(none, none, none, int64, none, none, none, none, none, none, int64, none, none, int64)"
+    bare = f"Parts({terms}, none, none, none)"
+    assert bare in compiled, compiled
+
+
+def test_in_free_flight_nothing_of_the_contact_runs() -> None:
+    scene = wall_and_point(preset("bench_kv").contact, speed=0.0, gap=2.0)
+    twin = Twin(scene)
+    twin.advance(3600.0)
+    assert twin.steps <= 80 and twin._work.force.any() == False  # noqa: E712
+
+
+def test_warm_up_leaves_nothing_to_compile() -> None:
+    twin = Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
+    twin.warm_up()
+    before = [len(kernel.signatures) for kernel in (loop.advance_times, loop.end_step, loop.lay_out_again)]
+    assert min(before) > 0 and twin.time == 0.0
+    twin.advance(0.01)
+    twin.set_travel_speed(1.0)
+    twin.advance(0.02)
+    twin.restore(twin.snapshot())
+    assert [len(kernel.signatures) for kernel in (loop.advance_times, loop.end_step, loop.lay_out_again)] == before
+
+
+def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:
+    scene, t = preset("bench_kv"), np.arange(1, 4001) * 1e-3
+    wrench = compile_loads(scene.loads).at(t)
+    exact = Twin(scene, excitation="sampled").advance_samples(t, wrench)
+    for bound in (16, 64, 400):
+        twin = Twin(scene, excitation="sampled", max_evaluations=bound)
+        before, most = 0, 0
+        for row in range(len(t)):
+            advance = twin.advance(t[row], wrench[row])
+            used = twin.evaluations - before
+            before, most = twin.evaluations, max(most, used)
+            assert advance.status is Status.OK
+        assert most <= bound
+        series = Twin(scene, excitation="sampled", max_evaluations=bound).advance_samples(t, wrench)
+        error, estimate = np.abs(series.q - exact.q).max(), series.error_estimate_m.sum()
+        # without the bound's code another kernel runs: the same up to rounding
+        assert (twin.bounded == 0) == (estimate == 0.0) == (error < 1e-14)
+        assert error <= 10.0 * estimate and error < 1e-4
+    assert twin.bounded == 0
+    with pytest.raises(ValueError, match="max_evaluations: got 15, expected an integer >= 16"):
+        Twin(scene, max_evaluations=15)
