@@ -55,6 +55,9 @@ class Process:
     def output(self) -> str:
         return self._log.read_text(errors="replace")
 
+    def send_signal(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
+
     def wait(self, timeout_s: float = START_S) -> int:
         return self._process.wait(timeout_s)
 

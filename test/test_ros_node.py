@@ -126,6 +126,62 @@ def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_p
         assert float(running.probe.figures("output")["latency_max_ms"]) > 0.0
 
 
+@pytest.mark.parametrize(("mode", "rate"), [("on_sample", 3000), ("fixed_rate", 10000)])
+def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mode: str, rate: int) -> None:
+    # the publisher overruns any queue: what is read is between all and a part
+    with bench(tmp_path, publish_mode=mode, input_depth=200, excitation_timeout=60.0) as running:
+        probe = running.probe
+        publisher = running.publisher("--rate", str(rate), "--seconds", "2")
+        probe.until(lambda: not publisher.running, "the end of the publisher", 100.0)
+        sent = json.loads(publisher.output().splitlines()[-1])["sent"]
+        figures = probe.figures("input")
+    assert sent == 2 * rate
+    dropped = sum(int(count) for key, count in figures.items() if key.startswith("dropped_"))
+    assert int(figures["samples_used"]) + dropped + int(figures["samples_lost"]) == sent
+    assert int(figures["samples_missing"]) == 0  # off: no rate is asked for
+
+
+def test_a_queue_that_overruns_is_loss_and_said(tmp_path: Path) -> None:
+    with bench(tmp_path, input_depth=200, excitation_timeout=60.0, publish_mode="fixed_rate") as running:
+        probe = running.probe
+        send = probe.excitation()
+        probe.figures("input")
+        running.twin.send_signal(signal.SIGSTOP)
+        for index in range(1000):
+            send(T0 + index * MS, (1.0, 2.0, 3.0))
+            if index % 50 == 49:
+                probe.pause(0.05)
+        running.twin.send_signal(signal.SIGCONT)
+        probe.until(lambda: int(probe.figures("input")["samples_used"]) > 0, "samples of before the stop")
+        # the next one tells that the last ones before it are missing
+        send(T0 + 1000 * MS, (1.0, 2.0, 3.0))
+        probe.until(lambda: int(probe.figures("input")["samples_lost"]) > 0, "loss")
+        figures = probe.figures("input")
+        said = [status.message for report in probe.reports for name, status in report.items() if name.endswith("input")]
+    assert int(figures["samples_used"]) + int(figures["samples_lost"]) == 1001
+    assert any("samples_lost" in message for message in said)
+
+
+def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=60.0) as running:
+        probe = running.probe
+        forces = probe.listen(JointState, "contact_forces")
+        first, second = probe.excitation(), probe.excitation()
+        for index in range(40):
+            first(T0 + index * MS, (30e3, 0.0, 0.0))
+            second(T0 + index * MS - 1_500_000_000, (-30e3, 0.0, 0.0))
+        probe.until(lambda: len(forces) == 40, "answers to the first")
+        probe.until_figure("input", "samples_not_followed", "40")
+        assert (probe.figures("input")["samples_used"], probe.figures("state")["resets"]) == ("40", "0")
+        probe.until(lambda: "not followed" in probe.status[-1].message, "the second said")
+        assert probe.status[-1].level == b"\x01"
+        assert probe.call(Trigger, f"{running.namespace}/plow_twin/switch_publisher", Trigger.Request()).success
+        first(T0 + 40 * MS, (30e3, 0.0, 0.0))
+        second(T0 + 41 * MS, (30e3, 0.0, 0.0))
+        probe.until(lambda: len(forces) == 41, "an answer to the second")
+        assert stamp_ns(forces[-1].header) == T0 + 41 * MS
+
+
 def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_timeout=60.0) as running:
         probe = running.probe

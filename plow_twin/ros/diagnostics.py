@@ -43,7 +43,11 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "samples_used": "samples that the model was advanced to",
         "newest_sample_age_s": "the node's time minus the stamp of the newest sample used [s]; empty without one",
         "samples_missing": "samples that expected_rate asks for and that never came",
-        "messages_lost": "messages that the middleware reports as lost on the way",
+        "samples_lost": "samples that the followed publisher sent and that never arrived, by its own numbering",
+        "samples_not_followed": "samples of other publishers of the source than the one followed; not used",
+        "queue_peak": "most samples that waited in the input queue since the last report",
+        "queue_wait_ms": "longest wait of a sample in the input queue since the last report [ms]",
+        "messages_lost": "messages that the middleware reports as lost on the way, on all inputs",
         "dropped_non_finite": "dropped: a number is not finite",
         "dropped_unstamped": "dropped: the stamp is zero or negative",
         "dropped_duplicate": "dropped: the stamp is that of the sample before",
@@ -127,6 +131,8 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None) -> tuple[bytes
     if lifecycle != "active":
         return OK, lifecycle, values
     message = f"{state.value}: {runtime.driver.failure}" if state is StreamState.FAILED else state.value
+    if runtime.inputs.other_sender:
+        return max(_LEVELS[state], WARN), f"{message}; another publisher sends too and is not followed", values
     return _LEVELS[state], message, values
 
 
@@ -162,9 +168,14 @@ class Health:
         """Return what arrived and what became of it."""
         counted = counters(runtime.driver)
         inputs, residual, age_s = runtime.inputs, runtime.residual(), runtime.newest_sample_age_s()
+        peak, wait_s = inputs.take_queue_peak()
         values = {key: str(counted[key]) for key in KEYS["input"] if key in counted} | {
             "source": runtime.source,
             "newest_sample_age_s": "" if age_s is None else f"{age_s:.3f}",
+            "samples_lost": str(inputs.senders.lost),
+            "samples_not_followed": str(inputs.senders.ignored),
+            "queue_peak": str(peak),
+            "queue_wait_ms": _ms(wait_s),
             "messages_lost": str(inputs.lost),
             "travel_used": str(inputs.travel.used),
             "travel_dropped": str(inputs.travel.arrived - inputs.travel.used),
@@ -173,7 +184,14 @@ class Health:
             "head_pose_residual": "" if residual is None else "{:.6g} {:.6g} {:.6g}".format(*residual),
             "refused_publishers": str(inputs.refused_publishers),
         }
-        grown = self._grown({**counted, "messages_lost": inputs.lost}, _TROUBLE)
+        more = {
+            "samples_lost": inputs.senders.lost,
+            "samples_not_followed": inputs.senders.ignored,
+            "messages_lost": inputs.lost,
+        }
+        grown = self._grown({**counted, **more}, _TROUBLE)
+        if peak > inputs.depth // 2:
+            grown.insert(0, f"input queue at {peak} of {inputs.depth}")
         if runtime.driver.state is StreamState.STALE:
             grown.insert(0, "excitation stale")
         if "dropped_unstamped" in grown:
@@ -230,6 +248,8 @@ _TROUBLE: Final = (
     "jumps_forward",
     "out_of_plane",
     "samples_missing",
+    "samples_lost",
+    "samples_not_followed",
     "messages_lost",
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -10,17 +11,24 @@ from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from numpy.typing import NDArray
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from plow_twin.model.scene import Scene
-from plow_twin.ros.messages import ToolForces, Wrench, planar_wrench, stamp_ns
+from plow_twin.ros.input_queue import InputQueue, Taken
+from plow_twin.ros.messages import ToolForces, read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
+from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.senders import Senders
 
 #: Depth of the optional inputs' queues.
 _SLOW_DEPTH = 200
 #: The input topics.
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose")
+#: Another sender counts as there for so long after its last sample [ns].
+_OTHER_SENDER_NS: Final = 3_000_000_000
 
 
 class Inputs:
@@ -38,8 +46,9 @@ class Inputs:
         Queue depth of the excitation topics.
     intake
         Where samples that go no further are counted.
-    on_sample
-        Receives stamp [ns] and wrench of each sample from the selected source.
+    on_samples
+        Receives stamp [ns] and wrench of the samples that the followed publisher of the selected source sent, in order
+        of arrival.
     on_travel
         Receives stamp [ns] and speed along the face [m/s].
     on_matched
@@ -53,17 +62,23 @@ class Inputs:
         source: str,
         depth: int,
         intake: Intake,
-        on_sample: Callable[[int, Wrench], None],
+        on_samples: Callable[[list[Arrival]], None],
         on_travel: Callable[[int, float], None],
         on_matched: Callable[[], None],
     ) -> None:
         self._node = node
         self._intake = intake
-        self._on_sample = on_sample
+        self._on_samples = on_samples
         self._on_travel = on_travel
         self._on_matched = on_matched
         self._tool_forces = ToolForces(scene)
         self.active = False
+        #: publishers of the selected source
+        self.senders = Senders()
+        self.depth = depth
+        #: most messages that waited in the queue, and their longest wait [s], since `take_queue_peak`
+        self._queue_peak = (0, 0.0)
+        self._other_heard_ns = -_OTHER_SENDER_NS
         #: messages that the middleware reports as lost before they could be read
         self.lost = 0
         self.travel = Intake()
@@ -73,17 +88,36 @@ class Inputs:
         self.refused_publishers = 0
         #: publishers that each input is connected to
         self.publishers = dict.fromkeys(TOPICS, 0)
-        excitation = self._excitation if source == "excitation" else self._not_selected
-        tool_forces = self._tool_force_sample if source == "tool_forces" else self._not_selected
+        self._source = source
         self._subscriptions: list[Any] = []
+        self._queue: InputQueue | None = None
         try:
-            self._subscribe(WrenchStamped, "excitation", excitation, depth)
-            self._subscribe(JointState, "tool_forces", tool_forces, depth)
+            for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
+                subscription = self._subscribe(kind, topic, self._not_selected, depth, raw=True)
+                if topic == source:
+                    self.senders.start(self._present())
+                    self._subscriptions.remove(subscription)
+                    self._queue = InputQueue(node, subscription, depth, self._taken)
             self._subscribe(TwistStamped, "travel", self._travel_speed, _SLOW_DEPTH)
             self._subscribe(PoseStamped, "head_pose", self._measured_pose, _SLOW_DEPTH)
         except BaseException:  # an override of the quality of service may be wrong for any of them
             self.close()
             raise
+
+    @property
+    def other_sender(self) -> bool:
+        """Whether another publisher than the one followed sends on the selected source."""
+        return time.monotonic_ns() - self._other_heard_ns < _OTHER_SENDER_NS
+
+    def take_queue_peak(self) -> tuple[int, float]:
+        """Return the most messages that waited in the queue, and their longest wait [s], since the last call."""
+        peak, self._queue_peak = self._queue_peak, (0, 0.0)
+        return peak
+
+    def look_for_senders(self) -> None:
+        """Find out whether the followed publisher is still there."""
+        if self._queue is not None:
+            self.senders.alive(self._present())
 
     def residual(self, q: NDArray[Any]) -> tuple[float, float, float] | None:
         """Return model minus measured pose, or None without a measurement."""
@@ -95,10 +129,19 @@ class Inputs:
 
     def close(self) -> None:
         """Take the subscriptions off the node."""
+        if self._queue is not None:
+            self._queue.close()
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
 
-    def _subscribe(self, kind: type, topic: str, callback: Callable[[Any], None], depth: int) -> None:
+    def _present(self) -> list[bytes]:
+        """Return the publishers of the selected source that there are."""
+        topic = self._node.resolve_topic_name(self._source)
+        return [bytes(found.endpoint_gid) for found in self._node.get_publishers_info_by_topic(topic)]
+
+    def _subscribe(
+        self, kind: type, topic: str, callback: Callable[[Any], None], depth: int, *, raw: bool = False
+    ) -> Subscription:
         events = SubscriptionEventCallbacks(
             message_lost=self._message_lost,
             incompatible_qos=lambda event: self._incompatible(topic, event),
@@ -111,8 +154,10 @@ class Inputs:
             sensor_input(depth),
             event_callbacks=events,
             qos_overriding_options=OVERRIDABLE,
+            raw=raw,
         )
         self._subscriptions.append(subscription)
+        return subscription
 
     def _message_lost(self, event: Any) -> None:
         self.lost += event.total_count_change
@@ -126,25 +171,48 @@ class Inputs:
 
     def _matched(self, topic: str, event: Any) -> None:
         self.publishers[topic] = event.current_count
+        if topic == self._source:
+            self.look_for_senders()
         self._on_matched()
 
-    def _excitation(self, message: WrenchStamped) -> None:
-        if not self.active:
-            self._intake.refuse(Verdict.INACTIVE)
-            return
-        wrench, out_of_plane = planar_wrench(message)
-        self._intake.out_of_plane += out_of_plane
-        self._on_sample(stamp_ns(message.header), wrench)
+    def _taken(self, batch: list[Taken]) -> None:
+        """Take in what has been in the queue of the selected source."""
+        wait_s = (time.time_ns() - batch[0].received_ns) * 1e-9
+        self._queue_peak = (max(self._queue_peak[0], len(batch)), max(self._queue_peak[1], wait_s))
+        read = self._read_wrench if self._source == "excitation" else self._read_tool_forces
+        arrived: list[Arrival] = []
+        for message in batch:
+            if not self.senders.hear(message.sender, message.number):
+                self._foreign()
+            elif not self.active:
+                self._intake.refuse(Verdict.INACTIVE)
+            else:
+                arrival = read(message.data)
+                if arrival is None:
+                    self._intake.refuse(Verdict.MALFORMED)
+                else:
+                    arrived.append(arrival)
+        if arrived:
+            self._on_samples(arrived)
 
-    def _tool_force_sample(self, message: JointState) -> None:
-        if not self.active:
-            self._intake.refuse(Verdict.INACTIVE)
-            return
+    def _foreign(self) -> None:
+        """Take note of a sample that another publisher than the one followed has sent."""
+        if not self.other_sender:
+            self.look_for_senders()
+        self._other_heard_ns = time.monotonic_ns()
+
+    def _read_wrench(self, data: bytes) -> Arrival | None:
+        found = read_wrench(data)
+        if found is None:
+            return None
+        stamp, wrench, out_of_plane = found
+        self._intake.out_of_plane += out_of_plane
+        return stamp, wrench
+
+    def _read_tool_forces(self, data: bytes) -> Arrival | None:
+        message = deserialize_message(data, JointState)
         wrench = self._tool_forces.wrench(message)
-        if wrench is None:
-            self._intake.refuse(Verdict.MALFORMED)
-        else:
-            self._on_sample(stamp_ns(message.header), wrench)
+        return None if wrench is None else (stamp_ns(message.header), wrench)
 
     def _not_selected(self, message: Any) -> None:
         self._intake.refuse(Verdict.NOT_SELECTED)

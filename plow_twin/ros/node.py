@@ -163,6 +163,8 @@ class TwinNode(LifecycleNode):
 
     def _publish_diagnostics(self) -> None:
         runtime = self.runtime
+        if runtime is not None:
+            runtime.inputs.look_for_senders()
         parts = {"state": self._health.state(self.lifecycle, self.reason, runtime, time.monotonic_ns())}
         if runtime is not None:
             parts["input"] = self._health.input(runtime)

@@ -16,13 +16,12 @@ from std_srvs.srv import Trigger
 
 from plow_twin.model.scene import Scene
 from plow_twin.ros.inputs import Inputs
-from plow_twin.ros.messages import Wrench
 from plow_twin.ros.parameters import Settings
 from plow_twin.ros.publishers import TOPICS, OutputPublishers
 from plow_twin.ros.solver_start import warm_up
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
-from plow_twin.stream.driver import Driver, Policy
+from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Entry
@@ -31,7 +30,6 @@ from plow_twin.stream.session import Session
 if TYPE_CHECKING:
     from plow_twin.ros.diagnostics import Part
     from plow_twin.ros.recording import Recording
-    from plow_twin.run.advance import Advance
 
 _CATCH_UP_S: Final = 0.002
 
@@ -90,14 +88,15 @@ class Runtime:
         self._publishers = OutputPublishers(node, settings.frame_id, settings.child_frame_id)
         made.callback(self._publishers.close)
         session = Session(twin, on_entry=self.recording.journal if self.recording else _ignore)
-        self.driver = Driver(session, self._intake(), policy(settings))
+        every_sample = settings.publish_mode == "on_sample"
+        self.driver = Driver(session, self._intake(), policy(settings), every_sample=every_sample)
         self.inputs = Inputs(
             node,
             self.scene,
             settings.excitation_source,
             settings.input_depth,
             self.driver.intake,
-            self._on_sample,
+            self._on_samples,
             self.driver.travel,
             self._changed,
         )
@@ -107,8 +106,10 @@ class Runtime:
         for rate, callback in self._periodic():
             self._timers.append(self._timer(rate, callback))
             made.callback(node.destroy_timer, self._timers[-1])
-        self._reset_service = node.create_service(Trigger, "~/reset", self._on_reset)
-        made.callback(node.destroy_service, self._reset_service)
+        self._services: list[Any] = []
+        for name, answer in (("~/reset", self._on_reset), ("~/switch_publisher", self._on_switch)):
+            self._services.append(node.create_service(Trigger, name, answer))
+            made.callback(node.destroy_service, self._services[-1])
         session.start()
 
     @property
@@ -159,7 +160,8 @@ class Runtime:
         self.deactivate()
         for timer in self._timers:
             self._node.destroy_timer(timer)
-        self._node.destroy_service(self._reset_service)
+        for service in self._services:
+            self._node.destroy_service(service)
         self.inputs.close()
         self.driver.close()
         self._publishers.close()
@@ -202,7 +204,7 @@ class Runtime:
         elif not self.sim_time:
             periodic.append((settings.step_rate, self._on_silence))
         if settings.publish_mode == "fixed_rate":
-            periodic.append((settings.publish_rate, self._publish))
+            periodic.append((settings.publish_rate, lambda: self._publish(self.driver.due())))
         return periodic
 
     def _timer(self, rate_hz: float, callback: Callable[[], None]) -> Any:
@@ -214,20 +216,25 @@ class Runtime:
     def _ros_time_ns(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)
 
-    def _on_sample(self, stamp_ns: int, wrench: Wrench) -> None:
+    def _on_samples(self, arrived: list[Arrival]) -> None:
         self._received_ns = now_ns = time.monotonic_ns()
-        self._advanced(self.driver.sample(stamp_ns, wrench, now_ns))
+        for frame in self.driver.samples(arrived, now_ns):
+            self._publish(frame)
+        self._advanced()
 
     def _on_silence(self) -> None:
-        advance = self.driver.silence(time.monotonic_ns())
-        if advance is not None:
+        holds = self.driver.holds
+        publication = self.driver.silence(time.monotonic_ns())
+        if self.driver.holds != holds:
             # what is published next answers no message
             self._received_ns = 0
-        self._advanced(advance)
+            self._publish(frame)
+            self._advanced()
 
     def _on_clock(self) -> None:
         self._received_ns = now_ns = time.monotonic_ns()
-        self._advanced(self.driver.clock_tick(self._ros_time_ns(), now_ns))
+        self._publish(self.driver.clock_tick(self._ros_time_ns(), now_ns))
+        self._advanced()
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         stamp_ns = self.driver.session.stamp_ns
@@ -237,11 +244,17 @@ class Runtime:
         response.message = "initial state restored; the next sample starts model time anew"
         return response
 
-    def _advanced(self, advance: Advance | None) -> None:
-        if advance is None:
-            return
-        if self._settings.publish_mode == "on_sample":
-            self._publish()
+    def _on_switch(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self.inputs.senders.switch()
+        response.message = (
+            f"the other publisher of {self.source} is followed from now on"
+            if response.success
+            else f"no other publisher of {self.source} has been heard"
+        )
+        self._changed()
+        return response
+
+    def _advanced(self) -> None:
         if self.recording:
             self.recording.renew(self.driver.session)
             if self.sim_time and self.recording.behind:
@@ -249,8 +262,7 @@ class Runtime:
                 time.sleep(_CATCH_UP_S)
         self._changed()
 
-    def _publish(self) -> None:
-        publication = self.driver.session.outputs.take()
+    def _publish(self, frame: Frame | None) -> None:
         if publication is None:
             return
         if not publication.finite:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from plow_twin.run.twin import Status
 from plow_twin.stream.health import RealTimeFactor
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 from plow_twin.stream.journal import Entry, Hold, Parameter, ParameterValue, Reset, Sample, Travel
 from plow_twin.stream.session import Session
 
-if TYPE_CHECKING:
-    from plow_twin.run.advance import Advance
+#: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
+Arrival = tuple[int, tuple[float, float, float]]
 
 #: Most model time that one call may catch up when the excitation is silent [ns]: the work of a call stays bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
@@ -42,12 +44,23 @@ class Policy:
 
 
 class Driver:
-    """Feed a session from live events. Times are passed in: `now_ns` on a steady clock, stamps on the samples' own."""
+    """Feed a session from live events and return what is to be published.
 
-    def __init__(self, session: Session, intake: Intake, policy: Policy) -> None:
+    Times are passed in: `now_ns` on a steady clock, stamps on the samples' own.
+
+    Parameters
+    ----------
+    session, intake, policy
+        What is driven, what judges the samples, what rules over silence and failures.
+    every_sample : bool
+        Return a frame for each advance; else only `due` returns one.
+    """
+
+    def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:
         self.session = session
         self.intake = intake
         self.policy = policy
+        self.every_sample = every_sample
         self.real_time = RealTimeFactor()
         self.state = StreamState.WAITING
         #: text of the last failed advance
@@ -59,6 +72,8 @@ class Driver:
         self._failures_in_row = 0
         self._received_ns = 0
         self._newest_ns: int | None = None
+        #: model time that has been counted [ns]
+        self._counted_ns: int | None = None
         self._zeroed = False
         #: what the stamps of the scene's own loads lie behind the clock [ns]: time spent inactive
         self._behind_ns = 0
@@ -69,17 +84,29 @@ class Driver:
         """Stamp of the newest sample used [ns]; None before the first and after a reset."""
         return self._newest_ns
 
-    def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Advance | None:
-        """Judge a sample and, when it is used, advance to it."""
-        verdict = self.intake.judge(stamp_ns, wrench, self.session.stamp_ns)
-        if not verdict.used:
-            return None
-        if verdict.resets:
-            self._restart_model(stamp_ns, verdict.value)
-        self._received_ns, self._newest_ns, self._zeroed = now_ns, stamp_ns, False
-        return self._advance(Sample(stamp_ns, wrench), now_ns, StreamState.RUNNING)
+    def samples(self, arrived: Sequence[Arrival], now_ns: int) -> Iterator[Frame]:
+        """Judge samples in order of arrival, advance to those that are used, and yield what is to be published.
 
-    def silence(self, now_ns: int) -> Advance | None:
+        The caller publishes each frame before it asks for the next, so that a recording holds them in order.
+        """
+        accepted: list[Sample] = []
+        for stamp_ns, wrench in arrived:
+            verdict = self.intake.judge(stamp_ns, wrench, self.session.stamp_ns)
+            if not verdict.used:
+                continue
+            if verdict.resets:
+                yield from self._use(accepted, now_ns)
+                accepted = []
+                self._restart_model(stamp_ns, verdict.value)
+            self._received_ns, self._newest_ns, self._zeroed = now_ns, stamp_ns, False
+            accepted.append(Sample(stamp_ns, wrench))
+        yield from self._use(accepted, now_ns)
+
+    def due(self) -> Frame | None:
+        """Return what is to be published of all since the last frame, or None when there was no advance since."""
+        return self.session.outputs.take()
+
+    def silence(self, now_ns: int) -> Frame | None:
         """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
         if self._newest_ns is None:
             return None
@@ -96,7 +123,7 @@ class Driver:
             return self._advance(Sample(stamp_ns, (0.0, 0.0, 0.0)), now_ns, StreamState.STALE)
         return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
-    def clock_tick(self, stamp_ns: int, now_ns: int) -> Advance | None:
+    def clock_tick(self, stamp_ns: int, now_ns: int) -> Frame | None:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
 
         The first call after `resume` only finds out how long that was.
@@ -147,26 +174,53 @@ class Driver:
         self.session.apply(Reset(stamp_ns, reason))
         self.resets += 1
         self._failures_in_row = 0
-        self._newest_ns = None
+        self._newest_ns = self._counted_ns = None
         self.state = StreamState.WAITING
 
-    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Advance | None:
-        before_ns = self.session.stamp_ns
+    def _use(self, samples: list[Sample], now_ns: int) -> Iterator[Frame]:
+        """Advance to samples: one by one where each is published, else in one go."""
+        if self.every_sample:
+            for sample in samples:
+                frame = self._advance(sample, now_ns, StreamState.RUNNING)
+                if frame is not None:
+                    yield frame
+            return
+        for series in self.session.apply_samples(samples):
+            self._advanced(now_ns)
+            # an end that is good ends a row of failures, whatever came before it
+            for status in series.status[-1:] if not series.status.any() else series.status:
+                self._judge_advance(Status(int(status)), StreamState.RUNNING)
+            self._give_up_after_failures()
+
+    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Frame | None:
         advance = self.session.apply(entry)
-        after_ns = self.session.stamp_ns
-        if before_ns is not None and after_ns is not None:
-            self.real_time.advanced((after_ns - before_ns) * 1e-9, now_ns)
-        if advance is None or not advance.status:
+        if advance is None:
+            return None
+        self._advanced(now_ns)
+        self._judge_advance(advance.status, state)
+        self._give_up_after_failures()
+        return self.due() if self.every_sample else None
+
+    def _advanced(self, now_ns: int) -> None:
+        """Count the model time since the last call."""
+        reached_ns = self.session.stamp_ns
+        if self._counted_ns is not None and reached_ns is not None:
+            self.real_time.advanced((reached_ns - self._counted_ns) * 1e-9, now_ns)
+        self._counted_ns = reached_ns
+
+    def _judge_advance(self, status: Status, state: StreamState) -> None:
+        if not status:
             self._failures_in_row = 0
             self.state = state
-            return advance
+            return
         self.failures += 1
         self._failures_in_row += 1
         self.state = StreamState.FAILED
-        self.failure = advance.status.text
+        self.failure = status.text
+
+    def _give_up_after_failures(self) -> None:
         if 0 < self.policy.failure_limit <= self._failures_in_row:
-            self.reset(after_ns or 0, f"{self._failures_in_row} failed advances: {self.failure}")
-        return advance
+            self.reset(self.session.stamp_ns or 0, f"{self._failures_in_row} failed advances: {self.failure}")
 
 
 def counters(driver: Driver) -> dict[str, int]:

@@ -70,14 +70,24 @@ class Intake:
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
         #: samples that were used although a component outside the plane was not zero
         self.out_of_plane = 0
-        #: samples that the expected rate asks for and that did not come in their place
-        self.missing = 0
         self._newest_ns: int | None = None
+        #: samples missing up to the last jump; since then: first stamp, samples used
+        self._missing_before = 0
+        self._first_ns = 0
+        self._since_first = 0
 
     @property
     def arrived(self) -> int:
         """Number of samples judged."""
         return sum(self.counts.values())
+
+    @property
+    def missing(self) -> int:
+        """Samples that the expected rate asks for, from stamp to stamp, and that have not come; bursts are credited."""
+        if self._newest_ns is None or self.expected_rate_hz <= 0.0:
+            return self._missing_before
+        asked = round((self._newest_ns - self._first_ns) * self.expected_rate_hz / NS_PER_S) + 1
+        return self._missing_before + max(0, asked - self._since_first)
 
     @property
     def used(self) -> int:
@@ -98,9 +108,10 @@ class Intake:
         """
         verdict = self._judge(stamp_ns, values, reached_ns)
         self.counts[verdict] += 1
-        if verdict is Verdict.ACCEPTED:
-            self._count_missing(stamp_ns)
         if verdict.used:
+            if self._newest_ns is None or verdict.resets:
+                self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
+            self._since_first += 1
             self._newest_ns = stamp_ns
         return verdict
 
@@ -112,12 +123,8 @@ class Intake:
 
     def restart(self) -> None:
         """Forget the newest stamp: the next sample is a first one. The counts go on."""
+        self._missing_before = self.missing
         self._newest_ns = None
-
-    def _count_missing(self, stamp_ns: int) -> None:
-        if self._newest_ns is not None and self.expected_rate_hz > 0.0:
-            periods = (stamp_ns - self._newest_ns) * self.expected_rate_hz / NS_PER_S
-            self.missing += max(0, round(periods) - 1)
 
     def _judge(self, stamp_ns: int, values: Sequence[float], reached_ns: int | None) -> Verdict:
         if not all(map(math.isfinite, values)):

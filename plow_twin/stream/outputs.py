@@ -6,6 +6,7 @@ A publication is a function of the journal alone, so that a replay forms the sam
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +17,7 @@ from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 
 if TYPE_CHECKING:
-    from plow_twin.run.advance import Advance
+    from plow_twin.run.advance import Advance, AdvanceSeries
 
 Array = NDArray[np.float64]
 
@@ -114,6 +115,18 @@ class Outputs:
         self._makes += advance.makes
         self._impulse += advance.impulse
         np.maximum(self._peak, advance.peak, out=self._peak)
+
+    def add_series(self, stamps_ns: Sequence[int], series: AdvanceSeries) -> None:
+        """Take in many advances that ended at `stamps_ns`; those that failed count for nothing."""
+        good = np.flatnonzero(series.status == 0)
+        if good.size == 0:
+            return
+        last = int(good[-1])
+        self._advance, self._stamp_ns = series[last], stamps_ns[last]
+        self._makes += series.makes[good].sum(axis=0)
+        # row by row, as `add` does: the sum has the same bits
+        self._impulse = np.add.reduce(np.concatenate((self._impulse[None], series.impulse[good])), axis=0)
+        np.maximum(self._peak, series.peak[good].max(axis=0), out=self._peak)
 
     def restart(self) -> None:
         """Forget what has not been published; the makes go on counting."""

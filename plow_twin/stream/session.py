@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset, Sample, Snapshot, Travel
 from plow_twin.stream.outputs import Outputs
 
 if TYPE_CHECKING:
-    from plow_twin.run.advance import Advance
+    from plow_twin.run.advance import Advance, AdvanceSeries
     from plow_twin.run.twin import Twin
 
 #: A digest follows each so many advances.
@@ -89,6 +89,21 @@ class Session:
                 pass
         return None
 
+    def apply_samples(self, samples: Sequence[Sample]) -> Iterator[AdvanceSeries]:
+        """Apply samples of rising stamps in as few calls as digests allow; the same bits as `apply` for each.
+
+        Yields the advances of one call after the other, each once it has been made.
+
+        Raises
+        ------
+        ValueError
+            As `apply`.
+        """
+        while samples:
+            count = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
+            part, samples = samples[:count], samples[count:]
+            yield self._advance_part(part)
+
     def snapshot(self) -> Snapshot:
         """Return the exact state of twin, outputs and session."""
         known = self.stamp_ns is not None
@@ -110,6 +125,27 @@ class Session:
         if self._advances % DIGEST_INTERVAL == 0:
             self._on_entry(Digest(stamp_ns, self.twin.digest()))
         return advance
+
+    def _advance_part(self, samples: Sequence[Sample]) -> AdvanceSeries:
+        stamps_ns = [sample.stamp_ns for sample in samples]
+        before_ns = self.stamp_ns if self.stamp_ns is not None else stamps_ns[0]
+        for stamp_ns, earlier_ns in zip(stamps_ns, (before_ns, *stamps_ns), strict=False):
+            if stamp_ns < earlier_ns:
+                raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {earlier_ns} ns")
+        for sample in samples:
+            self._on_entry(sample)
+        if self.origin_ns is None:
+            self.origin_ns = stamps_ns[0]
+        origin_ns = self.origin_ns
+        series = self.twin.advance_samples(
+            [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
+        )
+        self.stamp_ns = stamps_ns[-1]
+        self.outputs.add_series(stamps_ns, series)
+        self._advances += len(samples)
+        if self._advances % DIGEST_INTERVAL == 0:
+            self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
+        return series
 
     def _reset(self) -> None:
         self.twin.reset(0.0)

@@ -1,0 +1,77 @@
+"""Which of several senders of one input is followed, and how many of its samples never arrived.
+
+A sender numbers what it sends from 1 on, as the middleware does for each publisher: a gap in the numbers is loss,
+wherever it happened (on the way, or in a queue that overran), whatever the rate, and bursts change nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+#: Senders whose numbers are remembered; the oldest is forgotten.
+_MOST_SENDERS = 64
+
+
+class Senders:
+    """Follow the first sender heard until it has gone or a switch is asked for."""
+
+    def __init__(self) -> None:
+        #: the sender followed; None before the first sample and after it has gone
+        self.followed: bytes | None = None
+        #: samples that the followed sender sent and that never arrived
+        self.lost = 0
+        #: samples of the other senders, which are not used
+        self.ignored = 0
+        #: changes from one sender to another
+        self.switches = 0
+        self._next: dict[bytes, int] = {}
+        self._before: frozenset[bytes] = frozenset()
+        self._listed: set[bytes] = set()
+        self._other: bytes | None = None
+
+    def start(self, present: Collection[bytes]) -> None:
+        """Take note of the senders that were there before: what they sent until now is no loss."""
+        self._before = frozenset(present)
+
+    def hear(self, sender: bytes, number: int) -> bool:
+        """Take in the arrival of sample `number` (from 1) of a sender; True when that sender is followed."""
+        expected = self._next.get(sender)
+        if expected is None:
+            expected = number if sender in self._before else 1
+            if len(self._next) >= _MOST_SENDERS:
+                self._next.pop(next(name for name in self._next if name != self.followed))
+        if self.followed is None:
+            self._follow(sender)
+        followed = sender == self.followed
+        if followed:
+            # a number that comes after all is no loss any more
+            self.lost += number - expected if number >= expected else -1 if self.lost else 0
+        else:
+            self.ignored += 1
+            self._other = sender
+        self._next[sender] = max(expected, number + 1)
+        return followed
+
+    def alive(self, present: Collection[bytes]) -> None:
+        """Take note of the senders that there are; when the one followed has gone, the next one heard is followed.
+
+        One that has not been in such a list yet may be on its way into it: it has not gone.
+        """
+        gone = self._listed.difference(present)
+        self._listed = set(present)
+        if self.followed in gone:
+            self.followed = None
+        if self._other in gone:
+            self._other = None
+
+    def switch(self) -> bool:
+        """Follow the other sender heard last; False when there is none."""
+        if self._other is None:
+            return False
+        other, self._other = self._other, self.followed
+        self._follow(other)
+        return True
+
+    def _follow(self, sender: bytes) -> None:
+        self.switches += bool(self._next)
+        self.followed = sender

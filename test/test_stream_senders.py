@@ -1,0 +1,50 @@
+"""Loss by the sender's own numbering, and which sender is followed."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from plow_twin.stream.senders import Senders
+
+ONE, OTHER = b"one", b"other"
+
+
+@given(st.sets(st.integers(1, 300), min_size=1))
+def test_used_plus_lost_is_what_was_sent_whatever_was_taken_out(heard: set[int]) -> None:
+    senders = Senders()
+    assert all(senders.hear(ONE, number) for number in sorted(heard))
+    assert len(heard) + senders.lost == max(heard)
+
+
+@given(st.permutations(range(1, 12)))
+def test_what_comes_after_all_is_no_loss(order: list[int]) -> None:
+    senders = Senders()
+    for number in order:
+        senders.hear(ONE, number)
+    assert senders.lost == 0
+
+
+def test_what_was_sent_before_the_subscription_is_no_loss() -> None:
+    senders = Senders()
+    senders.start([ONE])
+    for number in (5000, 5001, 5004):
+        senders.hear(ONE, number)
+    assert senders.lost == 2
+
+
+def test_one_sender_is_followed_until_it_has_gone_or_a_switch_is_asked_for() -> None:
+    senders = Senders()
+    assert not senders.switch()
+    assert [senders.hear(ONE, 1), senders.hear(OTHER, 1), senders.hear(ONE, 2)] == [True, False, True]
+    # not yet in the list of those present: that says nothing
+    senders.alive([])
+    assert senders.followed == ONE
+    senders.alive([ONE, OTHER])
+    assert senders.switch()
+    assert [senders.hear(ONE, 3), senders.hear(OTHER, 2), senders.hear(OTHER, 4)] == [False, True, True]
+    assert (senders.lost, senders.ignored) == (1, 2)
+    senders.alive([ONE, OTHER])
+    senders.alive([ONE])
+    assert senders.hear(ONE, 4)
+    assert (senders.lost, senders.switches) == (1, 2)
