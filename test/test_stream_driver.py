@@ -13,6 +13,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driver import Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
 from plow_twin.stream.journal import Entry, Hold, Reset, Sample
+from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 SCENE = load_scene(scene_path("paper"))
@@ -30,7 +31,7 @@ class Bench:
         session = Session(twin, on_entry=self.journal.append)
         self.driver = Driver(session, Intake(), policy or Policy(), every_sample=every_sample)
 
-    def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Frame | None:
+    def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Publication | None:
         """Return what is published for one sample."""
         frames = list(self.driver.samples([(stamp_ns, wrench)], now_ns))
         return frames[0] if frames else None
@@ -176,8 +177,8 @@ def test_batches_give_the_bits_of_single_samples_and_a_journal_that_repeats_them
     assert batched.journal == single.journal
     one, other = single.driver.due(), batched.driver.due()
     assert one is not None and other is not None
-    assert one.touches.sum() > 0
-    for name in ("stamp_ns", "q", "v", "force", "touches", "impulse", "peak"):
+    assert one.makes.sum() > 0
+    for name in ("stamp_ns", "q", "v", "force", "makes", "impulse", "peak"):
         assert np.asarray(getattr(one, name)).tobytes() == np.asarray(getattr(other, name)).tobytes(), name
 
 

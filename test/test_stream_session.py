@@ -142,7 +142,7 @@ def test_nothing_is_lost_however_rarely_frames_are_taken(cuts: set[int]) -> None
         rare.apply(entries[begin : end - 1], take=False)
         rare.apply(entries[end - 1 : end])
     assert len(rare.publications) == len(bounds) - 1
-    assert (rare.publications[-1].touches == every.publications[-1].touches).all()
+    assert (rare.publications[-1].makes == every.publications[-1].makes).all()
     for publication, begin, end in zip(rare.publications, bounds, bounds[1:], strict=False):
         part = every.publications[begin:end]
         assert (publication.peak == np.max([single.peak for single in part], axis=0)).all()

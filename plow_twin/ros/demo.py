@@ -313,7 +313,7 @@ def _force_table(summary: RunSummary) -> Table:
         for mask in SENSES.values():
             pair = next(pair for pair in pairs if mask[pair])
             cells += [f"{summary.largest[pair] / 1e3:.1f}", f"{summary.mean_in_contact[pair] / 1e3:.1f}"]
-            cells.append(f"{summary.touches[pair]:.0f}")
+            cells.append(f"{summary.makes[pair]:.0f}")
         table.add_row(f"{letters[corner]} {corner.replace('_', ' ')}", *cells)
     return table
 

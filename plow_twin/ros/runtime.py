@@ -25,6 +25,7 @@ from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Entry
+from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
@@ -218,8 +219,8 @@ class Runtime:
 
     def _on_samples(self, arrived: list[Arrival]) -> None:
         self._received_ns = now_ns = time.monotonic_ns()
-        for frame in self.driver.samples(arrived, now_ns):
-            self._publish(frame)
+        for publication in self.driver.samples(arrived, now_ns):
+            self._publish(publication)
         self._advanced()
 
     def _on_silence(self) -> None:
@@ -228,7 +229,7 @@ class Runtime:
         if self.driver.holds != holds:
             # what is published next answers no message
             self._received_ns = 0
-            self._publish(frame)
+            self._publish(publication)
             self._advanced()
 
     def _on_clock(self) -> None:
@@ -262,7 +263,7 @@ class Runtime:
                 time.sleep(_CATCH_UP_S)
         self._changed()
 
-    def _publish(self, frame: Frame | None) -> None:
+    def _publish(self, publication: Publication | None) -> None:
         if publication is None:
             return
         if not publication.finite:
