@@ -159,13 +159,13 @@ def test_in_free_flight_nothing_of_the_contact_runs() -> None:
 def test_warm_up_leaves_nothing_to_compile() -> None:
     twin = Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
     twin.warm_up()
-    before = [len(kernel.signatures) for kernel in (loop.advance_times, loop.end_step, loop.lay_out_again)]
+    before = [len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)]
     assert min(before) > 0 and twin.time == 0.0
     twin.advance(0.01)
     twin.set_travel_speed(1.0)
     twin.advance(0.02)
     twin.restore(twin.snapshot())
-    assert [len(kernel.signatures) for kernel in (loop.advance_times, loop.end_step, loop.lay_out_again)] == before
+    assert [len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)] == before
 
 
 def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:
