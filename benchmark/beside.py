@@ -24,7 +24,8 @@ BEGIN, END = "<!-- beside: begin -->", "<!-- beside: end -->"
 _WORK = """
 import json, sys, time
 import numpy as np
-from plow_twin import Twin, simulate
+from plow_twin import simulate
+from plow_twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.model.loads import compile_loads
 

@@ -69,8 +69,8 @@ def main() -> None:
     _collect()
     from work_precision import prepare_bare
 
-    from plow_twin.scene_file.presets import scene_path
     from plow_twin.scene_file import load_scene
+    from plow_twin.scene_file.presets import scene_path
 
     scene = load_scene(scene_path(chosen.scene))
     run = prepare_bare(scene, 0.1, chosen.tol)

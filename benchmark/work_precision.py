@@ -62,7 +62,7 @@ def prepare_simulate(
     tol: float = 1e-9,
     dt: float | None = None,
     *,
-    audit: bool = False,
+    energy_balance: bool = False,
     whole_call: bool = False,
 ) -> Callable[[], Sample]:
     """Prepare `simulate` with everything it gives: poses, rates, forces, penetrations, events, statistics.
@@ -72,7 +72,7 @@ def prepare_simulate(
     method: Method = "events" if dt is None else "rk4"
 
     def run() -> Sample:
-        wall, result = timed(lambda: simulate(scene, t_end, output_dt, tol, method, dt, audit))
+        wall, result = timed(lambda: simulate(scene, t_end, output_dt, tol, method, dt, energy_balance))
         solver = result.solver
         return Sample(
             wall if whole_call else result.wall_s, result.q, solver["steps"], solver["evaluations"], len(result.events)
@@ -93,7 +93,7 @@ def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_EN
         wall, (code, motion) = timed(solve)
         if code != Status.OK:
             raise SolverError(f"at t = {motion.state.step_start:.9g} s: {Status(code).text}")
-        count = motion.state.count
+        state = motion.state
         return Sample(wall, motion.q, int(state.steps), int(state.evaluations), int(motion.log.length[0]))
 
     # compiles

@@ -108,13 +108,13 @@ def add_steps_per_event(rows: Sequence[Row]) -> None:
 
 
 def feature_cases() -> Iterator[Case]:
-    """Yield the KV scene plain, with the books of energy and momentum, with friction, with both."""
+    """Yield the KV scene plain, with energy and momentum balanced, with friction, with both."""
     scene = bench_scene("kv")
     rubbing = dataclasses.replace(scene, friction=Friction(coefficient=0.1))
-    features = (("plain", scene, False), ("audit", scene, True), ("friction 0.1", rubbing, False))
-    for name, chosen, audit in (*features, ("friction 0.1 and audit", rubbing, True)):
+    features = (("plain", scene, False), ("energy balance", scene, True), ("friction 0.1", rubbing, False))
+    for name, chosen, energy_balance in (*features, ("friction 0.1 and energy balance", rubbing, True)):
         row = Row("features", f"kv, {name}", OURS, f"tol={TOL:g}", SPARSE, T_END)
-        yield Case(row, partial(prepare_simulate, chosen, SPARSE, tol=TOL, audit=audit))
+        yield Case(row, partial(prepare_simulate, chosen, SPARSE, tol=TOL, energy_balance=energy_balance))
 
 
 def add_ratios(rows: Sequence[Row]) -> None:

@@ -1,11 +1,11 @@
 """Digital twin of a mechanism with clearance: the coal plough's head in its guide."""
 
-from plow_twin.run.advance import Advance as Advance
-from plow_twin.run.advance import AdvanceSeries as AdvanceSeries
-from plow_twin.run.advance import AdvanceBatch as AdvanceBatch
-from plow_twin.run.ensemble import Ensemble as Ensemble
-from plow_twin.run.ensemble import simulate_many as simulate_many
-from plow_twin.errors import ArgumentError as ArgumentError
+from __future__ import annotations
+
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from warnings import warn as _warn
+
 from plow_twin.errors import PlowTwinError as PlowTwinError
 from plow_twin.errors import Problem as Problem
 from plow_twin.errors import RecordingError as RecordingError
@@ -28,8 +28,32 @@ from plow_twin.model.scene import Provenance as Provenance
 from plow_twin.model.scene import Scene as Scene
 from plow_twin.model.scene import Table as Table
 from plow_twin.model.scene import Wear as Wear
+from plow_twin.run.advance import Advance as Advance
+from plow_twin.run.advance import AdvanceBatch as AdvanceBatch
+from plow_twin.run.advance import AdvanceSeries as AdvanceSeries
+from plow_twin.run.batch import TwinBatch as TwinBatch
+from plow_twin.run.energy_balance import EnergyBalance as EnergyBalance
+from plow_twin.run.ensemble import Ensemble as Ensemble
+from plow_twin.run.ensemble import simulate_many as simulate_many
 from plow_twin.run.simulate import Result as Result
 from plow_twin.run.simulate import simulate as simulate
 from plow_twin.run.twin import Status as Status
 from plow_twin.run.twin import Twin as Twin
-from plow_twin.run.batch import TwinBatch as TwinBatch
+
+if _TYPE_CHECKING:
+    from plow_twin.scene_file import dump_scene as dump_scene
+    from plow_twin.scene_file import load_scene as load_scene
+
+#: Imported when used: what reads YAML is not needed by who builds scenes in Python.
+_LAZY = {"load_scene": "plow_twin.scene_file", "dump_scene": "plow_twin.scene_file"}
+#: Names of version 0.1, and what they are now.
+_RENAMED = {"Twins": "TwinBatch", "AdvanceTogether": "AdvanceBatch"}
+
+
+def __getattr__(name: str) -> object:
+    if name in _LAZY:
+        return getattr(_import_module(_LAZY[name]), name)
+    if name in _RENAMED:
+        _warn(f"plow_twin.{name} is now plow_twin.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
+        return globals()[_RENAMED[name]]
+    raise AttributeError(f"module 'plow_twin' has no attribute {name!r}")

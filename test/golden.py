@@ -19,8 +19,8 @@ import llvmlite.binding
 import numpy as np
 from scenes import preset
 from test_solve_flight import swaying
+from test_solve_implicit import damped
 from test_solve_rest import fallen
-from test_solve_stiff import damped
 
 from plow_twin import Contact, Friction, Scene, Twin, TwinBatch, Wear, simulate
 from plow_twin.model.contact_laws import LAWS

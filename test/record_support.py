@@ -14,15 +14,15 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from plow_twin.model.scene import Wear
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import publication_messages
 from plow_twin.record.recorder import LossReport, Recorder
+from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry, Hold, Parameter, Reset, Sample, Travel
 from plow_twin.stream.session import Session
-from plow_twin.run.twin import Twin
 
 BASE_NS = 1_800_000_000_000_000_000
 STEP_NS = 1_000_000
@@ -85,7 +85,7 @@ def record_run(
         messages = {} if frame is None else publication_messages(frame, header.frame_id, header.child_frame_id)
         run.outputs += [(header.topic(name), message) for name, message in messages.items()]
         if frame is not None:
-            recorder.frame(frame)
+            recorder.publication(frame)
         if recorder.snapshot_wanted:
             journal(session.snapshot())
         if pause_every and index % pause_every == 0:

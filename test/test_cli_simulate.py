@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from plow_twin import PAIR_NAMES, simulate
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
 
 RUN = ["simulate", "paper", "--t-end", "2", "--output-dt", "0.01"]
 
@@ -186,19 +186,19 @@ def test_info_lists_marks_and_versions() -> None:
     assert {"mcap", "rerun-sdk", "matplotlib", "pyarrow", "Jinja2", "distributed", "rclpy"} <= versions.keys()
 
 
-def test_the_audit_closes_the_books() -> None:
-    done = plow_twin(*RUN, "--audit", "--json")
+def test_the_energy_balance_closes() -> None:
+    done = plow_twin(*RUN, "--energy-balance", "--json")
     assert done.returncode == 0, done.stderr
-    books = json.loads(done.stdout)["audit"]
-    start, end = books["kinetic_j"]
-    stored = books["stored_j"][1] - books["stored_j"][0]
-    given = books["load_work_j"] + books["gravity_work_j"]
-    taken = books["dissipated_j"] + books["friction_work_j"] + stored
-    assert end - start == pytest.approx(given - taken, abs=1e-6 * books["turnover_j"])
-    assert books["dissipated_j"] > 1.0 and books["friction_work_j"] == 0.0
-    assert 0.0 <= books["relative_imbalance"] < 1e-6 and len(books["momentum_imbalance"]) == 3
+    balance = json.loads(done.stdout)["energy_balance"]
+    start, end = balance["kinetic_j"]
+    stored = balance["stored_j"][1] - balance["stored_j"][0]
+    given = balance["load_work_j"] + balance["gravity_work_j"]
+    taken = balance["dissipated_j"] + balance["friction_work_j"] + stored
+    assert end - start == pytest.approx(given - taken, abs=1e-6 * balance["turnover_j"])
+    assert balance["dissipated_j"] > 1.0 and balance["friction_work_j"] == 0.0
+    assert 0.0 <= balance["relative_imbalance"] < 1e-6 and len(balance["momentum_imbalance"]) == 3
     shown = plow_twin(*RUN, "--audit").stdout
-    assert "books of energy" in shown and "largest imbalance" in shown
+    assert "balance of energy" in shown and "largest imbalance" in shown
 
 
 def test_words_of_the_paper_scene_say_in_a_comment_what_they_rest_on() -> None:

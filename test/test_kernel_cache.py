@@ -9,7 +9,9 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-CALL = "import numpy as np; from plow_twin.solve.dynamics import to_body; to_body(np.zeros(6), np.zeros(8)); print({})"
+CALL = (
+    "import numpy as np; from plow_twin.solve.kinematics import to_body; to_body(np.zeros(6), np.zeros(8)); print({})"
+)
 MISSES = CALL.format("sum(to_body.stats.cache_misses.values())")
 
 
@@ -22,6 +24,6 @@ def run(cache: Path) -> str:
 def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
     """After an upgrade an index may name types that are gone: reading it would raise."""
     assert run(tmp_path) == "1" and run(tmp_path) == "0"
-    (index,) = tmp_path.rglob("motion.to_body*.nbi")
+    (index,) = tmp_path.rglob("kinematics.to_body*.nbi")
     index.write_bytes(pickle.dumps("another version") + b"cannot be read")
     assert run(tmp_path) == "1" and run(tmp_path) == "0"

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plow_twin import Clearance, Contact, Frame, Head, Scene, SceneError
-from plow_twin.model.contact import free_force, normal_force, power_term, power_terms, root_terms
-from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, exact_damping_number
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
+from plow_twin.model.contact import free_force, normal_force, power_term, power_terms, root_terms
+from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, exact_damping_number
 
 
 @pytest.mark.parametrize(

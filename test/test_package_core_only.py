@@ -18,7 +18,8 @@ import json, sys
 from importlib.metadata import distributions
 from importlib.util import find_spec
 import plow_twin
-from plow_twin import Clearance, Contact, Frame, Gravity, Head, Scene, Twin, simulate
+from plow_twin import simulate
+from plow_twin import Clearance, Contact, Frame, Gravity, Head, Scene, Twin
 
 for name in ("yaml", "jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"):
     assert find_spec(name) is None, name

@@ -12,37 +12,35 @@ import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
-CORE = {"errors", "model", "solve", "advance", "twin", "twins", "books", "simulate", "ensemble"}
+SOLVER = {"errors", "kernel", "model", "solve"}
+CORE = SOLVER | {"run"}
 #: For each room of the package, the rooms it may import.
 ROOMS = {
     "errors": set(),
-    "presets": set(),
-    "model": {"errors"},
-    "solve": {"errors", "model"},
-    "advance": {"errors", "model", "solve"},
-    "twin": {"errors", "model", "solve", "advance"},
-    "twins": {"errors", "model", "solve", "advance", "twin"},
-    "books": {"errors", "model", "solve"},
-    "simulate": {"errors", "model", "solve", "books"},
-    "ensemble": {"errors", "model", "solve", "simulate"},
+    "build": set(),
+    "kernel": {"errors"},
+    "model": {"errors", "kernel"},
     "scene_file": {"errors", "model"},
+    "solve": {"errors", "kernel", "model"},
+    "run": SOLVER,
     "stream": CORE,
-    "record": CORE | {"scene_file", "stream"},
+    "estimate": CORE,
+    "record": CORE | {"build", "scene_file", "stream"},
     "view": CORE | {"scene_file", "stream", "record"},
-    "study": CORE | {"scene_file", "presets", "stream", "record", "view"},
-    "ros": CORE | {"scene_file", "presets", "stream", "record", "view"},
-    "cli": CORE | {"scene_file", "presets", "stream", "record", "view", "study", "ros"},
-    "__init__": CORE,
+    "study": CORE | {"build", "scene_file", "stream", "record", "view"},
+    "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},
+    "cli": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "ros"},
+    "__init__": CORE | {"scene_file"},
     "__main__": {"cli"},
 }
 MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std")}
 #: Libraries beside numpy, by room.
 LIBRARIES = {
-    "model": {"scipy", "numba", "llvmlite"},
-    "solve": {"scipy", "numba"},
-    "twin": {"scipy", "numba"},
-    "simulate": {"scipy", "numba"},
-    "ensemble": set(),
+    "build": {"numba", "llvmlite"},
+    "kernel": {"numba", "llvmlite"},
+    "model": {"scipy"},
+    "solve": {"scipy"},
+    "run": set(),
     "scene_file": {"yaml", "jsonschema"},
     "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite", "lz4", "zstandard", "isal"},
     "view": {"rerun"},

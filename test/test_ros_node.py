@@ -20,18 +20,18 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from plow_twin.run.advance import AdvanceSeries
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene, Wear
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.diagnostics import KEYS, STATUS_KEYS
 from plow_twin.ros.messages import stamp_ns
-from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.stream.outputs import CLEARANCE_NAMES
+from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.outputs import CLEARANCE_NAMES
 
 T0 = 1_795_000_000_000_000_000
 MS = 1_000_000

@@ -23,10 +23,10 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from plow_twin.model.scene import Constant, Table
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.ros.messages import ToolForces
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
 
 PAPER = load_scene(scene_path("paper"))
 

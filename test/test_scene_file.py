@@ -15,12 +15,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
-from plow_twin import PAIR_NAMES, Clearance, Constant, Contact, Frame, Gravity, Harmonic, Head, Initial, Mark, Provenance, Scene, SceneError, Table, Wear
+from plow_twin import (
+    PAIR_NAMES,
+    Clearance,
+    Constant,
+    Contact,
+    Frame,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Mark,
+    Provenance,
+    Scene,
+    SceneError,
+    Table,
+    Wear,
+)
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.pairs import CORNER_NAMES
 from plow_twin.model.scene import DOF_NAMES
-from plow_twin.scene_file.presets import PRESETS, scene_path
 from plow_twin.scene_file import dump_scene, load_scene, loads_scene, scene_schema
+from plow_twin.scene_file.presets import PRESETS, scene_path
 
 MINIMAL = """
 version: 1

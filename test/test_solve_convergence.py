@@ -46,8 +46,8 @@ def fixed_step_errors(
                 speed=1.0, gap=0.004 + 2.0 * dt * (phase + 0.5) / phases,
             )  # fmt: skip
             exact = simulate(scene, t_end, output_dt=t_end, tol=1e-13)
-            fixed = simulate(scene, t_end, output_dt=t_end, method=method, dt=dt)
-            found.append(abs(fixed_step.q[-1, 1] - exact.q[-1, 1]))
+            fixed_run = simulate(scene, t_end, output_dt=t_end, method=method, dt=dt)
+            found.append(abs(fixed_run.q[-1, 1] - exact.q[-1, 1]))
         errors.append(float(np.mean(found)))
     return errors
 
@@ -79,7 +79,7 @@ def test_event_location_keeps_the_order_of_the_series(
     Six decades of the tolerance, above what rounding leaves (1e-13 of the clearance).
     """
     scene, exact = preset(name), reference(REFERENCES[name])["q"][:401]
-    monkeypatch.setattr(compiled, "order_for", lambda tol: order)
+    monkeypatch.setattr(compiled_scene, "order_for", lambda tol: order)
     steps, errors = zip(*[run(scene, 10.0**-k, exact) for k in range(first, first + 6)], strict=True)
     slope = -np.polyfit(np.log(steps), np.log(errors), 1)[0]
     assert slope == pytest.approx(order, rel=0.1)

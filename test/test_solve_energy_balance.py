@@ -1,4 +1,4 @@
-"""The books of energy and momentum: they balance where the motion is right, and only there."""
+"""The balance of energy and momentum: they balance where the motion is right, and only there."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scenes import preset
 from plow_twin import Contact, Head, Wear, simulate
 from plow_twin.run.energy_balance import energy_balance_of
 from plow_twin.run.simulate import Motion, _run, run_events
-from plow_twin.solve.energy_balance import new_balance
 from plow_twin.solve.compiled_scene import compile_scene
+from plow_twin.solve.energy_balance import new_balance
 from plow_twin.solve.state import new_work
 
 PAPER = preset("paper")
@@ -30,27 +30,27 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_books_balance(name: str) -> None:
-    books = simulate(SCENES[name], 5.0, energy_balance=True).audit
-    assert books is not None
-    assert books.relative_imbalance < 1e-11
-    scale = np.abs(books.impulse).max(axis=0) + 1.0
-    assert (books.momentum_imbalance < 1e-10 * scale).all()
-    gained = books.kinetic_j[1] - books.kinetic_j[0]
-    stored = books.stored_j[1] - books.stored_j[0]
-    work = books.load_work_j + books.gravity_work_j - books.dissipated_j - books.friction_work_j
-    assert work == pytest.approx(gained + stored, abs=1e-9 * books.turnover_j)
-    assert books.dissipated_j > 0.0 and books.friction_work_j == 0.0
+def test_the_balance_balance(name: str) -> None:
+    balance = simulate(SCENES[name], 5.0, energy_balance=True).energy_balance
+    assert balance is not None
+    assert balance.relative_imbalance < 1e-11
+    scale = np.abs(balance.impulse).max(axis=0) + 1.0
+    assert (balance.momentum_imbalance < 1e-10 * scale).all()
+    gained = balance.kinetic_j[1] - balance.kinetic_j[0]
+    stored = balance.stored_j[1] - balance.stored_j[0]
+    work = balance.load_work_j + balance.gravity_work_j - balance.dissipated_j - balance.friction_work_j
+    assert work == pytest.approx(gained + stored, abs=1e-9 * balance.turnover_j)
+    assert balance.dissipated_j > 0.0 and balance.friction_work_j == 0.0
 
 
-def test_an_audit_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -> None:
-    plain, audited = simulate(PAPER, 2.0), simulate(PAPER, 2.0, energy_balance=True)
-    assert np.array_equal(plain.q, audited.q) and plain.solver == audited.solver and plain.energy_balance is None
-    assert _run(compile_scene(PAPER, 1e-9), np.zeros(1), 0.0, "events", None).audit is None
+def test_the_balance_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -> None:
+    plain, balanced = simulate(PAPER, 2.0), simulate(PAPER, 2.0, energy_balance=True)
+    assert np.array_equal(plain.q, balanced.q) and plain.solver == balanced.solver and plain.energy_balance is None
+    assert _run(compile_scene(PAPER, 1e-9), np.zeros(1), 0.0, "events", None).sums is None
 
 
 def test_a_wrong_motion_does_not_balance() -> None:
-    """The audit looks at forces of its own: a solver that takes another stiffness is found out."""
+    """The balance looks at forces of its own: a solver that takes another stiffness is found out."""
     compiled = compile_scene(PAPER, 1e-9)
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))
     motion.energy_balance = new_balance()
@@ -60,7 +60,10 @@ def test_a_wrong_motion_does_not_balance() -> None:
     assert energy_balance_of(compiled, motion.state, motion.energy_balance).relative_imbalance > 1e-10
 
 
-def test_the_books_of_fixed_steps_balance_to_their_order() -> None:
-    coarse, fine = (simulate(PAPER, 2.0, method="rk4", dt=dt, output_dt=0.1, energy_balance=True).audit for dt in (4e-4, 1e-4))
+def test_the_balance_of_fixed_steps_balance_to_their_order() -> None:
+    coarse, fine = (
+        simulate(PAPER, 2.0, method="rk4", dt=dt, output_dt=0.1, energy_balance=True).energy_balance
+        for dt in (4e-4, 1e-4)
+    )
     assert coarse is not None and fine is not None
     assert fine.relative_imbalance < 0.15 * coarse.relative_imbalance < 1e-6

@@ -9,7 +9,22 @@ import numpy as np
 import pytest
 from scenes import preset, wall_and_point
 
-from plow_twin import Clearance, Constant, Contact, Frame, Gravity, Head, Initial, Scene, SceneError, Status, Table, Twin, Wear, simulate
+from plow_twin import (
+    Clearance,
+    Constant,
+    Contact,
+    Frame,
+    Gravity,
+    Head,
+    Initial,
+    Scene,
+    SceneError,
+    Status,
+    Table,
+    Twin,
+    Wear,
+    simulate,
+)
 
 
 def bouncing(contact: Contact, mass: float, gap: float = 0.01) -> Scene:

@@ -10,7 +10,7 @@ from scenes import preset
 
 from plow_twin import Gravity, Harmonic, Initial, Scene, Table, Twin, simulate
 from plow_twin.run.simulate import Motion, output_times, run_events
-from plow_twin.solve.compiled_scene import Compiled, compile_scene
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.state import new_work
 
 
@@ -24,14 +24,14 @@ def swaying(drift: tuple[float, float, float] = (0.0, 0.0, 0.0), amplitude: floa
     return dataclasses.replace(scene, gravity=Gravity(0.0), loads=(load,), initial=Initial(v=tuple(v)))
 
 
-def without_flight(scene: Scene, tol: float) -> Compiled:
+def without_flight(scene: Scene, tol: float) -> CompiledScene:
     compiled = compile_scene(scene, tol)
     return dataclasses.replace(
         compiled, parts=compiled.parts._replace(terms=compiled.parts.terms._replace(flight=None))
     )
 
 
-def run(compiled: Compiled, t_end: float, output_dt: float) -> Motion:
+def run(compiled: CompiledScene, t_end: float, output_dt: float) -> Motion:
     times = output_times(t_end, output_dt)
     motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)), outputs=True)
     assert run_events(compiled, motion, times, t_end, new_work(), 10**7) == (0, len(times))
@@ -46,7 +46,10 @@ def test_an_hour_of_swinging_costs_36_steps_and_is_exact() -> None:
     shape = np.array([1.0, 0.5, 1.0]) * amplitude
     assert np.abs(result.q + shape * np.sin(omega * result.t)[:, None]).max() < 1e-13
     assert np.abs(result.v + shape * omega * np.cos(omega * result.t)[:, None]).max() < 2e-12
-    assert result.energy_balance is not None and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
+    assert (
+        result.energy_balance is not None
+        and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))

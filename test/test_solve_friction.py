@@ -66,4 +66,4 @@ def test_both_solvers_agree_and_the_books_balance(name: str) -> None:
 
 def test_without_friction_none_of_its_code_is_compiled() -> None:
     for friction in (None, Friction(0.0)):
-        assert compiled.compile_scene(replace(preset("paper"), friction=friction), 1e-9).parts.terms.slip is None
+        assert compiled_scene.compile_scene(replace(preset("paper"), friction=friction), 1e-9).parts.terms.slip is None

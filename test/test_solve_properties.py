@@ -18,10 +18,10 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from plow_twin import Clearance, Constant, Contact, Frame, Gravity, Harmonic, Head, Initial, Scene, Status, Twin, Wear
-from plow_twin.run import twin as twin_module
 from plow_twin.model.geometry import length_scale
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.run import twin as twin_module
 
 #: Steps that one request may take; what needs more says so.
 BUDGET = 20_000

@@ -50,7 +50,10 @@ def test_an_hour_at_rest_costs_next_to_nothing_and_is_in_balance(law: str) -> No
     assert np.array_equal(result.q[1], result.q[-1]) and not result.v[-1].any()
     assert np.abs(result.q[-1] - static_pose(scene, result.q[-1])).max() < 1e-12
     weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
-    assert result.energy_balance is not None and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
+    assert (
+        result.energy_balance is not None
+        and result.energy_balance.imbalance_j < 1e-12 * result.energy_balance.turnover_j
+    )
     assert np.abs(result.energy_balance.momentum_imbalance).max() < 1e-12 * weight * 3600.0
     # the pads carry the weight meanwhile: the totals go on
     carried = sum(row["impulse"] for row in result.statistics.values())

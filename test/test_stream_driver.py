@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from plow_twin.scene_file.presets import scene_path
+from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driver import Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
 from plow_twin.stream.journal import Entry, Hold, Reset, Sample
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
-from plow_twin.run.twin import Twin
 
 SCENE = load_scene(scene_path("paper"))
 T0 = 1_795_000_000_000_000_000
@@ -31,7 +31,7 @@ class Bench:
         session = Session(twin, on_entry=self.journal.append)
         self.driver = Driver(session, Intake(), policy or Policy(), every_sample=every_sample)
 
-    def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Frame | None:
+    def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Publication | None:
         """Return what is published for one sample."""
         frames = list(self.driver.samples([(stamp_ns, wrench)], now_ns))
         return frames[0] if frames else None
@@ -53,12 +53,12 @@ def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     held = bench.journal[2:]
     first: Entry = Sample(T0 + 21 * MS, (0.0, 0.0, 0.0)) if hold == "zero" else Hold(T0 + 21 * MS)
     assert held == [first, Hold(T0 + 31 * MS)]
-    assert driver.state is State.STALE
+    assert driver.state is StreamState.STALE
 
     # what the model has passed is late, the next one is used at once
     assert bench.sample(T0 + 31 * MS, LOAD, now_ns=132 * MS) is None
     assert bench.sample(T0 + 32 * MS, LOAD, now_ns=132 * MS) is not None
-    assert driver.state is State.RUNNING
+    assert driver.state is StreamState.RUNNING
     assert counters(driver)["dropped_late"] == 1
     assert counters(driver)["holds"] == 2
 
@@ -123,7 +123,7 @@ def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_res
     assert isinstance(bench.journal[-1], Reset)
     recovered = bench.sample(T0 + 30 * MS, LOAD, now_ns=30 * MS)
     assert recovered is not None and recovered.finite
-    assert driver.state is State.RUNNING
+    assert driver.state is StreamState.RUNNING
 
 
 def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:
@@ -177,8 +177,8 @@ def test_batches_give_the_bits_of_single_samples_and_a_journal_that_repeats_them
     assert batched.journal == single.journal
     one, other = single.driver.due(), batched.driver.due()
     assert one is not None and other is not None
-    assert one.touches.sum() > 0
-    for name in ("stamp_ns", "q", "v", "force", "touches", "impulse", "peak"):
+    assert one.makes.sum() > 0
+    for name in ("stamp_ns", "q", "v", "force", "makes", "impulse", "peak"):
         assert np.asarray(getattr(one, name)).tobytes() == np.asarray(getattr(other, name)).tobytes(), name
 
 
@@ -189,4 +189,4 @@ def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
     assert (bench.driver.failures, bench.kinds()[-1]) == (3, "Reset")
     list(bench.driver.samples([(T0 + i * MS, LOAD) for i in range(13, 20)], now_ns=0))
     frame = bench.driver.due()
-    assert frame is not None and frame.finite and bench.driver.state is State.RUNNING
+    assert frame is not None and frame.finite and bench.driver.state is StreamState.RUNNING

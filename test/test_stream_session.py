@@ -1,4 +1,4 @@
-"""The machine that live node and replay drive: same entries, same bits; nothing lost between two frames."""
+"""The machine that live node and replay drive: same entries, same bits; nothing lost between two publications."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene, Wear
-from plow_twin.scene_file.presets import scene_path
-from plow_twin.scene_file import load_scene
-from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Reset, Sample, Snapshot, Travel
-from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, Publication, Outputs, prior_points
-from plow_twin.stream.session import DIGEST_INTERVAL, Session
 from plow_twin.run.twin import Twin
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Reset, Sample, Snapshot, Travel
+from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, Outputs, Publication, prior_points
+from plow_twin.stream.session import DIGEST_INTERVAL, Session
 
 T0 = 1_795_000_000_123_456_789
 MS = 1_000_000
@@ -50,23 +50,32 @@ class Run:
 
     def __init__(self) -> None:
         self.emitted: list[Entry] = []
-        self.frames: list[Frame] = []
+        self.publications: list[Publication] = []
         self.session = Session(Twin(SCENE, excitation="sampled"), on_entry=self.emitted.append)
 
     def apply(self, entries: list[Entry], take: bool = True) -> Run:
         for entry in entries:
             self.session.apply(entry)
-            frame = self.session.outputs.take() if take else None
-            if frame is not None:
-                self.frames.append(frame)
+            publication = self.session.outputs.take() if take else None
+            if publication is not None:
+                self.publications.append(publication)
         return self
 
 
-def _bits(frame: Frame) -> bytes:
-    parts = [frame.penetration, frame.rate, frame.force, frame.touches, frame.impulse, frame.peak, frame.q, frame.v]
-    if frame.slow is not None:
-        parts += [frame.slow.clearance, frame.slow.wear_rate]
-    return frame.stamp_ns.to_bytes(8, "little") + b"".join(part.tobytes() for part in parts)
+def _bits(publication: Publication) -> bytes:
+    parts = [
+        publication.penetration,
+        publication.rate,
+        publication.force,
+        publication.makes,
+        publication.impulse,
+        publication.peak,
+        publication.q,
+        publication.v,
+    ]
+    if publication.slow is not None:
+        parts += [publication.slow.clearance, publication.slow.wear_rate]
+    return publication.stamp_ns.to_bytes(8, "little") + b"".join(part.tobytes() for part in parts)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +91,9 @@ def test_the_emitted_journal_repeats_the_run_bit_for_bit(reference: Run) -> None
     emitted = reference.emitted
     again = Run().apply([entry for entry in emitted if not isinstance(entry, Snapshot)])
     again.session.close()
-    assert [_bits(frame) for frame in again.frames] == [_bits(frame) for frame in reference.frames]
+    assert [_bits(publication) for publication in again.publications] == [
+        _bits(publication) for publication in reference.publications
+    ]
     assert again.emitted == [entry for entry in emitted if not isinstance(entry, Snapshot)]
     digests = [entry for entry in emitted if isinstance(entry, Digest)]
     assert len(digests) == (STEPS + 2) // DIGEST_INTERVAL + 1
@@ -112,12 +123,12 @@ def test_one_flipped_bit_of_a_sample_shows_in_the_next_digest(reference: Run) ->
 def test_frames_carry_the_twins_own_numbers(reference: Run) -> None:
     twin = Twin(SCENE, excitation="sampled")
     series = twin.advance_samples(np.arange(200) * 2 * MS * 1e-9, WRENCH[:200])
-    for index, frame in enumerate(reference.frames[:200]):
+    for index, publication in enumerate(reference.publications[:200]):
         for name in ("penetration", "rate", "force", "impulse", "peak", "q", "v"):
-            assert getattr(frame, name).tobytes() == getattr(series, name)[index].tobytes()
+            assert getattr(publication, name).tobytes() == getattr(series, name)[index].tobytes()
     touches = np.cumsum(series.makes, axis=0)
     assert touches[-1].sum() > 0
-    assert (np.array([frame.touches for frame in reference.frames[:200]]) == touches).all()
+    assert (np.array([publication.makes for publication in reference.publications[:200]]) == touches).all()
 
 
 @settings(max_examples=8)
@@ -130,22 +141,24 @@ def test_nothing_is_lost_however_rarely_frames_are_taken(cuts: set[int]) -> None
     for begin, end in itertools.pairwise(bounds):
         rare.apply(entries[begin : end - 1], take=False)
         rare.apply(entries[end - 1 : end])
-    assert len(rare.frames) == len(bounds) - 1
-    assert (rare.frames[-1].touches == every.frames[-1].touches).all()
-    for frame, begin, end in zip(rare.frames, bounds, bounds[1:], strict=False):
-        part = every.frames[begin:end]
-        assert (frame.peak == np.max([single.peak for single in part], axis=0)).all()
-        np.testing.assert_allclose(frame.impulse, np.sum([single.impulse for single in part], axis=0), rtol=1e-12)
-        assert _bits(frame)[:200] == _bits(part[-1])[:200]
+    assert len(rare.publications) == len(bounds) - 1
+    assert (rare.publications[-1].makes == every.publications[-1].makes).all()
+    for publication, begin, end in zip(rare.publications, bounds, bounds[1:], strict=False):
+        part = every.publications[begin:end]
+        assert (publication.peak == np.max([single.peak for single in part], axis=0)).all()
+        np.testing.assert_allclose(publication.impulse, np.sum([single.impulse for single in part], axis=0), rtol=1e-12)
+        assert _bits(publication)[:200] == _bits(part[-1])[:200]
 
 
 @pytest.mark.parametrize("at", [0, 1, 333, 801])
 def test_a_snapshot_goes_on_with_the_same_bits(reference: Run, at: int) -> None:
     before = Run().apply(_entries()[:at])
     after = Run().apply([Loss(at), before.session.snapshot(), *_entries()[at:]])
-    # an entry that makes no advance makes no frame
-    frames = reference.frames[len(before.frames) :]
-    assert [_bits(frame) for frame in after.frames] == [_bits(frame) for frame in frames]
+    # an entry that makes no advance makes no publication
+    publications = reference.publications[len(before.publications) :]
+    assert [_bits(publication) for publication in after.publications] == [
+        _bits(publication) for publication in publications
+    ]
     assert after.session.twin.digest() == reference.session.twin.digest()
 
 
@@ -163,9 +176,9 @@ def test_clearance_is_base_plus_mean_wear_of_each_side_with_the_priors_interval(
     advance = twin.advance(0.0, np.zeros(3))
     depth = np.arange(1.0, 9.0) * 1e-3
     outputs.add(T0, replace(advance, wear_depth=depth))
-    frame = outputs.take()
-    assert frame is not None and frame.slow is not None
-    named = dict(zip(CLEARANCE_NAMES, frame.slow.clearance, strict=True))
+    publication = outputs.take()
+    assert publication is not None and publication.slow is not None
+    named = dict(zip(CLEARANCE_NAMES, publication.slow.clearance, strict=True))
     # pads 1, 7 left; 3, 5 right; 0, 2 top; 4, 6 bottom
     assert named["horizontal"] == pytest.approx(0.025 + (2e-3 + 8e-3) / 2 + (4e-3 + 6e-3) / 2)
     assert named["vertical"] == pytest.approx(0.030 + (1e-3 + 3e-3) / 2 + (5e-3 + 7e-3) / 2)
@@ -182,13 +195,13 @@ def test_without_wear_the_interval_is_the_value() -> None:
 
 
 def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
-    slow = [frame for frame in reference.frames[:200] if frame.slow is not None]
-    assert [frame.stamp_ns // SLOW_PERIOD_NS for frame in slow] == sorted(
-        {frame.stamp_ns // SLOW_PERIOD_NS for frame in reference.frames[:200]}
+    slow = [publication for publication in reference.publications[:200] if publication.slow is not None]
+    assert [publication.stamp_ns // SLOW_PERIOD_NS for publication in slow] == sorted(
+        {publication.stamp_ns // SLOW_PERIOD_NS for publication in reference.publications[:200]}
     )
     for before, after in itertools.pairwise(slow):
         assert before.slow is not None and after.slow is not None
         grown = after.slow.clearance[2:10] - before.slow.clearance[2:10]
         seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
         np.testing.assert_allclose(after.slow.wear_rate * seconds, grown, atol=1e-18)
-    assert max(frame.slow.wear_rate.max() for frame in slow if frame.slow is not None) > 0.0
+    assert max(publication.slow.wear_rate.max() for publication in slow if publication.slow is not None) > 0.0

@@ -16,14 +16,14 @@ from plow_twin.cli.app import run
 from plow_twin.model.scene import Mark
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.study.calibration.calibrate import Calibration, Search, calibrate
-from plow_twin.study.members import run_members
 from plow_twin.study.calibration.objective import RecordingObjective, TargetObjective
-from plow_twin.study.parameters import StudyError, with_parameters
 from plow_twin.study.calibration.pose_recording import PoseRecording, load_poses
-from plow_twin.study.statistics import statistic
 from plow_twin.study.calibration.targets import Target, TargetSet, load_targets
 from plow_twin.study.calibration.uniqueness import identifiability, near_optimal
 from plow_twin.study.calibration.unknowns import Space, parse_unknown
+from plow_twin.study.members import run_members
+from plow_twin.study.parameters import StudyError, with_parameters
+from plow_twin.study.statistics import statistic
 
 #: Of a scene that is not the preset: stiffness, damping, a phase, a clearance and a sign.
 TRUTH = {

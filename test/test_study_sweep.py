@@ -21,8 +21,8 @@ from plow_twin.errors import SceneError
 from plow_twin.scene_file import dump_scene
 from plow_twin.study.parameters import StudyError, parameter_of, parameter_paths, with_parameters
 from plow_twin.study.store import Store
-from plow_twin.study.sweep.table import Sweep, parse_axis
 from plow_twin.study.sweep.run import run_here, run_on_cluster
+from plow_twin.study.sweep.table import Sweep, parse_axis
 
 GRID = ["--x", "clearance.horizontal_m=0.020:0.030:5", "--y", "contact.stiffness=6e6:6e7:3:log"]
 STATISTICS = (

@@ -15,10 +15,10 @@ from rerun.chunk import RrdReader
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Wear
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import FileStatus
 from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Travel
 from plow_twin.view import ViewSummary, to_rrd
 from plow_twin.view.section import ARROW_MM_PER_N, Section

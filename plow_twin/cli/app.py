@@ -9,6 +9,7 @@ from typing import Final, NoReturn
 
 import click
 
+from plow_twin.build import package_version
 from plow_twin.cli.console import FAILED, WRONG_INPUT
 from plow_twin.cli.demo import demo
 from plow_twin.cli.info import info
@@ -17,7 +18,6 @@ from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
 from plow_twin.cli.view import view
 from plow_twin.errors import PlowTwinError, SceneError
-from plow_twin.record.header import package_version
 
 #: Extra of the package that brings a module.
 EXTRA_OF_MODULE: Final = {

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, table
-from plow_twin.scene_file.presets import PRESETS, scene_path
+from plow_twin.scene_file.presets import PRESETS
 
 
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 a recording with loss.")
@@ -37,8 +37,8 @@ def _show(facts: dict[str, Any], as_json: bool) -> int:
 def _environment() -> dict[str, Any]:
     from importlib.metadata import PackageNotFoundError, version
 
+    from plow_twin.build import build_fingerprint
     from plow_twin.scene_file.presets import config_folder
-    from plow_twin.record.header import build_fingerprint
 
     facts: dict[str, Any] = dict(build_fingerprint())
     core = ("scipy", "click", "rich", "PyYAML", "jsonschema")
@@ -55,7 +55,7 @@ def _scene(target: str, as_json: bool) -> int:
     from plow_twin.cli.scene_facts import derived, numbers
     from plow_twin.scene_file import load_scene
 
-    scene = load_scene(scene_path(target))
+    scene = load_scene(target)
     rows, facts = numbers(scene), derived(scene)
     if as_json:
         click.echo(json.dumps({"numbers": rows, "derived": facts}, indent=2))

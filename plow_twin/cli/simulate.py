@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from plow_twin.cli.console import DONE, POSITIVE, busy, json_option, kilonewton, output_console, quiet_option, table
-from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,7 +37,13 @@ MOST_ROWS: Final = 10_000_000
     help="events: every touch located; rk4, euler: fixed steps for comparison.",
 )
 @click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
-@click.option("--audit", is_flag=True, help="Keep the books of energy and momentum; costs about as much as the run.")
+@click.option(
+    "--energy-balance",
+    "--audit",
+    "energy_balance",
+    is_flag=True,
+    help="Balance energy and momentum; costs about as much as the run.",
+)
 @quiet_option
 def simulate(
     scene: str,
@@ -49,13 +54,13 @@ def simulate(
     as_json: bool,
     method: str,
     dt: float | None,
-    audit: bool,
+    energy_balance: bool,
     quiet: bool,
 ) -> int:
     """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc."""
     _check_usage(out, method, dt)
     _check_rows(t_end, output_dt)
-    result = _run(scene, quiet, t_end, output_dt, tol, method, dt, audit)
+    result = _run(scene, quiet, t_end, output_dt, tol, method, dt, energy_balance)
     if out is not None:
         try:
             write_samples(result, out)
@@ -70,10 +75,10 @@ def simulate(
 
 def _run(scene: str, quiet: bool, t_end: float, *settings: Any) -> Result:
     from plow_twin.errors import SceneError
-    from plow_twin.scene_file import load_scene
     from plow_twin.run.simulate import simulate as run
+    from plow_twin.scene_file import load_scene
 
-    model = load_scene(scene_path(scene))
+    model = load_scene(scene)
     try:
         with busy(f"simulating {t_end:g} s (the first run compiles)", quiet):
             return run(model, t_end, *settings)
@@ -138,18 +143,18 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
         "solver": _plain(result.solver),
         "wall_s": float(result.wall_s),
         "compile_s": float(result.compile_s),
-        **({} if result.energy_balance is None else {"audit": _plain(energy_balance_of(result.energy_balance))}),
+        **({} if result.energy_balance is None else {"energy_balance": _plain(balance_of(result.energy_balance))}),
     }
 
 
-def energy_balance_of(books: EnergyBalance) -> dict[str, Any]:
-    """Return the books as plain numbers and lists, with the imbalance over the turnover."""
+def balance_of(balance: EnergyBalance) -> dict[str, Any]:
+    """Return the balance as plain numbers and lists, with the imbalance over the turnover."""
     from dataclasses import asdict
 
     import numpy as np
 
-    plain = {key: np.asarray(value).tolist() for key, value in asdict(books).items()}
-    return {**plain, "relative_imbalance": books.relative_imbalance}
+    plain = {key: np.asarray(value).tolist() for key, value in asdict(balance).items()}
+    return {**plain, "relative_imbalance": balance.relative_imbalance}
 
 
 def _plain(value: Any) -> Any:
@@ -158,22 +163,22 @@ def _plain(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else value
 
 
-def _audit_table(books: EnergyBalance) -> Table:
-    rows = table("books of energy", "what", "J")
-    kinetic, stored = (end - start for start, end in (books.kinetic_j, books.stored_j))
+def _balance_table(balance: EnergyBalance) -> Table:
+    rows = table("balance of energy", "what", "J")
+    kinetic, stored = (end - start for start, end in (balance.kinetic_j, balance.stored_j))
     for name, value in (
-        ("work of the loads", books.load_work_j),
-        ("work of gravity", books.gravity_work_j),
-        ("- dissipated in contacts", -books.dissipated_j),
-        ("- dissipated by friction", -books.friction_work_j),
+        ("work of the loads", balance.load_work_j),
+        ("work of gravity", balance.gravity_work_j),
+        ("- dissipated in contacts", -balance.dissipated_j),
+        ("- dissipated by friction", -balance.friction_work_j),
         ("- stored in contacts at the end, more than at the start", -stored),
         ("= kinetic energy gained", kinetic),
     ):
         rows.add_row(name, f"{value + 0.0:.6g}")  # no -0
-    rows.add_row("largest imbalance on the way", f"{books.imbalance_j:.3g}")
-    rows.add_row("the same over the turnover", f"{books.relative_imbalance:.1e}")
+    rows.add_row("largest imbalance on the way", f"{balance.imbalance_j:.3g}")
+    rows.add_row("the same over the turnover", f"{balance.relative_imbalance:.1e}")
     rows.add_row(
-        "largest imbalance of momentum [N s, N s, N m s]", " ".join(f"{v:.1e}" for v in books.momentum_imbalance)
+        "largest imbalance of momentum [N s, N s, N m s]", " ".join(f"{v:.1e}" for v in balance.momentum_imbalance)
     )
     return rows
 
@@ -199,6 +204,6 @@ def _print_statistics(result: Result, scene: str, t_end: float) -> None:
         sets.add_row(name, f"{ccw.get(name, 0.0):.1%}", f"{cw.get(name, 0.0):.1%}")
     console.print(sets)
     if result.energy_balance is not None:
-        console.print(_audit_table(result.energy_balance))
+        console.print(_balance_table(result.energy_balance))
     solver = ", ".join(f"{key} {value}" for key, value in result.solver.items())
     console.print(f"{solver}; {result.wall_s * 1e3:.1f} ms, compiled in {result.compile_s:.1f} s", highlight=False)

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.scene_file.presets import scene_path
-
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
@@ -44,5 +42,5 @@ def study_scene(name: str, settings: Sequence[str]) -> Scene:
     from plow_twin.scene_file import load_scene
     from plow_twin.study.parameters import parse_settings, with_parameters
 
-    scene = load_scene(scene_path(name))
+    scene = load_scene(name)
     return with_parameters(scene, parse_settings(scene, settings)) if settings else scene

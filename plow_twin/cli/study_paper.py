@@ -10,7 +10,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option
-from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
     from plow_twin.study.paper.study import PaperStudy
@@ -43,15 +42,15 @@ def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: b
     JSON and CSV, the plots, and the run as MCAP recording and .rrd.
     """
     from plow_twin.scene_file import load_scene
-    from plow_twin.study.paper.study import study_paper
     from plow_twin.study.paper.runs import LONGEST_S, SHORTEST_S
+    from plow_twin.study.paper.study import study_paper
 
     if not SHORTEST_S <= t_end <= LONGEST_S:
         message = f"got {t_end:g} s, expected {SHORTEST_S:.4f} s (two periods of the load) to {LONGEST_S:g} s"
         raise click.BadParameter(message, param_hint="--t-end")
     if out.exists() and any(out.iterdir()):
         raise click.BadParameter(f"got {str(out)!r}, which is not empty, expected a new folder", param_hint="--out")
-    model = load_scene(scene_path(scene))
+    model = load_scene(scene)
     with progress("the paper's figures (the first run compiles)", quiet) as on_progress:
         study = study_paper(model, scene, out, t_end, workers, recording, on_progress)
     if study.runs.failed:

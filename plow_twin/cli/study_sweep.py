@@ -71,8 +71,8 @@ def sweep(
     from plow_twin.scene_file import dump_scene
     from plow_twin.study.report import require
     from plow_twin.study.store import Store
-    from plow_twin.study.sweep.table import Sweep, parse_axis
     from plow_twin.study.sweep.output import draw, write_parquet
+    from plow_twin.study.sweep.table import Sweep, parse_axis
 
     require("matplotlib", "pyarrow", *(["distributed"] if dask else []))
     with usage_errors():

@@ -17,11 +17,15 @@ import numba
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
 
+#: Rooms that hold compiled functions, with all their folders.
+KERNEL_FOLDERS: Final = ("kernel", "model", "solve")
+
+
 def _source_digest() -> str:
     package = Path(__file__).resolve().parent.parent
     digest = hashlib.blake2b(digest_size=16)
-    for folder in ("model", "solve"):
-        for source in sorted((package / folder).glob("*.py")):
+    for folder in KERNEL_FOLDERS:
+        for source in sorted((package / folder).rglob("*.py")):
             digest.update(source.read_bytes())
     return digest.hexdigest()
 

@@ -6,13 +6,17 @@ halving the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.state import MAX_HALVINGS
 
 Array = NDArray[np.float64]
+
+#: Halvings of an interval, at most, when a root or a maximum is isolated.
+MAX_HALVINGS: Final = 48
 
 
 @kernel()

@@ -20,7 +20,13 @@ from plow_twin.kernel.simd import row, splat
 
 @kernel(inline=True)
 def free_force(
-    penetration: float, rate: float, stiffness: float, exponent: float, damping_factor: float, viscous: float, ramp: float
+    penetration: float,
+    rate: float,
+    stiffness: float,
+    exponent: float,
+    damping_factor: float,
+    viscous: float,
+    ramp: float,
 ) -> float:
     """Return the law's F in N for penetration d in m and rate d' in m/s, negative where it would pull.
 
@@ -35,7 +41,13 @@ def free_force(
 
 @kernel(inline=True)
 def normal_force(
-    penetration: float, rate: float, stiffness: float, exponent: float, damping_factor: float, viscous: float, ramp: float
+    penetration: float,
+    rate: float,
+    stiffness: float,
+    exponent: float,
+    damping_factor: float,
+    viscous: float,
+    ramp: float,
 ) -> float:
     """Return F >= 0 in N: a contact never pulls, nor acts from outside (`free_force`)."""
     if penetration <= 0.0:

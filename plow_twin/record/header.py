@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Any, Final
 
+from plow_twin.build import build_fingerprint, package_version
 from plow_twin.errors import RecordingError
 from plow_twin.stream.journal import ParameterValue
 
@@ -28,50 +24,6 @@ READABLE_VERSIONS: Final = ("1", "2")
 
 #: Keys that version 1 lacks; their defaults say what was so then.
 _SINCE_VERSION_2: Final = ("record_outputs", "part")
-
-#: Folders and files whose code decides the bits of a run.
-_NUMERIC_SOURCES: Final = ("model", "solve", "twin.py", "stream/session.py", "stream/outputs.py", "record/outputs.py")
-
-
-@cache
-def build_fingerprint() -> Mapping[str, str]:
-    """Return what the exact bits of a run depend on: versions, processor, platform, a hash of the numeric sources."""
-    import llvmlite.binding
-    import numba
-
-    return {
-        "plow_twin": package_version(),
-        "source": _source_hash(),
-        "python": platform.python_version(),
-        "numpy": version("numpy"),
-        "numba": version("numba"),
-        "llvmlite": version("llvmlite"),
-        "jit": "off" if getattr(numba.config, "DISABLE_JIT", 0) else "on",
-        "cpu": llvmlite.binding.get_host_cpu_name(),
-        "platform": f"{platform.system()} {platform.machine()}",
-        "libc": " ".join(platform.libc_ver()),
-    }
-
-
-def package_version() -> str:
-    """Return the version of the installed package."""
-    for name in ("plow_twin", "plow-twin"):
-        try:
-            return version(name)
-        except PackageNotFoundError:
-            continue
-    return "not installed"
-
-
-def _source_hash() -> str:
-    root = Path(__file__).resolve().parent.parent
-    digest = hashlib.sha256()
-    for name in _NUMERIC_SOURCES:
-        part = root / name
-        for path in sorted(part.glob("*.py")) if part.is_dir() else [part]:
-            if path.exists():
-                digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True)

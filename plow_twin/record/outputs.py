@@ -14,7 +14,7 @@ from plow_twin.record.template import Template, compiled
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 
 if TYPE_CHECKING:
-    from plow_twin.stream.outputs import Publication, Frames
+    from plow_twin.stream.outputs import Publication, Publications
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ SLOW_TOPICS: Final = frozenset({"clearance", "wear_rate"})
 
 
 def publication_messages(publication: Publication, frame_id: str, child_frame_id: str) -> dict[str, Message]:
-    """Return the messages of a publication by the base name of their topic; the slow ones only when the publication has them."""
+    """Return the messages of a publication by the base name of their topic; the slow ones only when it has them."""
     messages: dict[str, Message] = {
         "contact_forces": contact_forces(publication, frame_id),
         "contact_peaks": contact_peaks(publication, frame_id),
@@ -39,8 +39,8 @@ def publication_messages(publication: Publication, frame_id: str, child_frame_id
     return messages
 
 
-def frame_templates(frame_id: str, child_frame_id: str) -> dict[str, Template]:
-    """Return, by base name of the topic, the template whose numbers are the columns of `frame_numbers`."""
+def publication_templates(frame_id: str, child_frame_id: str) -> dict[str, Template]:
+    """Return, by base name of the topic, the template whose numbers are the columns of `publication_numbers`."""
 
     def joints(values: Array) -> Message:
         return JointState(0, frame_id, PAIR_NAMES, *values.reshape(3, PAIR_COUNT))
@@ -60,14 +60,20 @@ def frame_templates(frame_id: str, child_frame_id: str) -> dict[str, Template]:
     }
 
 
-def frame_numbers(publications: Frames) -> dict[str, tuple[NDArray[np.int64], Array]]:
+def publication_numbers(publications: Publications) -> dict[str, tuple[NDArray[np.int64], Array]]:
     """Return, by base name of the topic, stamps (n,) and numbers (n, k) of the messages of many publications."""
     stamps, slow = publications.stamp_ns, publications.stamp_ns[publications.slow_index]
     motion = np.empty((len(publications), 7))
     head_numbers(publications.q, publications.v, motion)
     return {
-        "contact_forces": (stamps, np.concatenate((publications.penetration, publications.rate, publications.force), axis=1)),
-        "contact_peaks": (stamps, np.concatenate((publications.makes, publications.impulse, publications.peak), axis=1)),
+        "contact_forces": (
+            stamps,
+            np.concatenate((publications.penetration, publications.rate, publications.force), axis=1),
+        ),
+        "contact_peaks": (
+            stamps,
+            np.concatenate((publications.makes, publications.impulse, publications.peak), axis=1),
+        ),
         "head_state": (stamps, motion),
         "clearance": (slow, publications.clearance),
         "wear_rate": (slow, publications.wear_rate),
@@ -87,12 +93,21 @@ def head_numbers(q, v, out):  # type: ignore[no-untyped-def]
 
 def contact_forces(publication: Publication, frame_id: str) -> JointState:
     """Return penetration [m] as position, its rate [m/s] as velocity and force [N] as effort, all at the stamp."""
-    return JointState(publication.stamp_ns, frame_id, PAIR_NAMES, publication.penetration, publication.rate, publication.force)
+    return JointState(
+        publication.stamp_ns, frame_id, PAIR_NAMES, publication.penetration, publication.rate, publication.force
+    )
 
 
 def contact_peaks(publication: Publication, frame_id: str) -> JointState:
     """Return all makes so far as position, impulse [N s] as velocity and peak force [N] as effort since the last."""
-    return JointState(publication.stamp_ns, frame_id, PAIR_NAMES, publication.makes.astype(np.float64), publication.impulse, publication.peak)
+    return JointState(
+        publication.stamp_ns,
+        frame_id,
+        PAIR_NAMES,
+        publication.makes.astype(np.float64),
+        publication.impulse,
+        publication.peak,
+    )
 
 
 def head_state(publication: Publication, frame_id: str, child_frame_id: str) -> Odometry:

@@ -1,4 +1,4 @@
-"""The recorder of a live node: takes entries and frames without ever waiting, writes them in a thread of its own.
+"""The recorder of a live node: takes entries and publications without ever waiting, writes them in a thread of its own.
 
 The caller's cost is a clock reading and an append. The thread looks at the queue some times a second, lays many
 messages into their chunk in one compiled call and compresses them: both hold no interpreter lock. When it falls behind,
@@ -24,7 +24,7 @@ from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS
 from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
-from plow_twin.stream.outputs import Publication, Frames
+from plow_twin.stream.outputs import Publication, Publications
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
@@ -118,11 +118,11 @@ class Recorder:
         warm_up_writer(header)
         self._writer = RunWriter(Path(path), header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
-        self._frame_topics = {name: header.topic(name) for name in FRAME_TOPICS}
+        self._publication_topics = {name: header.topic(name) for name in FRAME_TOPICS}
         self._limits = (part_bytes, part_s, keep_bytes)
         self._split_due = False
         self._part_since = time.monotonic()
-        self._queue: deque[_EntryItem | _OutputItem | _FrameItem] = deque()
+        self._queue: deque[_EntryItem | _OutputItem | _PublicationItem] = deque()
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
@@ -194,24 +194,24 @@ class Recorder:
             self._lost[topic] += 1
             return False
 
-    def frame(self, frame: Frame) -> bool:
-        """Take all messages of a frame that was sent; False when they were lost."""
+    def publication(self, publication: Publication) -> bool:
+        """Take all messages of a publication that was sent; False when they were lost."""
         now = self._now_ns()
-        topics = self._frame_topics
+        topics = self._publication_topics
         with self._lock:
             if self._room(1 + len(topics), self._queue_size * 3 // 4):
                 for name, topic in topics.items():
                     gap = (
                         self._output_gaps
-                        and (frame.slow or name not in SLOW_TOPICS)
+                        and (publication.slow or name not in SLOW_TOPICS)
                         and self._output_gaps.pop(topic, 0)
                     )
                     if gap:
                         self._push_entry(now, Dropped(topic, gap))
-                self._queue.append(_FrameItem(self._sequence, now, frame))
+                self._queue.append(_PublicationItem(self._sequence, now, publication))
                 return True
             self._snapshot_due = True
-            lost = [topic for name, topic in topics.items() if frame.slow or name not in SLOW_TOPICS]
+            lost = [topic for name, topic in topics.items() if publication.slow or name not in SLOW_TOPICS]
             self._output_gaps.update(lost)
             self._lost.update(lost)
             return False
@@ -280,32 +280,32 @@ class Recorder:
             items = [self._queue.popleft() for _ in range(min(backlog, _BURST))]
             backlog -= len(items)
             for item in items:
-                self._unflushed.update(item.keys(self._frame_topics))
+                self._unflushed.update(item.keys(self._publication_topics))
             self._write(items)
             self._written += len(items)
             time.sleep(1e-6)
 
-    def _write(self, items: list[_EntryItem | _OutputItem | _FrameItem]) -> None:
+    def _write(self, items: list[_EntryItem | _OutputItem | _PublicationItem]) -> None:
         """Write items in order, alike ones that follow each other at once; journal and outputs have orders apart."""
         samples: list[_EntryItem] = []
-        frames: list[_FrameItem] = []
+        publications: list[_PublicationItem] = []
         for item in items:
-            if isinstance(item, _FrameItem):
-                frames.append(item)
+            if isinstance(item, _PublicationItem):
+                publications.append(item)
             elif isinstance(item, _EntryItem) and isinstance(item.entry, Sample):
                 samples.append(item)
             elif isinstance(item, _EntryItem):
                 samples = self._write_samples(samples)
                 if isinstance(item.entry, Snapshot) and self._part_is_full():
-                    frames = self._write_frames(frames)
+                    publications = self._write_publications(publications)
                     self._split()
                 item.write(self._writer)
             else:
-                frames = self._write_frames(frames)
+                publications = self._write_publications(publications)
                 item.write(self._writer)
         # samples first: their chunk must not be closed behind that of messages sent after them
         self._write_samples(samples)
-        self._write_frames(frames)
+        self._write_publications(publications)
 
     def _write_samples(self, items: list[_EntryItem]) -> list[_EntryItem]:
         if items:
@@ -316,11 +316,11 @@ class Recorder:
             self._writer.write_samples(sequence, times, stamps, np.array([sample.wrench for sample in samples]))
         return []
 
-    def _write_frames(self, items: list[_FrameItem]) -> list[_FrameItem]:
+    def _write_publications(self, items: list[_PublicationItem]) -> list[_PublicationItem]:
         if items:
             sequence = np.array([item.sequence for item in items], np.int64)
             times = np.array([item.log_time_ns for item in items], np.int64)
-            self._writer.write_frames(sequence, times, Frames.of([item.frame for item in items]))
+            self._writer.write_publications(sequence, times, Publications.of([item.publication for item in items]))
         return []
 
     def _part_is_full(self) -> bool:
@@ -351,7 +351,7 @@ class Recorder:
             unwritten, self._queue = self._queue, deque()
             self._lost.update(unsafe)
             for item in unwritten:
-                self._lost.update(item.keys(self._frame_topics))
+                self._lost.update(item.keys(self._publication_topics))
         if first and self._on_error is not None:
             self._on_error(self._error)
 
@@ -364,7 +364,7 @@ class _EntryItem:
     log_time_ns: int
     entry: Entry | Dropped
 
-    def keys(self, frame_topics: Mapping[str, str]) -> list[str]:
+    def keys(self, publication_topics: Mapping[str, str]) -> list[str]:
         return [JOURNAL]
 
     def write(self, writer: RunWriter) -> None:
@@ -381,7 +381,7 @@ class _OutputItem:
     stamp_ns: int
     message: Message
 
-    def keys(self, frame_topics: Mapping[str, str]) -> list[str]:
+    def keys(self, publication_topics: Mapping[str, str]) -> list[str]:
         return [self.topic]
 
     def write(self, writer: RunWriter) -> None:
@@ -389,12 +389,12 @@ class _OutputItem:
 
 
 @dataclass(frozen=True, slots=True)
-class _FrameItem:
-    """A frame, all of whose messages are on their way to the file."""
+class _PublicationItem:
+    """A publication, all of whose messages are on their way to the file."""
 
     sequence: int
     log_time_ns: int
-    frame: Frame
+    publication: Publication
 
-    def keys(self, frame_topics: Mapping[str, str]) -> list[str]:
-        return [topic for name, topic in frame_topics.items() if self.frame.slow or name not in SLOW_TOPICS]
+    def keys(self, publication_topics: Mapping[str, str]) -> list[str]:
+        return [topic for name, topic in publication_topics.items() if self.publication.slow or name not in SLOW_TOPICS]

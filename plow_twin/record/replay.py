@@ -17,15 +17,21 @@ from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
-from plow_twin.run.advance import AdvanceSeries
+from plow_twin.build import build_fingerprint
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.cdr import decode, encode
 from plow_twin.record.chunks import scan
-from plow_twin.record.header import RunHeader, build_fingerprint
+from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS, publication_messages, frame_numbers, frame_templates
+from plow_twin.record.outputs import (
+    FRAME_TOPICS,
+    SLOW_TOPICS,
+    publication_messages,
+    publication_numbers,
+    publication_templates,
+)
 from plow_twin.record.reader import (
     Batch,
     Entries,
@@ -37,15 +43,17 @@ from plow_twin.record.reader import (
     sample_template,
 )
 from plow_twin.record.template import Bytes, Indexes, Template, differs, read_numbers
-from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot
-from plow_twin.stream.outputs import Publication, Frames
-from plow_twin.stream.session import Session
+from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
+from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot
+from plow_twin.stream.outputs import Publication, Publications
+from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
-#: Topics that depend on the frame before: after a lost message they can be compared again from the next snapshot on.
+#: Topics that depend on the publication before: after a lost message they can be compared again from the next
+#: snapshot on.
 _CUMULATIVE: Final = frozenset({"contact_peaks", "clearance", "wear_rate"})
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
@@ -125,7 +133,8 @@ def replay(
     digests_only
         Compare the digests alone; messages are not even read where they stand in chunks of their own.
     write
-        Folder for a full recording made of the journal: a frame after each advance. Only digests are compared then.
+        Folder for a full recording made of the journal, with all outputs after each advance. Only digests are compared
+        then.
 
     Raises
     ------
@@ -174,11 +183,13 @@ class _Replay:
         excitation: Any = "scene" if header.excitation_source == "scene" else "sampled"
         twin = Twin(scene, tol=header.tol, excitation=excitation)
         twin.warm_up()
-        self.templates = frame_templates(header.frame_id, header.child_frame_id)
+        self.templates = publication_templates(header.frame_id, header.child_frame_id)
         if excitation == "sampled":
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
-        self.frames: Frames | None = None  # of the last run of samples; its last frame may have messages to come
+        self.publications: Publications | None = (
+            None  # of the last run of samples; its last publication may have messages to come
+        )
         self.session = Session(twin, header.origin_ns)
         self.topics = {header.topic(name): name for name in FRAME_TOPICS}
         self.next_sequence = 0
@@ -245,7 +256,7 @@ class _Replay:
         except ValueError:  # one by one: the sample that is refused is counted
             return False
         if found.status.any():
-            # a failed advance is no part of a frame
+            # a failed advance is no part of a publication
             self.session.restore(*before)
             return False
         self.report.entries += len(entries)
@@ -261,7 +272,7 @@ class _Replay:
         ]
         self.report.digests_compared += len(digests)
         self.next_sequence = (int(entries.sequence[-1]) + 1) & _SEQUENCE_MASK
-        self.messages, self.frames = None, None
+        self.messages, self.publications = None, None
         if self.sink is not None and found.rows is not None:
             self._write_run(entries, stamps, found.rows)
             self._messages(sent, begin, end)
@@ -272,7 +283,7 @@ class _Replay:
         return True
 
     def _write_run(self, entries: Entries, stamps: Indexes, rows: AdvanceSeries) -> None:
-        """Write a run of samples and digests, and a frame after each sample."""
+        """Write a run of samples and digests, and a publication after each sample."""
         assert self.sink is not None
         begin = 0
         for end in (*sorted(entries.others), len(entries)):
@@ -285,20 +296,22 @@ class _Replay:
                 record = entries.record(end)
                 self.sink.write_entry(record.sequence, record.log_time_ns, record.entry)
             begin = end + 1
-        frames = self.session.outputs.take_rows(stamps, rows, np.arange(len(stamps)))
-        self.sink.write_frames(entries.sequence[entries.sample], entries.log_time_ns[entries.sample], frames)
+        publications = self.session.outputs.take_rows(stamps, rows, np.arange(len(stamps)))
+        self.sink.write_publications(
+            entries.sequence[entries.sample], entries.log_time_ns[entries.sample], publications
+        )
 
     def _write_entry(self, record: EntryRecord) -> None:
-        """Write an entry that has been applied, and the frame after it."""
+        """Write an entry that has been applied, and the publication after it."""
         assert self.sink is not None
         entry = record.entry
         if isinstance(entry, Snapshot) and self.synced:
-            entry = self.session.snapshot()  # with the windows of the frames that are written
+            entry = self.session.snapshot()  # with the windows of the publications that are written
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
-        frame = self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold) else None
-        if frame is not None and frame.finite:
+        publication = self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold) else None
+        if publication is not None and publication.finite:
             places = np.array([record.sequence]), np.array([record.log_time_ns])
-            self.sink.write_frames(*places, Frames.of([frame]))
+            self.sink.write_publications(*places, Publications.of([publication]))
 
     def _compare_sent(
         self,
@@ -311,27 +324,27 @@ class _Replay:
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Form the frames that were sent and compare their messages; return the differences."""
+        """Form the publications that were sent and compare their messages; return the differences."""
         after = done[sent.sequence[begin:end] - entries.sequence[0]] - 1  # row after which each was sent
         changed = np.ones(len(after), bool)
         changed[1:] = after[1:] != after[:-1]
-        taken, frame = after[changed], np.cumsum(changed) - 1
-        frames = self.session.outputs.take_rows(stamps, rows, taken)
+        taken, publication = after[changed], np.cumsum(changed) - 1
+        publications = self.session.outputs.take_rows(stamps, rows, taken)
         if len(taken) and taken[-1] == len(stamps) - 1:
-            self.frames = frames
-        numbers = frame_numbers(frames)
+            self.publications = publications
+        numbers = publication_numbers(publications)
         different: list[tuple[int, int]] = []
         for name, indexes, buffer, starts, lengths in sent.by_topic(begin, end):
             if name in _CUMULATIVE and not self.outputs_synced:
                 self.report.not_compared[name] += len(indexes)
                 continue
             self.report.compared[name] += len(indexes)
-            row = frame[indexes - begin]
+            row = publication[indexes - begin]
             if name in SLOW_TOPICS:
-                slow = np.searchsorted(frames.slow_index, row)
+                slow = np.searchsorted(publications.slow_index, row)
                 absent = (
-                    frames.slow_index[np.minimum(slow, len(frames.slow_index) - 1)] != row
-                    if len(frames.slow_index)
+                    publications.slow_index[np.minimum(slow, len(publications.slow_index) - 1)] != row
+                    if len(publications.slow_index)
                     else np.ones(len(row), bool)
                 )
                 row = np.where(absent, -1, slow)
@@ -351,20 +364,20 @@ class _Replay:
                     row[present], stamp, values, some,
                 )  # fmt: skip
                 wrong[present] = some
-            different += [(int(index), int(frame[index - begin])) for index in indexes[wrong].tolist()]
+            different += [(int(index), int(publication[index - begin])) for index in indexes[wrong].tolist()]
         found = []
         for index, place in sorted(different):
             record = sent.record(index)
-            where = self._difference(record, frames[place])
+            where = self._difference(record, publications[place])
             if where is not None:
                 step = first_step + int(taken[place])
                 found.append((step, record.publish_time_ns, self.topics[record.topic], *where))
         return found
 
-    def _difference(self, record: OutputRecord, frame: Frame) -> tuple[str, str, str] | None:
-        """Return what differs between a recorded message and that of a frame, computed as the node does."""
+    def _difference(self, record: OutputRecord, publication: Publication) -> tuple[str, str, str] | None:
+        """Return what differs between a recorded message and that of a publication, computed as the node does."""
         name = self.topics[record.topic]
-        computed = publication_messages(frame, self.header.frame_id, self.header.child_frame_id).get(name)
+        computed = publication_messages(publication, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
             return "message", "a message", "none"
         return None if encode(computed) == record.data else _first_difference(record, computed)
@@ -378,8 +391,8 @@ class _Replay:
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
             self.synced = self.outputs_synced = True  # a journal that starts at the scene's own initial state
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
-        if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one frame
-            self.messages = self.frames = None
+        if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one publication
+            self.messages = self.publications = None
         self.report.entries += 1
         match record.entry:
             case Loss(count):
@@ -441,11 +454,13 @@ class _Replay:
         if not self.synced or record.sequence != here or (name in _CUMULATIVE and not self.outputs_synced):
             self.report.not_compared[name] += 1
             return
-        if self.messages is None:  # the first message of a frame
-            frame = self.frames[len(self.frames) - 1] if self.frames else self.session.outputs.take()
-            self.frames = None
+        if self.messages is None:  # the first message of a publication
+            publication = (
+                self.publications[len(self.publications) - 1] if self.publications else self.session.outputs.take()
+            )
+            self.publications = None
             frames = (self.header.frame_id, self.header.child_frame_id)
-            self.messages = {} if frame is None else publication_messages(frame, *frames)
+            self.messages = {} if publication is None else publication_messages(publication, *frames)
         computed = self.messages.get(name)
         if computed is None and self.resumed:
             self.report.not_compared[name] += 1
@@ -557,7 +572,9 @@ def _warm_up(scene: Scene, tol: float, templates: Mapping[str, Template], *, row
         buffer, places, places, template.data, template.fixed, template.runs, places.copy(), numbers, flags
     )  # fmt: skip
     if done.rows is not None:
-        for name, (stamp, values) in frame_numbers(session.outputs.take_rows(stamps, done.rows, np.arange(2))).items():
+        for name, (stamp, values) in publication_numbers(
+            session.outputs.take_rows(stamps, done.rows, np.arange(2))
+        ).items():
             template = templates[name]
             differs(
                 buffer, places, places, template.data, template.fixed, template.runs, places, stamp, values, flags

@@ -19,11 +19,11 @@ from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile
 from plow_twin.record.messages import Message, WrenchStamped
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
-from plow_twin.record.outputs import SLOW_TOPICS, frame_numbers, frame_templates, head_numbers
+from plow_twin.record.outputs import SLOW_TOPICS, head_numbers, publication_numbers, publication_templates
 from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
 from plow_twin.stream.journal import Entry, Sample
-from plow_twin.stream.outputs import Frames
+from plow_twin.stream.outputs import Publications
 
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
@@ -73,7 +73,7 @@ class RunWriter:
         self._sync = sync
         self._journal, self._outputs = ChunkBuilder("zstd"), ChunkBuilder("lz4")
         self._sample = sample_template(header.frame_id)
-        self._frames = frame_templates(header.frame_id, header.child_frame_id)
+        self._templates = publication_templates(header.frame_id, header.child_frame_id)
         self._done: list[PartFacts] = []
         self._bytes_before = 0
         warm_up()
@@ -117,24 +117,24 @@ class RunWriter:
         )
         self._close_full_chunks()
 
-    def write_frames(self, sequence: Indexes, log_time_ns: Indexes, frames: Frames) -> None:
-        """Write the messages of many frames, each sent after journal entry number `sequence`."""
+    def write_publications(self, sequence: Indexes, log_time_ns: Indexes, publications: Publications) -> None:
+        """Write the messages of many publications, each sent after journal entry number `sequence`."""
         log_time_ns = np.maximum(log_time_ns, 0)
-        numbers = frame_numbers(frames)
-        everywhere = np.arange(len(frames))
-        rows = {name: frames.slow_index if name in SLOW_TOPICS else everywhere for name in numbers}
-        sizes = np.zeros(len(frames), np.int64)
+        numbers = publication_numbers(publications)
+        everywhere = np.arange(len(publications))
+        rows = {name: publications.slow_index if name in SLOW_TOPICS else everywhere for name in numbers}
+        sizes = np.zeros(len(publications), np.int64)
         places = {}
         for name, row in rows.items():
             places[name] = sizes[row].copy()
-            sizes[row] += MESSAGE_HEAD + len(self._frames[name])
+            sizes[row] += MESSAGE_HEAD + len(self._templates[name])
         ends = np.cumsum(sizes)
-        begin = self._outputs.reserve(int(ends[-1])) if len(frames) else 0
+        begin = self._outputs.reserve(int(ends[-1])) if len(publications) else 0
         for name, row in rows.items():
             if not len(row):
                 continue
             stamps, values = numbers[name]
-            template = self._frames[name]
+            template = self._templates[name]
             channel = self._channel(self.header.topic(name), template.message_type)
             starts = begin + (ends - sizes)[row] + places[name]
             self._outputs.add_many(
@@ -249,7 +249,7 @@ def _make_folder(folder: Path) -> None:
 def warm_up_writer(header: RunHeader) -> None:
     """Compile what lays messages into chunks, so that no compiler runs beside the first samples."""
     templates: dict[str, Any] = {"sample": sample_template(header.frame_id)}
-    templates |= frame_templates(header.frame_id, header.child_frame_id)
+    templates |= publication_templates(header.frame_id, header.child_frame_id)
     one = np.zeros(1, np.int64)
     for template in templates.values():
         builder = ChunkBuilder("zstd")

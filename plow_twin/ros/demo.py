@@ -23,7 +23,6 @@ from rich.table import Table
 from plow_twin.errors import PlowTwinError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, corner_of
 from plow_twin.model.scene import Mark, Provenance, Wear
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.ros.run_summary import SENSES, RunSummary, corner_letters, summarise
 from plow_twin.scene_file import dump_scene, load_scene
 
@@ -113,7 +112,7 @@ def _worn_scene(folder: Path) -> Path:
     """Write the paper's scene with wear switched on, so that the demo shows clearance growing."""
     wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
     assumed = Provenance(Mark.ASSUMED, "hard steel guide in coal dust, 1e-15 .. 1e-13 m^2/N; not in the paper")
-    paper = load_scene(scene_path("paper"))
+    paper = load_scene("paper")
     path = (folder / "scene.yaml").resolve()
     scene = replace(paper, wear=wear, marks={**paper.marks, "wear.coefficient_m2_n": assumed})
     path.write_text(dump_scene(scene), encoding="utf-8")
@@ -314,7 +313,7 @@ def _force_table(summary: RunSummary) -> Table:
         for mask in SENSES.values():
             pair = next(pair for pair in pairs if mask[pair])
             cells += [f"{summary.largest[pair] / 1e3:.1f}", f"{summary.mean_in_contact[pair] / 1e3:.1f}"]
-            cells.append(f"{summary.touches[pair]:.0f}")
+            cells.append(f"{summary.makes[pair]:.0f}")
         table.add_row(f"{letters[corner]} {corner.replace('_', ' ')}", *cells)
     return table
 

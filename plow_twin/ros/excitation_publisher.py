@@ -28,7 +28,6 @@ from sensor_msgs.msg import JointState
 
 from plow_twin.errors import SceneError
 from plow_twin.model.loads import compile_loads
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.ros.main import StopRequested, StopSignals, make_executor
 from plow_twin.ros.messages import set_stamp
 from plow_twin.ros.qos import LATCHED, sensor_input
@@ -162,7 +161,7 @@ def plan(scene_name: str, rate_hz: float, seconds: float) -> Plan:
         The scene cannot be used.
     """
     period_ns = round(NS_PER_S / rate_hz)
-    loads = compile_loads(load_scene(scene_path(scene_name)).loads)
+    loads = compile_loads(load_scene(scene_name).loads)
     times = np.arange(max(1, round(seconds * NS_PER_S / period_ns)), dtype=np.float64) * (period_ns * 1e-9)
     return Plan(loads.at(times), period_ns)
 

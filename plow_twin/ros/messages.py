@@ -108,7 +108,7 @@ class JointStateWriter:
 
 
 class OdometryWriter:
-    """One `Odometry` that is written over: pose in the slide's publication, twist in the head's own axes.
+    """One `Odometry` that is written over: pose in the slide's frame, twist in the head's own axes.
 
     The covariances stay zero: unknown.
     """

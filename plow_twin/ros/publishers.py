@@ -38,9 +38,11 @@ class OutputPublishers:
         self.published = 0
 
     def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
-        """Publish a publication, the forces first; `forces_sent` is called right after them."""
+        """Send a publication, the forces first; `forces_sent` is called right after them."""
         stamp = publication.stamp_ns
-        self._send("contact_forces", self._forces.write(stamp, publication.penetration, publication.rate, publication.force))
+        self._send(
+            "contact_forces", self._forces.write(stamp, publication.penetration, publication.rate, publication.force)
+        )
         forces_sent()
         self._send("contact_peaks", self._peaks.write(stamp, publication.makes, publication.impulse, publication.peak))
         self._send("head_state", self._head.write(publication))

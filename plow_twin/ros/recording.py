@@ -84,7 +84,7 @@ class Recording:
 
     def publication(self, publication: Publication) -> None:
         """Take the messages of a publication that has been published."""
-        self._recorder.frame(frame)
+        self._recorder.publication(publication)
 
     def status(self, stamp_ns: int, name: str, hardware_id: str, report: Part) -> None:
         """Take a status that has been published."""

@@ -29,8 +29,8 @@ class RunSummary:
     ----------
     largest, mean_in_contact : ndarray, shape (8,)
         Largest force, and impulse over the time in contact (known to one sample interval a touch) [N].
-    touches : ndarray, shape (8,)
-        Number of touches.
+    makes : ndarray, shape (8,)
+        Number of makes.
     contact_sets : dict
         By sense: share of the contact time in which exactly these corners carry force.
     clearance : dict
@@ -44,7 +44,7 @@ class RunSummary:
     scene: Scene
     largest: NDArray[np.float64]
     mean_in_contact: NDArray[np.float64]
-    touches: NDArray[np.float64]
+    makes: NDArray[np.float64]
     contact_sets: dict[str, dict[str, float]]
     clearance: dict[str, tuple[float, float, float]]
     wear_depth: NDArray[np.float64]
@@ -77,13 +77,13 @@ def summarise(path: Path) -> RunSummary:
         in_contact += (message.velocity > 0.0) * (message.stamp_ns - before_ns) * 1e-9
         before_ns = message.stamp_ns
     mean = np.divide(impulse, in_contact, out=np.zeros(PAIR_COUNT), where=in_contact > 0.0)
-    touches = peaks[-1].position if peaks else np.zeros(PAIR_COUNT)
+    makes = peaks[-1].position if peaks else np.zeros(PAIR_COUNT)
     clearance = dict(zip(*_named(found["clearance"]), strict=True))
     return RunSummary(
         scene,
         largest,
         mean,
-        touches,
+        makes,
         {sense: _shares(forces, mask, corner_letters(scene)) for sense, mask in SENSES.items()},
         {
             name: (clearance[name], clearance[f"{name}/p05"], clearance[f"{name}/p95"])

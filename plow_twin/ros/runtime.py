@@ -15,11 +15,11 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from plow_twin.model.scene import Scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.ros.inputs import Inputs
 from plow_twin.ros.parameters import Settings
 from plow_twin.ros.publishers import TOPICS, OutputPublishers
 from plow_twin.ros.solver_start import warm_up
+from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
@@ -27,7 +27,6 @@ from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
-from plow_twin.run.twin import Twin
 
 if TYPE_CHECKING:
     from plow_twin.ros.diagnostics import Part
@@ -65,7 +64,7 @@ class Runtime:
         self._settings = settings
         self._changed = changed
         self.sim_time: bool = node.get_parameter("use_sim_time").value
-        self.scene: Scene = load_scene(scene_path(settings.scene))
+        self.scene: Scene = load_scene(settings.scene)
         sampled = settings.excitation_source != "scene"
         node.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
         twin = Twin(self.scene, tol=settings.tolerance, excitation="sampled" if sampled else "scene")
@@ -220,8 +219,8 @@ class Runtime:
 
     def _on_samples(self, arrived: list[Arrival]) -> None:
         self._received_ns = now_ns = time.monotonic_ns()
-        for frame in self.driver.samples(arrived, now_ns):
-            self._publish(frame)
+        for publication in self.driver.samples(arrived, now_ns):
+            self._publish(publication)
         self._advanced()
 
     def _on_silence(self) -> None:
@@ -230,7 +229,7 @@ class Runtime:
         if self.driver.holds != holds:
             # what is published next answers no message
             self._received_ns = 0
-            self._publish(frame)
+            self._publish(publication)
             self._advanced()
 
     def _on_clock(self) -> None:
@@ -264,7 +263,7 @@ class Runtime:
                 time.sleep(_CATCH_UP_S)
         self._changed()
 
-    def _publish(self, frame: Frame | None) -> None:
+    def _publish(self, publication: Publication | None) -> None:
         if publication is None:
             return
         if not publication.finite:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.scene import Scene
+from plow_twin.solve.compiled_scene import CompiledScene
 from plow_twin.solve.energy_balance import FRICTION, LOAD_X, LOADS, NORMAL, BalanceSums
-from plow_twin.solve.compiled_scene import Compiled
 from plow_twin.solve.state import COS, SIN, THETA, State, X, Y
 
 Array = NDArray[np.float64]
@@ -61,7 +61,7 @@ class EnergyBalance:
         return self.imbalance_j / self.turnover_j if self.turnover_j > 0.0 else 0.0
 
 
-def energy_balance_of(compiled: Compiled, last: State, summed: BalanceSums) -> EnergyBalance:
+def energy_balance_of(compiled: CompiledScene, last: State, summed: BalanceSums) -> EnergyBalance:
     """Return the balance of a motion from its initial state to `last`."""
     sums, scene, first = summed.sums, compiled.scene, compiled.initial_state()
     gravity = _potential(scene, first) - _potential(scene, last)
@@ -90,7 +90,7 @@ def _potential(scene: Scene, state: State) -> float:
     return float(scene.head.mass_kg * scene.gravity.acceleration_m_s2 * (height + scene.gravity.arm_m * theta))
 
 
-def _stored_energy(compiled: Compiled, state: State) -> float:
+def _stored_energy(compiled: CompiledScene, state: State) -> float:
     """Return the elastic energy of all contacts in J."""
     rows, contact = compiled.params.penetration_rows, compiled.scene.contact
     penetration = rows.T @ np.array([state.y[COS], state.y[SIN], state.y[X], state.y[Y], 1.0]) - state.wear_depth

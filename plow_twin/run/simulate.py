@@ -10,15 +10,14 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
-from plow_twin.errors import ArgumentError, SolverError
+from plow_twin.errors import SolverError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
-from plow_twin.solve import loop
-from plow_twin.solve import fixed_step
+from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
+from plow_twin.solve import fixed_step, loop
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.energy_balance import BalanceSums, new_balance
-from plow_twin.solve.compiled_scene import Compiled, compile_scene
-from plow_twin.solve.state import (TOTALS, Log, State, Status, Totals, Work, new_log, new_record, new_work)
+from plow_twin.solve.state import TOTALS, Log, State, Status, Totals, Work, new_log, new_record, new_work
 
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
@@ -136,10 +135,10 @@ class Motion:
     v: Array
     penetration: Array | None = None
     force: Array | None = None
-    energy_balance: BalanceSums | None = None
+    sums: BalanceSums | None = None
 
     @staticmethod
-    def start(compiled: Compiled, q: Array, v: Array, outputs: bool = False) -> Motion:
+    def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
         """Start at the scene's initial state; rows go to q and v, shape (n, 3) each, pair outputs to new arrays."""
         eight = (len(q), PAIR_COUNT)
         pairs = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
@@ -149,20 +148,20 @@ class Motion:
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
     """Raise `ValueError` for times that no run can have."""
     if not (np.isfinite(t_end) and t_end >= 0.0):
-        raise ArgumentError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
+        raise ValueError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
     if output_dt is not None and not (np.isfinite(output_dt) and output_dt > 0.0):
-        raise ArgumentError(f"output_dt: got {output_dt!r}, expected a finite time > 0 [s]")
+        raise ValueError(f"output_dt: got {output_dt!r}, expected a finite time > 0 [s]")
     if method not in get_args(Method):
-        raise ArgumentError(f"method: got {method!r}, expected one of {', '.join(get_args(Method))}")
+        raise ValueError(f"method: got {method!r}, expected one of {', '.join(get_args(Method))}")
     if method == "events":
         if dt is not None:
-            raise ArgumentError(f"dt: got {dt!r}, expected None with method='events'")
+            raise ValueError(f"dt: got {dt!r}, expected None with method='events'")
         return
     if dt is None or not (np.isfinite(dt) and dt > 0.0):
-        raise ArgumentError(f"dt: got {dt!r}, expected a finite time > 0 [s] with method={method!r}")
+        raise ValueError(f"dt: got {dt!r}, expected a finite time > 0 [s] with method={method!r}")
     for name, value in (("t_end", t_end), ("output_dt", output_dt)):
         if value is not None and abs(value / dt - round(value / dt)) > 1e-6 * max(1.0, value / dt):
-            raise ArgumentError(f"{name}: got {value!r}, expected a whole multiple of dt = {dt!r} [s]")
+            raise ValueError(f"{name}: got {value!r}, expected a whole multiple of dt = {dt!r} [s]")
 
 
 def output_times(t_end: float, output_dt: float | None) -> Array:
@@ -177,10 +176,10 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
 
 
 def _run(
-    compiled: Compiled, times: Array, t_end: float, method: Method, dt: float | None, energy_balance: bool = False
+    compiled: CompiledScene, times: Array, t_end: float, method: Method, dt: float | None, energy_balance: bool = False
 ) -> Motion:
     motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)), outputs=True)
-    motion.energy_balance = new_balance() if energy_balance else None
+    motion.sums = new_balance() if energy_balance else None
     if dt is None:
         code, _ = run_events(compiled, motion, times, t_end, new_work(), BUDGET)
         time = float(motion.state.step_start)
@@ -193,14 +192,14 @@ def _run(
 
 
 def run_events(
-    compiled: Compiled, motion: Motion, times: Array, t_end: float, work: Work, budget: int
+    compiled: CompiledScene, motion: Motion, times: Array, t_end: float, work: Work, budget: int
 ) -> tuple[int, int]:
     """Bring a motion to `t_end` by the event-located series; return its `Status` and the number of rows written."""
     first = np.zeros(1, np.int64)
     while True:
         code = loop.integrate(
             compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, budget, first,
-            times, motion.q, motion.v, motion.penetration, motion.force, motion.energy_balance,
+            times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
         )  # fmt: skip
         if code != Status.LOG_FULL:
             return code, int(first[0])
@@ -208,14 +207,14 @@ def run_events(
 
 
 def _run_fixed(
-    compiled: Compiled, motion: Motion, steps: int, stride: int, dt: float, euler: bool
+    compiled: CompiledScene, motion: Motion, steps: int, stride: int, dt: float, euler: bool
 ) -> tuple[int, float]:
     """Bring a motion through `steps` fixed steps; return its `Status` and the time reached."""
     done = np.zeros(1, np.int64)
     while True:
         code = fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, euler, stride,
-            motion.q, motion.v, motion.penetration, motion.force, motion.energy_balance,
+            motion.q, motion.v, motion.penetration, motion.force, motion.sums,
         )  # fmt: skip
         if code != Status.LOG_FULL:
             return code, float(done[0]) * dt
@@ -231,7 +230,7 @@ def _grown(log: Log) -> Log:
 
 
 def _result(
-    compiled: Compiled,
+    compiled: CompiledScene,
     times: Array,
     t_end: float,
     tol: float,
@@ -241,7 +240,7 @@ def _result(
     wall_s: float,
     compile_s: float,
 ) -> Result:
-    scene, log, count = compiled.scene, motion.log, motion.state.count
+    scene, log, state = compiled.scene, motion.log, motion.state
     assert motion.force is not None and motion.penetration is not None
     size = int(log.length[0])
     events = np.zeros(size, EVENT_DTYPE)
@@ -256,7 +255,7 @@ def _result(
         t=times, q=motion.q, v=motion.v, force=motion.force, penetration=motion.penetration, events=events,
         statistics=statistics_of(motion.totals, t_end), contact_sets=contact_sets_of(scene, motion.totals),
         solver=solver, wear_depth=motion.state.wear_depth.copy(), wall_s=wall_s, compile_s=compile_s,
-        energy_balance=None if motion.energy_balance is None else energy_balance_of(compiled, motion.state, motion.energy_balance),
+        energy_balance=energy_balance_of(compiled, motion.state, motion.sums) if motion.sums is not None else None,
     )  # fmt: skip
 
 

@@ -17,11 +17,11 @@ def config_folder() -> Path:
     FileNotFoundError
         When the package was installed without its data files.
     """
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parent.parent
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"
     # lib/pythonX.Y/site-packages/plow_twin of pip, colcon or a user's home: share/ lies beside lib/
-    unresolved = Path(__file__).absolute().parent
+    unresolved = Path(__file__).absolute().parent.parent
     for prefix in (*package.parents, *unresolved.parents):
         folder = prefix / "share" / "plow_twin" / "config"
         if folder.is_dir():

@@ -22,6 +22,7 @@ from plow_twin.model.scene import (
     Scene,
     Table,
 )
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS
 from plow_twin.scene_file.table import read_table, sample_table
 from plow_twin.scene_file.validation import validate
@@ -44,14 +45,14 @@ def load_scene(path: str | Path) -> Scene:
     Parameters
     ----------
     path : str or Path
-        The YAML file; load tables are looked up beside it.
+        The YAML file, or the name of a preset: paper, bench_kv, bench_hc. Load tables are looked up beside it.
 
     Raises
     ------
     SceneError
         When the file cannot be read or used; it lists every problem.
     """
-    path = Path(path)
+    path = scene_path(path)
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

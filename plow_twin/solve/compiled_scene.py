@@ -8,15 +8,29 @@ from typing import Any
 
 import numpy as np
 
-from plow_twin.errors import ArgumentError
 from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import DOF_NAMES, Contact, Scene, Wear
-from plow_twin.solve.modes import settle_modes
-from plow_twin.solve.state import (HARMONIC, MAX_ORDER, PARAMS, SEGMENT, STATE, Array, Harmonics, Implicit, Params, Parts, Segments, State, Terms, new_record)
 from plow_twin.solve.method.implicit import new_implicit
+from plow_twin.solve.modes import settle_modes
+from plow_twin.solve.state import (
+    HARMONIC,
+    MAX_ORDER,
+    PARAMS,
+    SEGMENT,
+    STATE,
+    Array,
+    Harmonics,
+    Implicit,
+    Params,
+    Parts,
+    Segments,
+    State,
+    Terms,
+    new_record,
+)
 
 #: Tightest and loosest tolerance.
 TOLERANCE_RANGE = (1e-13, 1e-1)
@@ -73,7 +87,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     """
     low, high = TOLERANCE_RANGE
     if not low <= tol <= high:
-        raise ArgumentError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
+        raise ValueError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
     loads = compile_loads(() if sampled else scene.loads)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     gravity = scene.gravity.acceleration_m_s2

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 
-from plow_twin.model.contact import normal_force
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
-from plow_twin.solve.modes import any_penetrates
-from plow_twin.solve.method.flight import fly
-from plow_twin.solve.state import COS, OMEGA, ON, SIN, THETA, VX, VY, X, Y
+from plow_twin.model.contact import normal_force
 from plow_twin.solve.kinematics import row_values
+from plow_twin.solve.method.flight import fly
+from plow_twin.solve.modes import any_penetrates
+from plow_twin.solve.state import COS, OMEGA, ON, SIN, VX, VY, X, Y
 
 
 @kernel(inline=True)
@@ -21,7 +21,7 @@ def sigma_at(state, used):
     if state.beta == 0.0:
         return used
     # the root of alpha sigma + beta sigma^2 / 2 = used that suffers no cancellation
-    return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha ** 2 + 2.0 * state.beta * used, 0.0)))
+    return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * state.beta * used, 0.0)))
 
 
 @kernel(fast=True)
@@ -45,10 +45,10 @@ def evaluate(p, parts, state, w, sigma, out) -> None:
 
 @kernel(fast=True)
 def wear_depth_at(state, w, sigma, out) -> None:
-    """Write each pad's wear wear_depth at sigma of the step to `out`, shape (8,)."""
+    """Write each pad's wear depth at sigma of the step to `out`, shape (8,)."""
     wear_depth = row(state.wear_depth, 0)
     if any_penetrates(state):
-        # row 0 would be the wear_depth itself; pairs without force do not wear
+        # row 0 would be the wear depth itself; pairs without force do not wear
         order = state.order
         growth = row(w.wear, order)
         for k in range(order - 1, 0, -1):
@@ -57,22 +57,15 @@ def wear_depth_at(state, w, sigma, out) -> None:
     set_row(out, 0, wear_depth)
 
 
-@kernel()
-def pose_of(p, y, offset, q, v) -> None:
-    """Write pose and rate of the cavity's centre in world axes from body coordinates; inverse of `body_state`."""
-    c, s, x, yy, vx, vy, om = y[COS], y[SIN], y[0], y[1], y[VX], y[VY], y[OMEGA]
-    if offset is not None:
-        x, yy = x - p.offset[0], yy - p.offset[1]
-        vx, vy = vx + om * p.offset[1], vy - om * p.offset[0]
-    q[0], q[1], q[2] = c * x - s * yy, s * x + c * yy, y[THETA]
-    v[0], v[1], v[2] = c * vx - s * vy, s * vx + c * vy, om
-
-
 @kernel(fast=True)
 def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
-    """Write penetration, rate and force of the eight pairs in body coordinates y, worn by `wear_depth`; shape (8,) each."""
+    """Write penetration, rate and force of the eight pairs, shape (8,) each, in body coordinates y."""
     c, s, om = y[COS], y[SIN], y[OMEGA]
-    set_row(penetration, 0, row_values(p.penetration_rows, c, s, y[X], y[Y]) + (row(p.penetration_rows, 4) - row(wear_depth, 0)))
+    set_row(
+        penetration,
+        0,
+        row_values(p.penetration_rows, c, s, y[X], y[Y]) + (row(p.penetration_rows, 4) - row(wear_depth, 0)),
+    )
     set_row(rate, 0, row_values(p.penetration_rows, -om * s, om * c, y[VX] + om * y[Y], y[VY] - om * y[X]))
     for pair in range(8):
         force[pair] = 0.0

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
+from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import free_force
 from plow_twin.model.friction import friction_force
-from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.state import COS, OMEGA, ON, SIN, THETA, VX, VY
+from plow_twin.solve.kinematics import penetration_at, rate_at, row_rate, row_value, to_body_axes, to_world_axes
 from plow_twin.solve.loads import load_at
-from plow_twin.solve.kinematics import row_value, row_rate, penetration
+from plow_twin.solve.state import ON
 
 
 @kernel()
@@ -54,14 +54,15 @@ def accelerate(p, parts, frozen, state, t, z, load, out) -> None:
 @kernel()
 def _accelerate(p, offset, free, slip, frozen, state, z, load, out) -> None:
     c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
-    x, y, vx, vy = c * z[0] + s * z[1], c * z[1] - s * z[0], c * z[3] + s * z[4], c * z[4] - s * z[3]
+    x, y = to_body_axes(c, s, z[0], z[1])
+    vx, vy = to_body_axes(c, s, z[3], z[4])
     fx = fy = torque = 0.0
     for pair in range(8):
         if p.enabled[pair] == 0:
             continue
-        d = penetration(p, state.wear_depth[pair], pair, c, s, x, y)
+        d = penetration_at(p, state, pair, c, s, x, y)
         if (frozen and state.mode[pair] == ON) or (not frozen and d > 0.0):
-            r = row_rate(p.penetration_rows, pair, c, s, om, x, y, vx, vy)
+            r = rate_at(p, pair, c, s, om, x, y, vx, vy)
             f = free_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
             if not frozen:
                 f = max(f, 0.0)
@@ -70,28 +71,12 @@ def _accelerate(p, offset, free, slip, frozen, state, z, load, out) -> None:
             fy += push_y
             torque += moment
     out[0], out[1], out[2] = z[3], z[4], z[5]
-    out[3] = load[0] + (c * fx - s * fy) * p.inverse_mass
-    out[4] = load[1] + (s * fx + c * fy) * p.inverse_mass
+    along_x, along_y = to_world_axes(c, s, fx, fy)
+    out[3] = load[0] + along_x * p.inverse_mass
+    out[4] = load[1] + along_y * p.inverse_mass
     out[5] = load[2] + torque * p.inverse_inertia
     if offset is not None:
         out[5] += about_mass(p, c, s, load)
     if free is not None:
         for j in range(3):
             out[3 + j] *= p.free[j]
-
-
-@kernel()
-def to_body(z, y) -> None:
-    """Write body coordinates from z."""
-    c, s = math.cos(z[2]), math.sin(z[2])
-    y[0], y[1] = c * z[0] + s * z[1], c * z[1] - s * z[0]
-    y[VX], y[VY], y[OMEGA] = c * z[3] + s * z[4], c * z[4] - s * z[3], z[5]
-    y[COS], y[SIN], y[THETA] = c, s, z[2]
-
-
-@kernel()
-def to_world(y, z) -> None:
-    """Write z from body coordinates."""
-    c, s = y[COS], y[SIN]
-    z[0], z[1], z[2] = c * y[0] - s * y[1], s * y[0] + c * y[1], y[THETA]
-    z[3], z[4], z[5] = c * y[VX] - s * y[VY], s * y[VX] + c * y[VY], y[OMEGA]

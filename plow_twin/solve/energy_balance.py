@@ -1,4 +1,4 @@
-"""The audit of a run: is the change of energy and momentum what the forces did?
+"""The energy balance of a run: is the change of energy and momentum what the forces did?
 
 Forces are evaluated anew as values, not taken from the series: loads at their time, contacts by `model.contact` and
 `model.friction`. Their power and impulse are integrated by Gauss-Legendre quadrature over each step of the series, by
@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
-from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Array, new_record
-from plow_twin.solve.loads import load_at
-from plow_twin.solve.dynamics import about_mass, push
+from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.solve.dense_output import evaluate, pair_outputs, wear_depth_at
+from plow_twin.solve.dynamics import about_mass, push
+from plow_twin.solve.kinematics import to_world_axes
+from plow_twin.solve.loads import load_at
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Array, new_record
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
 _NODES = 24
@@ -48,7 +49,7 @@ class BalanceSums(NamedTuple):
     now: Array  #: (SIZE,) powers and forces at one instant
     before: Array  #: (SIZE,) the same a step before
     body: Array  #: (8,) body coordinates at a node
-    wear_depth: Array  #: (8,) wear wear_depth at a node
+    wear_depth: Array  #: (8,) wear depth at a node
     pairs: Array  #: (3, 8) penetration, rate, force
     sums: np.record
 
@@ -89,12 +90,14 @@ def _powers_under(p, offset, free, slip, state, wear_depth, y, load, pairs, out)
         torque += moment
         out[NORMAL] += force * pairs[1, pair]
         out[FRICTION] += power
-    out[CONTACT_X], out[CONTACT_Y], out[CONTACT_M] = c * fx - s * fy, s * fx + c * fy, torque
+    out[CONTACT_X], out[CONTACT_Y] = to_world_axes(c, s, fx, fy)
+    out[CONTACT_M] = torque
     if free is not None:
         for j in range(3):
             load[j] *= p.free[j]
             out[CONTACT_X + j] *= p.free[j]
-    out[LOADS] = load[0] * (c * y[VX] - s * y[VY]) + load[1] * (s * y[VX] + c * y[VY]) + load[2] * om
+    vx, vy = to_world_axes(c, s, y[VX], y[VY])
+    out[LOADS] = load[0] * vx + load[1] * vy + load[2] * om
 
 
 @kernel()
@@ -104,8 +107,8 @@ def _balance(p, y, balance, start) -> None:
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
     c, s = math.cos(y[THETA]), math.sin(y[THETA])
     sums.energy[1] = 0.5 * m * (y[VX] * y[VX] + y[VY] * y[VY]) + 0.5 * inertia * y[OMEGA] * y[OMEGA]
-    sums.momentum[1, 0] = m * (c * y[VX] - s * y[VY])
-    sums.momentum[1, 1] = m * (s * y[VX] + c * y[VY])
+    vx, vy = to_world_axes(c, s, y[VX], y[VY])
+    sums.momentum[1, 0], sums.momentum[1, 1] = m * vx, m * vy
     sums.momentum[1, 2] = inertia * y[OMEGA]
     if start:
         sums.energy[0] = sums.energy[1]

@@ -6,9 +6,9 @@ Guards are polynomials of the step; `polynomial.first_root` finds where one turn
 from __future__ import annotations
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.polynomial import first_root, first_root_within
 from plow_twin.kernel.simd import below, magnitude, row, set_row, splat
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
-from plow_twin.kernel.polynomial import first_root, first_root_within
 
 
 @kernel(fast=True)

@@ -9,11 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.dense_output import pair_outputs
+from plow_twin.solve.dynamics import accelerate
 from plow_twin.solve.energy_balance import balance_fixed_step, start_balance
+from plow_twin.solve.kinematics import pose_of, to_body, to_world
 from plow_twin.solve.modes import mode_inside, touch, within_range
 from plow_twin.solve.state import OFF, ON, Status
-from plow_twin.solve.dynamics import accelerate, to_body, to_world
-from plow_twin.solve.dense_output import pair_outputs, pose_of
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _LOG_FULL = int(Status.LOG_FULL)
@@ -121,7 +122,9 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
 
 
 @kernel()
-def integrate_fixed(p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force, balance) -> int:
+def integrate_fixed(
+    p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force, balance
+) -> int:
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
     z, trial = np.empty(6), np.empty(6)
     k = np.empty((4, 6))

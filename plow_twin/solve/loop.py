@@ -6,16 +6,17 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
-from plow_twin.solve.totals import add_to_totals
-from plow_twin.solve.energy_balance import start_balance, balance_step
-from plow_twin.solve.modes import within_range
+from plow_twin.solve.dense_output import evaluate, pair_outputs, sigma_at, sum_series, wear_depth_at
+from plow_twin.solve.energy_balance import balance_step, start_balance
 from plow_twin.solve.fixed_step import end_coarsely
+from plow_twin.solve.kinematics import pose_of
 from plow_twin.solve.method.flight import fly
-from plow_twin.solve.state import STATE, Status
-from plow_twin.solve.dense_output import evaluate, pair_outputs, pose_of, sigma_at, sum_series, wear_depth_at
 from plow_twin.solve.method.rest import write_rest
 from plow_twin.solve.method.taylor import one_by_one
-from plow_twin.solve.step import lay_out_step, complete_step
+from plow_twin.solve.modes import within_range
+from plow_twin.solve.state import Status
+from plow_twin.solve.step import complete_step, lay_out_step
+from plow_twin.solve.totals import add_to_totals
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
@@ -76,7 +77,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
 
 @kernel()
 def _worn_at(state, w, wear, sigma, out) -> None:
-    """Write each pad's wear wear_depth at sigma of the step under way."""
+    """Write each pad's wear depth at sigma of the step under way."""
     if wear is not None:
         wear_depth_at(state, w, sigma, out)
     else:
@@ -85,7 +86,7 @@ def _worn_at(state, w, wear, sigma, out) -> None:
 
 @kernel()
 def _worn_now(state, w, wear, out) -> None:
-    """Write each pad's wear wear_depth at the present time, also within a step."""
+    """Write each pad's wear depth at the present time, also within a step."""
     if state.step_size >= 0.0:
         _worn_at(state, w, wear, sigma_at(state, state.elapsed), out)
     else:
@@ -102,40 +103,32 @@ def _clear(totals) -> None:
 
 
 @kernel()
-def _undo(state, w, target) -> None:
-    """Let the head stay as it was before an advance, whose record has been put back, while time goes on to `target`.
+def _advance(p, parts, state, w, totals, target, stop_time, budget, bound) -> int:
+    """Proceed to `target`; when that fails, time goes on but the head stays as it was, and nothing is counted.
 
-    A step under way ends at the time before the advance: its place and wear there are in `w.saved`.
+    With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
     """
-    set_row(state.y, 0, row(w.saved, 0))
-    set_row(state.wear_depth, 0, row(w.saved, 1))
-    state.touch_time += target - state.time
-    state.step_start, state.step_size, state.elapsed, state.time = target, -1.0, 0.0, target
-
-
-@kernel()
-def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound):
-    """Proceed to `target`; return a `Status` and the steps taken.
-
-    When that fails, time goes on but the head stays as it was, and nothing is counted. `saved` is an array of one
-    record. With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
-    """
-    state = states[index]
-    saved[0] = state
-    _present(p, parts, state, w, w.saved[0])
-    _worn_now(state, w, parts.terms.wear, w.saved[1])
-    before = state.steps
-    code = _proceed(p, parts, state, w, totals, target, stop_time, before + budget)
+    saved = w.saved
+    _present(p, parts, state, w, saved[0])
+    set_row(saved, 1, row(state.damping_factor, 0))
+    set_row(saved, 2, row(state.wear_depth, 0))
+    for pair in range(8):
+        w.modes[pair] = state.mode[pair]
+    code = _proceed(p, parts, state, w, totals, target, stop_time, budget)
     if bound is not None:
         bound.error[0] = 0.0
         if code == _BUDGET:
             code = end_coarsely(p, parts, state, totals, target, bound)
-    steps = state.steps - before
     if code != _OK:
-        states[index] = saved[0]
-        _undo(state, w, target)
+        set_row(state.y, 0, row(saved, 0))
+        set_row(state.damping_factor, 0, row(saved, 1))
+        set_row(state.wear_depth, 0, row(saved, 2))
+        for pair in range(8):
+            state.mode[pair] = w.modes[pair]
+        state.step_start, state.step_size, state.elapsed, state.time = target, -1.0, 0.0, target
+        state.touching = state.events_at_once = 0
         _clear(totals)
-    return code, steps
+    return code
 
 
 @kernel()
@@ -156,7 +149,7 @@ def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, pea
 def advance_times(
     p,
     parts,
-    states,
+    state,
     w,
     totals,
     times,
@@ -175,12 +168,13 @@ def advance_times(
     error_estimate,
     bound,
 ) -> None:
-    """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
-    state, saved = states[0], np.empty(1, STATE)
+    """Advance to each time under the scene's own loads and write a row for each."""
     for i in range(times.size):
-        status[i], steps[i] = _advance(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound)
+        before = state.steps
+        status[i] = _advance(p, parts, state, w, totals, times[i], np.inf, before + budget, bound)
         if bound is not None:
             error_estimate[i] = bound.error[0]
+        steps[i] = state.steps - before
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth)
 
 
@@ -215,24 +209,53 @@ def advance_batch(
     A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
     bits alone. `work` and `totals` are arrays of one.
     """
-    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, STATE)
+    w, sums, piece = work[0], totals[0], parts.segments[0]
     for m in range(first, last):
         p, state = params[m], states[m]
         state.piece = 0
         for i in range(times.size):
+            before = state.steps
             span = times[i] - state.step_start
             piece.knot = state.step_start
             for j in range(3):
                 piece.start[j] = wrench[m, i, j]
                 piece.slope[j] = (wrench[m, i + 1, j] - wrench[m, i, j]) / span if span > 1e-100 else 0.0
-            code, steps[m, i] = _advance(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound)
-            status[m, i] = code
+            status[m, i] = _advance(p, parts, state, w, sums, times[i], times[i], before + budget, bound)
             if bound is not None:
                 error_estimate[m, i] = bound.error[0]
+            steps[m, i] = state.steps - before
             _read_row(
                 p, parts, state, w, sums, i, q[m], v[m], penetration[m], rate[m], force[m], peak[m], impulse[m],
                 makes[m], wear_depth[m],
             )  # fmt: skip
+
+
+@kernel()
+def advance_marked(params, parts, states, work, totals, times, wrench, budget, marks, saved, status, rows) -> None:
+    """Advance one twin to each time, as `advance_together` does, and save its state where `marks` say.
+
+    `marks` are numbers of advances, rising; `saved` has room for as many states. `rows` are the columns of the outputs
+    or None: then nothing is read out.
+    """
+    w, sums, piece = work[0], totals[0], parts.segments[0]
+    p, state = params[0], states[0]
+    state.step[PIECE] = 0
+    mark = 0
+    for i in range(times.size):
+        span = times[i] - state.clock[T0]
+        piece.knot = state.clock[T0]
+        for j in range(3):
+            piece.start[j] = wrench[i, j]
+            piece.slope[j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
+        status[i] = _advance(p, parts, state, w, sums, times[i], times[i], state.count[STEPS] + budget, None)
+        if rows is not None:
+            q, v, penetration, rate, force, peak, impulse, makes, wear_depth = rows
+            _read_row(p, parts, state, w, sums, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth)
+        else:
+            _clear(sums)
+        while mark < marks.size and marks[mark] == i + 1:
+            saved[mark] = states[0]
+            mark += 1
 
 
 @kernel()
@@ -266,11 +289,11 @@ def lay_out_again(p, parts, state, w) -> None:
             state.explicit_size_before,
         )
         state.overdamped = state.overdamped_before
-    for i in range(state.count.size):
-        w.counted[i] = state.count[i]
+    steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
+    recoveries, implicit_steps = state.recoveries, state.implicit_steps
     _lay_out(p, parts, state, w, np.inf)
-    for i in range(state.count.size):
-        state.count[i] = w.counted[i]
+    state.steps, state.evaluations, state.guard_roots = steps, evaluations, guard_roots
+    state.recoveries, state.implicit_steps = recoveries, implicit_steps
     state.elapsed = used
 
 

@@ -6,18 +6,29 @@ import math
 
 import numpy as np
 
-from plow_twin.model.contact import free_force
 from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.state import (ACTS, BASE, CLIPPED, COS, DAMPS, OFF, OMEGA, ON, RAMPS, RELEASED, SIN, THETA, VX, VY, X, Y)
-from plow_twin.solve.kinematics import row_rate, penetration
+from plow_twin.model.contact import free_force
+from plow_twin.solve.kinematics import penetration_of, rate_of
+from plow_twin.solve.state import (
+    ACTS,
+    BASE,
+    CLIPPED,
+    DAMPS,
+    OFF,
+    ON,
+    RAMPS,
+    RELEASED,
+    THETA,
+)
+
+#: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees.
+LARGEST_ANGLE = 0.25 * math.pi
 
 
 @kernel(inline=True)
 def penetration_and_rate(p, state, pair):
     """Return penetration and its rate of one pair at the step's start."""
-    y = state.y
-    d = penetration(p, state.wear_depth[pair], pair, y[COS], y[SIN], y[X], y[Y])
-    return d, row_rate(p.penetration_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+    return penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y)
 
 
 @kernel()
@@ -100,5 +111,5 @@ def within_range(p, state, y) -> bool:
     deepest = 0.0
     for pair in range(8):
         if p.enabled[pair] == 1:
-            deepest = max(deepest, penetration(p, state.wear_depth[pair], pair, y[COS], y[SIN], y[X], y[Y]))
-    return abs(y[THETA]) <= 0.7853981633974483 and deepest <= p.half_cavity
+            deepest = max(deepest, penetration_of(p, state, pair, y))
+    return abs(y[THETA]) <= LARGEST_ANGLE and deepest <= p.half_cavity

@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.kernel.polynomial import MAX_HALVINGS
 from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 
@@ -21,8 +22,6 @@ IntArray = NDArray[np.int64]
 
 #: Highest order of the series; the tolerance decides how many terms are used.
 MAX_ORDER: Final = 30
-#: Depth to which an interval is halved when a root or a maximum is isolated.
-MAX_HALVINGS: Final = 48
 
 # indices into Work.per_pair
 ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
@@ -38,17 +37,6 @@ RELEASED: Final = 3
 
 # indices into State.y
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
-# indices into State.clock: step's start, time into it and length; map of the series' variable to time; end of what is
-# linear; length of the step before; last touch; present time, bit for bit as it was asked for; lengths of the next
-# implicit and of the last explicit step, and both as they were before the step under way was laid out
-T0, USED, LENGTH, SIGMA, ALPHA, BETA, HARD_END, LAST_LENGTH, TOUCHED, NOW = range(10)
-IMPLICIT_LENGTH, EXPLICIT_LENGTH, WAS_IMPLICIT, WAS_EXPLICIT = range(10, 14)
-# indices into State.step; TOUCHING has a bit for each pair that touches at the step's start and needs the root map
-ORDER, EVENT_PAIR, EVENT_TO, TOUCHING, STALL, PIECE, AT_HARD_END, OVERDAMPED, WAS_OVERDAMPED, FLYING, RESTING = range(
-    11
-)
-# indices into State.count
-STEPS, COEFFICIENTS, EVENTS, GUARD_ROOTS, RECOVERIES, BOUNDED, IMPLICIT = range(7)
 
 
 class Status(IntEnum):
@@ -139,17 +127,47 @@ PARAMS: Final = _in_lines(
     ]
 )
 
-#: Everything that the future depends on, and the step under way.
+#: Everything that the future depends on, and the step under way. Times in s.
 STATE: Final = _in_lines(
     [
         ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
-        ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair
-        ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth of each pad
+        ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
+        ("wear_depth", "f8", (PAIR_COUNT,)),  # of each pad in m
         ("mode", "i8", (PAIR_COUNT,)),
         ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
-        ("clock", "f8", (14,)),
-        ("step", "i8", (11,)),
-        ("count", "i8", (7,)),
+        ("step_start", "f8"),
+        ("elapsed", "f8"),  # time into the step under way
+        ("step_size", "f8"),  # of the step under way, negative without one
+        ("sigma_end", "f8"),  # the series' variable at the step's end
+        ("alpha", "f8"),  # time runs as t = alpha sigma + beta sigma^2 / 2
+        ("beta", "f8"),
+        ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
+        ("last_step_size", "f8"),
+        ("touch_time", "f8"),  # of the last touch
+        ("time", "f8"),  # the present, bit for bit as it was asked for
+        ("implicit_size", "f8"),  # of the next implicit step
+        ("explicit_size", "f8"),  # of the last explicit step
+        ("implicit_size_before", "f8"),  # both as they were before the step under way was laid out
+        ("explicit_size_before", "f8"),
+        ("order", "i8"),  # of the series of the step under way
+        ("event_pair", "i8"),  # the pair whose event ends the step, or -1
+        ("event_mode", "i8"),  # the mode that follows
+        ("touching", "i8"),  # a bit for each pair that touches at the step's start and needs the root of time
+        ("events_at_once", "i8"),  # events so far at one instant
+        ("piece", "i8"),  # of the sampled load
+        ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
+        ("overdamped", "i8"),  # explicit steps in a row that stability has bound
+        ("overdamped_before", "i8"),  # the same before the step under way was laid out
+        ("in_flight", "i8"),  # 1 during a step of free flight
+        ("at_rest", "i8"),  # 1 during a step of rest
+        # counted since the start
+        ("steps", "i8"),
+        ("evaluations", "i8"),  # of the equations of motion; an order of a series counts as one
+        ("events", "i8"),
+        ("guard_roots", "i8"),  # guards whose roots were searched for
+        ("recoveries", "i8"),  # times that modes flipped at one instant
+        ("bounded", "i8"),  # advances whose end was coarse
+        ("implicit_steps", "i8"),
     ]
 )
 
@@ -182,8 +200,8 @@ WORK: Final = np.dtype(
         ("hessian", "f8", (3, 3)),
         ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
-        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
-        ("counted", "i8", (7,)),  # counters before a step is laid out again
+        ("saved", "f8", (3, PAIR_COUNT)),  # y, damping factors and wear depths before an advance
+        ("modes", "i8", (PAIR_COUNT,)),  # and the modes
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
     ]

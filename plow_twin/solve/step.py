@@ -1,4 +1,4 @@
-"""One step: series, step_size, first event, what happened in it, and the switch at its end.
+"""One step: series, step size, first event, what happened in it, and the switch at its end.
 
 A step never depends on where output is wanted. It ends at an event, at a knot of the load, or where its series stops
 being accurate.
@@ -11,15 +11,15 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.modes import penetration_and_rate, slow_touch, touch, weigh_pairs
+from plow_twin.solve.dense_output import evaluate, wear_depth_at
 from plow_twin.solve.events import first_event
 from plow_twin.solve.method.flight import take_off
-from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, THETA
-from plow_twin.solve.method.step_size import accurate_step, before_sticking, time_to_separation
-from plow_twin.solve.dense_output import evaluate, wear_depth_at
-from plow_twin.solve.method.rest import settle
-from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
 from plow_twin.solve.method.implicit import PATIENCE, STAGES, collocate, note_explicit
+from plow_twin.solve.method.rest import settle
+from plow_twin.solve.method.step_size import accurate_step, before_sticking, time_to_separation
+from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
+from plow_twin.solve.modes import penetration_and_rate, slow_touch, touch, weigh_pairs
+from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, THETA
 
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
@@ -28,7 +28,7 @@ _TOUCH_REACH = 2.5
 
 
 @kernel()
-def _linear_load(segments, step, t0, w):
+def _linear_load(segments, state, t0, w):
     """Add the linear load at t0 to `w.wrench` and return the time up to which it is linear."""
     piece = state.piece
     while piece + 1 < segments.size and segments[piece + 1].knot <= t0:
@@ -82,7 +82,7 @@ def lay_out_step(
     for j in range(3):
         w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
     if segments is not None:
-        stop_time = min(stop_time, _linear_load(parts.segments, step, t0, w))
+        stop_time = min(stop_time, _linear_load(parts.segments, state, t0, w))
     state.stop_time = stop_time
     span = min(stop_time - t0, LONGEST_STEP)
     limited = span < LONGEST_STEP
@@ -137,7 +137,9 @@ def lay_out_step(
         if implicit is not None and penetrating:
             note_explicit(p, state, w, state.alpha * sigma + 0.5 * state.beta * sigma * sigma, sigma < sigma_limit)
     limited = limited and sigma == sigma_limit
-    end, pair, target = first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp)
+    end, pair, target = first_event(
+        p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp
+    )
     if pair >= 0 and state.events_at_once > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.recoveries += 1

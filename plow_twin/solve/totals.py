@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.polynomial import maximum, shift_column
 from plow_twin.kernel.simd import magnitude, row, set_row, splat
 from plow_twin.solve.state import FIRST, ON, SECOND, SUM
-from plow_twin.kernel.polynomial import maximum, shift_column
 
 
 @kernel(fast=True)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from plow_twin.run.twin import Status
 from plow_twin.stream.health import RealTimeFactor
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 from plow_twin.stream.journal import Entry, Hold, Parameter, ParameterValue, Reset, Sample, Travel
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
-from plow_twin.run.twin import Status
 
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
 Arrival = tuple[int, tuple[float, float, float]]
@@ -54,7 +54,7 @@ class Driver:
     session, intake, policy
         What is driven, what judges the samples, what rules over silence and failures.
     every_sample : bool
-        Return a frame for each advance; else only `due` returns one.
+        Return a publication for each advance; else only `due` returns one.
     """
 
     def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:
@@ -85,10 +85,10 @@ class Driver:
         """Stamp of the newest sample used [ns]; None before the first and after a reset."""
         return self._newest_ns
 
-    def samples(self, arrived: Sequence[Arrival], now_ns: int) -> Iterator[Frame]:
+    def samples(self, arrived: Sequence[Arrival], now_ns: int) -> Iterator[Publication]:
         """Judge samples in order of arrival, advance to those that are used, and yield what is to be published.
 
-        The caller publishes each frame before it asks for the next, so that a recording holds them in order.
+        The caller publishes each publication before it asks for the next, so that a recording holds them in order.
         """
         accepted: list[Sample] = []
         for stamp_ns, wrench in arrived:
@@ -103,11 +103,11 @@ class Driver:
             accepted.append(Sample(stamp_ns, wrench))
         yield from self._use(accepted, now_ns)
 
-    def due(self) -> Frame | None:
-        """Return what is to be published of all since the last frame, or None when there was no advance since."""
+    def due(self) -> Publication | None:
+        """Return what is to be published of all since the last publication, or None when there was no advance since."""
         return self.session.outputs.take()
 
-    def silence(self, now_ns: int) -> Frame | None:
+    def silence(self, now_ns: int) -> Publication | None:
         """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
         if self._newest_ns is None:
             return None
@@ -124,7 +124,7 @@ class Driver:
             return self._advance(Sample(stamp_ns, (0.0, 0.0, 0.0)), now_ns, StreamState.STALE)
         return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
-    def clock_tick(self, stamp_ns: int, now_ns: int) -> Frame | None:
+    def clock_tick(self, stamp_ns: int, now_ns: int) -> Publication | None:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
 
         The first call after `resume` only finds out how long that was.
@@ -178,13 +178,13 @@ class Driver:
         self._newest_ns = self._counted_ns = None
         self.state = StreamState.WAITING
 
-    def _use(self, samples: list[Sample], now_ns: int) -> Iterator[Frame]:
+    def _use(self, samples: list[Sample], now_ns: int) -> Iterator[Publication]:
         """Advance to samples: one by one where each is published, else in one go."""
         if self.every_sample:
             for sample in samples:
-                frame = self._advance(sample, now_ns, StreamState.RUNNING)
-                if frame is not None:
-                    yield frame
+                publication = self._advance(sample, now_ns, StreamState.RUNNING)
+                if publication is not None:
+                    yield publication
             return
         for series in self.session.apply_samples(samples):
             self._advanced(now_ns)
@@ -193,7 +193,7 @@ class Driver:
                 self._judge_advance(Status(int(status)), StreamState.RUNNING)
             self._give_up_after_failures()
 
-    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Frame | None:
+    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Publication | None:
         advance = self.session.apply(entry)
         if advance is None:
             return None

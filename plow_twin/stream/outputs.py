@@ -36,7 +36,7 @@ _STATE_SIZE: Final = 4 * PAIR_COUNT
 
 @dataclass(frozen=True)
 class Slow:
-    """The slowly changing part of a publication: `clearance` (30,) [m] under `CLEARANCE_NAMES`, `wear_rate` (8,) [m/s]."""
+    """What changes slowly: `clearance` (30,) [m] under `CLEARANCE_NAMES`, `wear_rate` (8,) [m/s]."""
 
     clearance: Array
     wear_rate: Array
@@ -72,8 +72,8 @@ class Publication:
 
 
 @dataclass(frozen=True)
-class Frames:
-    """Many publications: the fields of `Publication` with a leading axis (n,); the slow parts of the publications `slow_index` (m,)."""
+class Publications:
+    """Many publications: the fields of `Publication` with an axis (n,) in front; `slow_index` (m,) have slow parts."""
 
     stamp_ns: NDArray[np.int64]
     penetration: Array
@@ -101,9 +101,11 @@ class Frames:
         )
 
     @classmethod
-    def of(cls, publications: Sequence[Publication]) -> Frames:
+    def of(cls, publications: Sequence[Publication]) -> Publications:
         """Put publications together."""
-        slow = [(index, publication.slow) for index, publication in enumerate(publications) if publication.slow is not None]
+        slow = [
+            (index, publication.slow) for index, publication in enumerate(publications) if publication.slow is not None
+        ]
         arrays = {name: np.stack([getattr(publication, name) for publication in publications]) for name in _ARRAYS}
         return cls(
             stamp_ns=np.array([publication.stamp_ns for publication in publications], np.int64),
@@ -120,7 +122,7 @@ _ARRAYS: Final = ("penetration", "rate", "force", "makes", "impulse", "peak", "q
 def clearances(scene: Scene, wear_depth: Array) -> Array:
     """Return total horizontal and vertical clearance and the eight pad depths, shape (..., 10) [m], from (..., 8).
 
-    A side's walls move out by the mean wear_depth of the two pads on it.
+    A side's walls move out by the mean wear depth of the two pads on it.
     """
     left, right, top, bottom = (wear_depth[..., side].mean(axis=-1) for side in (_LEFT, _RIGHT, _TOP, _BOTTOM))
     horizontal = scene.clearance.horizontal_m + left + right
@@ -132,7 +134,7 @@ def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
 
     Growth is proportional to k_s as long as it is small against the clearance. Without wear, or with k_s = 0, both
-    points equal the wear_depth.
+    points equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
@@ -142,7 +144,7 @@ def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
 
 
 class Outputs:
-    """Collect advances into publications. Makes, impulses and peaks survive any number of advances between two publications."""
+    """Collect advances into publications. Makes, impulses and peaks survive any number of advances between two."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -212,8 +214,8 @@ class Outputs:
         self._peak[:] = 0.0
         return publication
 
-    def take_rows(self, stamps: NDArray[np.int64], rows: AdvanceSeries, taken: NDArray[np.int64]) -> Frames:
-        """Take in good advances that ended at `stamps`, with a publication after each of the rising numbers of rows `taken`.
+    def take_rows(self, stamps: NDArray[np.int64], rows: AdvanceSeries, taken: NDArray[np.int64]) -> Publications:
+        """Take in good advances that ended at `stamps`, with a publication after each of the rows `taken` (rising).
 
         The same bits as `add` for each row and `take` after those rows.
         """
@@ -229,7 +231,7 @@ class Outputs:
             peak[longer] = np.maximum(peak[longer], rows.peak[first[longer] + offset])
         makes = self._makes + np.cumsum(rows.makes, axis=0)
         slow_index, clearance, wear_rate = self._slow_rows(stamps[taken], rows.wear_depth[taken])
-        publications = Frames(
+        publications = Publications(
             stamp_ns=stamps[taken],
             penetration=rows.penetration[taken],
             rate=rows.rate[taken],
@@ -255,7 +257,7 @@ class Outputs:
 
     def _slow_rows(self, stamps: NDArray[np.int64], wear_depth: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Return which of some publications have a slow part, and the parts."""
-        before_ns, depth_before = self._slow_ns, self._slow_wear_depth
+        before_ns, wear_before = self._slow_ns, self._slow_wear_depth
         spans = stamps // SLOW_PERIOD_NS
         changed = np.ones(len(stamps), bool)
         changed[1:] = spans[1:] != spans[:-1]
@@ -268,7 +270,7 @@ class Outputs:
         elapsed_s, grown = np.ones(len(stamps)), np.zeros(wear_depth.shape)
         elapsed_s[1:], grown[1:] = np.diff(stamps) * 1e-9, np.diff(wear_depth, axis=0)
         if before_ns is not None:
-            elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - depth_before
+            elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - wear_before
         self._slow_ns, self._slow_wear_depth = int(stamps[-1]), wear_depth[-1].copy()
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         intervals = np.stack((low, high), axis=-1).reshape(len(wear_depth), -1)

@@ -29,8 +29,8 @@ def _ignore(entry: Entry) -> None:
 class Session:
     """One run of a twin under a journal.
 
-    The same entries in the same order give the same motion, the same publications (`outputs`) and the same digests, bit for
-    bit, whatever the clock did meanwhile. Model time is (stamp - origin), the origin being the first stamp.
+    The same entries in the same order give the same motion, the same publications (`outputs`) and the same digests, bit
+    for bit, whatever the clock did meanwhile. Model time is (stamp - origin), the origin being the first stamp.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ class Session:
         return done
 
     def restore(self, snapshot: Snapshot, pending: tuple[int, Advance] | None, origin_ns: int | None) -> None:
-        """Go back to a snapshot, with what the next publication then was to show (`Outputs.pending`); nothing is emitted."""
+        """Go back to a snapshot, with what the next publication was to show (`Outputs.pending`); nothing is emitted."""
         self._restore(snapshot.data)
         self.origin_ns = origin_ns
         self.outputs.set_pending(pending)

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.run.ensemble import Ensemble, simulate_many
 from plow_twin.model.scene import Scene
+from plow_twin.run.ensemble import Ensemble, simulate_many
 from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]

@@ -12,9 +12,7 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.state import COS, SIN, X, Y
-from plow_twin.solve.dynamics import to_body, to_world
-from plow_twin.solve.kinematics import penetration
+from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 
 #: Radians of the fastest harmonic that a flight must span; a series gets some two of them into a step.
 _LEAST_PHASE = 8.0
@@ -37,7 +35,7 @@ def _clearance(p, state) -> float:
     y, nearest = state.y, np.inf
     for pair in range(8):
         if p.enabled[pair] == 1:
-            penetration = penetration(p, state.wear_depth[pair], pair, y[COS], y[SIN], y[X], y[Y])
+            penetration = penetration_of(p, state, pair, y)
             nearest = min(nearest, -penetration)
     return nearest
 

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import roots_jacobi
 
-from plow_twin.model.contact import free_force
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
+from plow_twin.model.contact import free_force
+from plow_twin.solve.dynamics import accelerate
+from plow_twin.solve.kinematics import penetration_of, rate_of, row_value, row_values, to_body, to_world
 from plow_twin.solve.state import COS, DAMPS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y
-from plow_twin.solve.dynamics import accelerate, to_body, to_world
-from plow_twin.solve.kinematics import row_values, row_value, row_rate, penetration
 
 #: Stages: the polynomials' degree. The order is 2 s - 1.
 STAGES = 9
@@ -245,9 +245,11 @@ def _write_series(p, state, h, w, implicit) -> float:
         for pair in range(8):
             forces[i, pair] = 0.0
             if state.mode[pair] == ON:
-                d = penetration(p, state.wear_depth[pair], pair, y[COS], y[SIN], y[X], y[Y])
-                r = row_rate(p.penetration_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
-                forces[i, pair] = free_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+                d = penetration_of(p, state, pair, y)
+                r = rate_of(p, pair, y)
+                forces[i, pair] = free_force(
+                    d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp
+                )
     _interpolate(forces, implicit.from_stages, h, w.force)
     last = w.series[s]
     size = abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA])

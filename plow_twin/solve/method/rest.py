@@ -11,12 +11,12 @@ import math
 
 import numpy as np
 
-from plow_twin.model.contact import free_force
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
-from plow_twin.solve.state import COS, OFF, OMEGA, ON, SIN, VX, VY, X, Y
-from plow_twin.solve.dynamics import accelerate, to_body, to_world
-from plow_twin.solve.kinematics import penetration
+from plow_twin.model.contact import free_force
+from plow_twin.solve.dynamics import accelerate
+from plow_twin.solve.kinematics import penetration_of, to_body, to_world
+from plow_twin.solve.state import OFF, OMEGA, ON, VX, VY
 
 #: Share of the tolerances that the motion left out may reach.
 _SHARE = 1e-3
@@ -33,7 +33,7 @@ def _held(p, state, y, least) -> bool:
     """Tell whether each pair is on or off, and neither close to changing that."""
     for pair in range(8):
         if p.enabled[pair] == 1:
-            penetration = penetration(p, state.wear_depth[pair], pair, y[COS], y[SIN], y[X], y[Y])
+            penetration = penetration_of(p, state, pair, y)
             inside = state.mode[pair] == ON and penetration > least
             if not (inside or (state.mode[pair] == OFF and penetration < -least)):
                 return False
@@ -144,10 +144,12 @@ def write_rest(p, state, w) -> None:
     y = state.y
     set_row(w.series, 0, row(y, 0))
     for pair in range(8):
-        penetration = penetration(p, state.wear_depth[pair], pair, y[COS], y[SIN], y[X], y[Y])
+        penetration = penetration_of(p, state, pair, y)
         w.penetration[0, pair], w.force[0, pair] = penetration, 0.0
         if state.mode[pair] == ON:
-            w.force[0, pair] = free_force(penetration, 0.0, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+            w.force[0, pair] = free_force(
+                penetration, 0.0, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp
+            )
     set_row(w.series, 1, splat(0.0))
     set_row(w.penetration, 1, splat(0.0))
     set_row(w.force, 1, splat(0.0))

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import ON
-from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
 
 #: A pair that would part within so many steps like the last is looked at, by a series of this order.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
@@ -17,7 +17,7 @@ _PARTING_REACH, PARTING_ORDER = 1.3, 6
 
 @kernel()
 def accurate_step(p, w, order, sigma_limit):
-    """Return the sigma over which the series meets its share of the tolerance, at most `sigma_limit`; NaN if not finite.
+    """Return the sigma over which the series meets its share of the tolerance; NaN if it is not finite.
 
     Term k may be as large as `threshold[k]`, which falls geometrically to the admissible error at the last order (root
     test as by Jorba and Zou, sec. 3.2). All of the last `lacuna` orders are looked at, since single ones can vanish.

@@ -15,11 +15,11 @@ from __future__ import annotations
 
 import math
 
-from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import lane, magnitude, pack, permutation, row, set_row, splat, spread_total, total
-from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
+from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.solve.kinematics import row_values
+from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
 
 #: Factors of omega (S1 in lanes 4 and 7) in the rates of the state's components, and of the rates that are components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
@@ -243,7 +243,9 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
     force = _multiply(w.force, tau, k) * p.friction
     set_row(drag, k, force)
     # t is the wall's normal turned by +90 degrees, the gap's rows for X and Y are minus the normals
-    return _applied(p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k))
+    return _applied(
+        p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
+    )
 
 
 @kernel(fast=True)
@@ -287,8 +289,8 @@ def expand(
 ):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
-    Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. `sigma_limit` is the longest
-    sigma of interest: orders whose terms vanish there are not computed.
+    Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. Orders whose terms vanish
+    at `sigma_limit`, the longest sigma of interest, are not computed.
     """
     alpha, beta = state.alpha, state.beta
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
@@ -300,7 +302,9 @@ def expand(
         x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
         om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
         if k == 0:
-            penetration = row_values(p.penetration_rows, c, s, x, yy) + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
+            penetration = (
+                row_values(p.penetration_rows, c, s, x, yy) + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
+            )
         else:
             if not penetrating:
                 penetration = row_values(p.penetration_rows, c, s, x, yy)
@@ -340,7 +344,9 @@ def expand(
             set_row(w.force, k, force)
             # the rows for X and Y are minus the walls' inward normals
             torque = _join(w.arm, w.force, k, arm, force)
-            applied = applied + _applied(p, row(p.penetration_rows, 2) * force * -1.0, row(p.penetration_rows, 3) * force * -1.0, torque)
+            applied = applied + _applied(
+                p, row(p.penetration_rows, 2) * force * -1.0, row(p.penetration_rows, 3) * force * -1.0, torque
+            )
             if slip is not None:
                 applied = applied + _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
             if wear is not None:

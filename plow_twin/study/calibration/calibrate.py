@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.study.calibration.objective import Objective
-from plow_twin.study.parameters import Value
 from plow_twin.study.calibration.unknowns import Space
+from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
 #: Called with the share of the work done, 0..1, and the best objective so far.

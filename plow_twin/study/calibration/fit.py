@@ -10,15 +10,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
+from plow_twin.build import build_fingerprint, package_version
 from plow_twin.model.scene import Mark, Provenance, Scene
-from plow_twin.record.header import build_fingerprint, package_version
 from plow_twin.scene_file import dump_scene
 from plow_twin.study.calibration.calibrate import Calibration, Search
 from plow_twin.study.calibration.objective import Objective, TargetObjective
-from plow_twin.study.parameters import Value, with_parameters
-from plow_twin.study.store import write_atomically
 from plow_twin.study.calibration.uniqueness import Cluster, Identifiability
 from plow_twin.study.calibration.unknowns import Space
+from plow_twin.study.parameters import Value, with_parameters
+from plow_twin.study.store import write_atomically
 
 _NOT_NUMBERS: Final = ("sign", "scale", "labels", "law", "rotation")
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from plow_twin.errors import SceneError
 from plow_twin.model.geometry import half_diagonal, length_scale
 from plow_twin.model.scene import Scene
+from plow_twin.study.calibration.pose_recording import PoseRecording
+from plow_twin.study.calibration.targets import FAILED_RESIDUAL, TargetSet
 from plow_twin.study.members import run_members
 from plow_twin.study.parameters import Value, with_parameters
-from plow_twin.study.calibration.pose_recording import PoseRecording
 from plow_twin.study.statistics import statistics_of
-from plow_twin.study.calibration.targets import FAILED_RESIDUAL, TargetSet
 
 Array = NDArray[np.float64]
 Values = Mapping[str, Value]

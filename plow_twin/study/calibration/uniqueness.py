@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from plow_twin.study.calibration.calibrate import Calibration, jacobian
 from plow_twin.study.calibration.objective import Objective
-from plow_twin.study.parameters import Value
 from plow_twin.study.calibration.unknowns import Space
+from plow_twin.study.parameters import Value
 
 Array = NDArray[np.float64]
 

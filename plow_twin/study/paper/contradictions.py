@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from plow_twin.study.paper.study import sets as paper_sets
+from plow_twin.study.paper import sets as paper_sets
 from plow_twin.study.paper.rows import braces
 from plow_twin.study.paper.rows_sets import shown_time
 from plow_twin.study.paper.runs import PaperRuns

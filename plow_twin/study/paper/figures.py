@@ -41,8 +41,8 @@ def draw_all(runs: PaperRuns, folder: Path, on_progress: Callable[[float], objec
 
 
 def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figure]]]:
-    from plow_twin.study.paper.study import figures_motion as motion
-    from plow_twin.study.paper.study import figures_trends as trends
+    from plow_twin.study.paper import figures_motion as motion
+    from plow_twin.study.paper import figures_trends as trends
 
     scene = runs.scene.clearance
     case = f"{1e3 * scene.horizontal_m:g} mm horizontal, {1e3 * scene.vertical_m:g} mm vertical clearance"

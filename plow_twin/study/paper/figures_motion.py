@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from plow_twin.study.paper.study import sets as paper_sets
+from plow_twin.study.paper import sets as paper_sets
 from plow_twin.study.paper.rows import braces
 from plow_twin.study.paper.rows_motion import force_table
 from plow_twin.study.paper.rows_sets import shown_time

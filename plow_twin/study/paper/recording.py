@@ -18,9 +18,9 @@ from plow_twin.errors import SolverError
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import output_times
+from plow_twin.run.twin import Twin
 from plow_twin.stream.journal import Entry, Sample
 from plow_twin.stream.session import Session
-from plow_twin.run.twin import Twin
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter

@@ -1,15 +1,10 @@
-"""The table published / reconstructed / difference / agrees: what a row is, and all rows of the comparison."""
+"""What a row of the table published / reconstructed / difference / agrees is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Final
-
-from plow_twin.model.scene import Mark
-
-if TYPE_CHECKING:
-    from plow_twin.study.paper.runs import PaperRuns
+from typing import Final
 
 #: What stands behind a row beside the numbers of the scene.
 FITTED: Final = "fitted to this"
@@ -67,32 +62,6 @@ class Row:
         if self.published_value is None or self.value is None:
             return None
         return (self.value - self.published_value) / abs(self.published_value)
-
-
-def all_rows(runs: PaperRuns) -> list[Row]:
-    """Return the whole comparison in the order of the paper."""
-    from plow_twin.study.paper.study import rows_motion as paper_rows_motion
-    from plow_twin.study.paper.study import rows_sets as paper_rows_sets
-    from plow_twin.study.paper.study import rows_trends as paper_rows_trends
-
-    rows = [
-        *paper_rows_motion.rows(runs.scene, runs.case),
-        *paper_rows_sets.rows(runs.scene, runs.case),
-        *paper_rows_trends.rows(runs),
-    ]
-    if any(entry.mark is Mark.RECONSTRUCTED for entry in runs.scene.marks.values()):
-        return rows
-    return [replace(row, inputs=UNKNOWN) for row in rows]
-
-
-def one_run_rows(runs: PaperRuns, index: int) -> list[Row]:
-    """Return the rows of Figs 6 to 9 for one form of the head's rotation (see `Rotation`)."""
-    from plow_twin.study.paper.study import rows_motion as paper_rows_motion
-    from plow_twin.study.paper.study import rows_sets as paper_rows_sets
-
-    assert runs.rotation is not None
-    scene, result = runs.rotation.scenes[index], runs.rotation.results[index]
-    return [*paper_rows_motion.rows(scene, result), *paper_rows_sets.rows(scene, result)]
 
 
 def braces(corners: str) -> str:

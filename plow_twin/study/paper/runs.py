@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.run.ensemble import simulate_many
 from plow_twin.errors import Problem, SceneError, SolverError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Clearance, Harmonic, Scene
+from plow_twin.run.ensemble import simulate_many
 from plow_twin.run.simulate import Result, output_times, simulate
 from plow_twin.solve.state import Status
 from plow_twin.study.paper.rotation import Rotation, rotation_scenes

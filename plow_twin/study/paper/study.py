@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from plow_twin.model.scene import Mark, Scene
+from plow_twin.study.paper.comparison import all_rows, one_run_rows
 from plow_twin.study.paper.contradictions import Contradiction, contradictions
 from plow_twin.study.paper.figures import Picture, draw_all, draw_rotation
 from plow_twin.study.paper.recording import Recording, record
 from plow_twin.study.paper.rotation import RotationRow, rotation_rows
-from plow_twin.study.paper.rows import FITTED, Row, Verdict, all_rows, one_run_rows
+from plow_twin.study.paper.rows import FITTED, Row, Verdict
 from plow_twin.study.paper.runs import PaperRuns, run_all
 from plow_twin.study.report import require
 
@@ -159,7 +160,7 @@ def _write(study: PaperStudy, out: Path) -> None:
 
 def as_plain(study: PaperStudy) -> dict[str, Any]:
     """Return the study without its series as plain values."""
-    from plow_twin.record.header import build_fingerprint
+    from plow_twin.build import build_fingerprint
     from plow_twin.scene_file import dump_scene
 
     runs, rotation = study.runs, study.runs.rotation

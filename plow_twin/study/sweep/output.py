@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from plow_twin.record.header import package_version
+from plow_twin.build import package_version
 from plow_twin.study.statistics import unit_of
 from plow_twin.study.sweep.table import Axis, Table
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.record.header import build_fingerprint
+from plow_twin.build import build_fingerprint
 from plow_twin.study.parameters import StudyError
 from plow_twin.study.store import Store
 from plow_twin.study.sweep.table import Sweep, Table, run_members_of

@@ -19,7 +19,7 @@ def damped(damping: float) -> Scene:
 
 
 def implicit_of(scene: Scene, tol: float = 1e-9) -> Implicit | None:
-    return compiled.compile_scene(scene, tol).parts.implicit
+    return compiled_scene.compile_scene(scene, tol).parts.implicit
 
 
 @pytest.mark.parametrize(("damping", "friction"), [(1e8, None), (1e9, None), (1e9, Friction(0.2, 0.02))])
@@ -28,7 +28,7 @@ def test_implicit_and_explicit_steps_agree(
 ) -> None:
     scene = replace(damped(damping), friction=friction)
     implicit = simulate(scene, 0.5, output_dt=0.01, energy_balance=True)
-    monkeypatch.setattr(compiled, "_implicit", lambda *arguments: None)
+    monkeypatch.setattr(compiled_scene, "_implicit", lambda *arguments: None)
     explicit = simulate(scene, 0.5, output_dt=0.01)
     assert implicit.solver["steps"] < 0.4 * explicit.solver["steps"]
     assert pose_error(scene, implicit.q, explicit.q) < 5e-9

@@ -1,0 +1,53 @@
+"""What a build is: the version of the package, and all that the exact bits of a run depend on."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+#: Rooms whose code decides the bits of a run.
+NUMERIC_ROOMS: Final = ("kernel", "model", "solve", "run", "stream", "record")
+
+
+def package_version() -> str:
+    """Return the version of the installed package."""
+    for name in ("plow_twin", "plow-twin"):
+        try:
+            return version(name)
+        except PackageNotFoundError:
+            continue
+    return "not installed"
+
+
+@cache
+def build_fingerprint() -> Mapping[str, str]:
+    """Return what the exact bits of a run depend on: versions, processor, platform, a hash of the numeric sources."""
+    import llvmlite.binding
+    import numba
+
+    return {
+        "plow_twin": package_version(),
+        "source": source_digest(Path(__file__).resolve().parent),
+        "python": platform.python_version(),
+        "numpy": version("numpy"),
+        "numba": version("numba"),
+        "llvmlite": version("llvmlite"),
+        "jit": "off" if getattr(numba.config, "DISABLE_JIT", 0) else "on",
+        "cpu": llvmlite.binding.get_host_cpu_name(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "libc": " ".join(platform.libc_ver()),
+    }
+
+
+def source_digest(package: Path) -> str:
+    """Return 16 hexadecimal digits that stand for the sources of the numeric rooms in a package's folder."""
+    digest = hashlib.sha256()
+    for room in NUMERIC_ROOMS:
+        for path in sorted((package / room).rglob("*.py")):
+            digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
