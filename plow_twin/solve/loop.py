@@ -239,15 +239,15 @@ def advance_marked(params, parts, states, work, totals, times, wrench, budget, m
     """
     w, sums, piece = work[0], totals[0], parts.segments[0]
     p, state = params[0], states[0]
-    state.step[PIECE] = 0
+    state.piece = 0
     mark = 0
     for i in range(times.size):
-        span = times[i] - state.clock[T0]
-        piece.knot = state.clock[T0]
+        span = times[i] - state.step_start
+        piece.knot = state.step_start
         for j in range(3):
             piece.start[j] = wrench[i, j]
             piece.slope[j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
-        status[i] = _advance(p, parts, state, w, sums, times[i], times[i], state.count[STEPS] + budget, None)
+        status[i] = _advance(p, parts, state, w, sums, times[i], times[i], state.steps + budget, None)
         if rows is not None:
             q, v, penetration, rate, force, peak, impulse, makes, wear_depth = rows
             _read_row(p, parts, state, w, sums, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth)
