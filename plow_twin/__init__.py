@@ -6,6 +6,7 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
 from warnings import warn as _warn
 
+from plow_twin.errors import ArgumentError as ArgumentError
 from plow_twin.errors import PlowTwinError as PlowTwinError
 from plow_twin.errors import Problem as Problem
 from plow_twin.errors import RecordingError as RecordingError

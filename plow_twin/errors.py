@@ -32,6 +32,10 @@ class SceneError(PlowTwinError, ValueError):
         super().__init__(f"{source}: {len(self.problems)} problem(s)\n{lines}")
 
 
+class ArgumentError(PlowTwinError, ValueError):
+    """An argument of a call cannot be used; the message names it, the value got and the value expected."""
+
+
 class SolverError(PlowTwinError, RuntimeError):
     """The motion could not be continued; the message says when and why."""
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import pose_error, preset, reference, wall_and_point
 
-from plow_twin import Constant, SolverError, Status, Twin, Wear, simulate
+from plow_twin import Constant, Contact, SolverError, Status, Twin, Wear, simulate
 from plow_twin.model.loads import compile_loads
 from plow_twin.solve import loop
 
@@ -124,6 +124,24 @@ def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wre
     assert after.status is Status.OK and abs(after.q - good.q).max() < 0.05
 
 
+@pytest.mark.parametrize("depth", [0.2, 1.3])
+def test_a_failed_advance_leaves_no_trace_in_what_follows(depth: float) -> None:
+    """It has crossed the end of the ramp; the impact goes on as if there had been none."""
+    ramp, idle = 1e-3, (0.0, 0.0, 0.0)
+    contact = Contact("ramped_damping", 1e6, exponent=1.5, damping=2e3, ramp_m=ramp)
+    twins = [Twin(wall_and_point(contact, speed=1.0), excitation="sampled") for _ in range(2)]
+    t, dt = 0.0, 1e-5
+    while twins[0].advance(t, idle).penetration[0] < depth * ramp:
+        twins[1].advance(t, idle)
+        t += dt
+    twins[1].advance(t, idle)
+    assert twins[1].advance(t + 0.1, (0.0, -1e6, 0.0)).status is Status.OUT_OF_RANGE
+    assert twins[1].advance(t + 0.1, idle).status is Status.OK
+    # to rounding: a step ends where the failure was
+    expected, after = twins[0].advance(t + 0.01, idle), twins[1].advance(t + 0.11, idle)
+    assert after.q == pytest.approx(expected.q, abs=1e-13) and after.v == pytest.approx(expected.v, rel=1e-9)
+
+
 def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
     """A step that ends at the time asked for is checked too."""
     for dt in (1e-3, 7e-4):
@@ -165,7 +183,9 @@ def test_warm_up_leaves_nothing_to_compile() -> None:
     twin.set_travel_speed(1.0)
     twin.advance(0.02)
     twin.restore(twin.snapshot())
-    assert [len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)] == before
+    assert [
+        len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)
+    ] == before
 
 
 def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:

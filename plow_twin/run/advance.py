@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.errors import ArgumentError
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.state import Status
 
@@ -130,8 +131,8 @@ def columns(out: AdvanceSeries | AdvanceBatch) -> tuple[NDArray[np.float64] | ND
 def check_times(now: float, times: NDArray[np.float64]) -> None:
     """Raise `ValueError` for times that are not finite or go back."""
     if times.ndim != 1 or not np.isfinite(times).all():
-        raise ValueError(f"t: got {times!r}, expected finite times in s, shape (n,)")
+        raise ArgumentError(f"t: got {times!r}, expected finite times in s, shape (n,)")
     if len(times) and (times[0] < now or (times[1:] < times[:-1]).any()):
         before = np.concatenate([[now], times[:-1]])
         index = int(np.flatnonzero(times < before)[0])
-        raise ValueError(f"t: got {times[index]!r} s, expected a time not before {before[index]!r} s")
+        raise ArgumentError(f"t: got {times[index]!r} s, expected a time not before {before[index]!r} s")

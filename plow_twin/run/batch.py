@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from plow_twin.errors import ArgumentError
 from plow_twin.model.scene import Scene
 from plow_twin.run.advance import AdvanceBatch, check_times, columns, empty_batch
 from plow_twin.run.twin import DEFAULT_BUDGET
@@ -53,7 +54,7 @@ class TwinBatch:
 
     def __init__(self, scenes: Sequence[Scene], *, tol: float = 1e-9, start: float = 0.0, workers: int = 1) -> None:
         if not scenes:
-            raise ValueError("scenes: got none, expected at least one")
+            raise ArgumentError("scenes: got none, expected at least one")
         self.scenes = tuple(scenes)
         self.tol = tol
         self._compiled = [compile_scene(scene, tol, sampled=True) for scene in scenes]
@@ -89,7 +90,7 @@ class TwinBatch:
         """
         sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
         if sample.shape not in ((3,), (len(self), 3)):
-            raise ValueError(f"wrench: got shape {sample.shape}, expected (3,) or ({len(self)}, 3)")
+            raise ArgumentError(f"wrench: got shape {sample.shape}, expected (3,) or ({len(self)}, 3)")
         return self.advance_samples(np.array([t], dtype=np.float64), sample[..., None, :])
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceBatch:
@@ -111,7 +112,7 @@ class TwinBatch:
         check_times(self.time, times)
         shape = (len(self), len(times), 3)
         if samples.shape not in (shape, shape[1:]) or not np.isfinite(samples).all():
-            raise ValueError(f"wrench: got {samples!r}, expected finite numbers of shape {shape} or {shape[1:]}")
+            raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape {shape} or {shape[1:]}")
         ends = np.empty((len(self), len(times) + 1, 3))
         ends[:, 0], ends[:, 1:] = self._wrench, samples
         out = empty_batch(times, len(self))
@@ -122,7 +123,7 @@ class TwinBatch:
     def reset(self, t: float) -> None:
         """Go back to the scenes' initial states, at model time `t`."""
         if not np.isfinite(t):
-            raise ValueError(f"t: got {t!r}, expected a finite time in s")
+            raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
         for index, compiled in enumerate(self._compiled):
             self._states[index] = compiled.initial_state(t)
         self._wrench = np.zeros((len(self), 3))
@@ -131,7 +132,7 @@ class TwinBatch:
         """Set the speed along the face from here on, of each twin (m,) or of all; only wear depends on it."""
         speeds = np.broadcast_to(np.abs(np.asarray(speed_m_s, dtype=np.float64)), len(self))
         if not np.isfinite(speeds).all():
-            raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected finite speeds in m/s")
+            raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected finite speeds in m/s")
         for index, (scene, speed) in enumerate(zip(self.scenes, speeds, strict=True)):
             if scene.wear is not None:
                 self._params["wear_per_impulse"][index] = wear_rate(scene.wear, speed)
@@ -150,7 +151,9 @@ class TwinBatch:
         """
         sizes = np.cumsum([self._states.nbytes, self._wrench.nbytes])
         if len(data) != sizes[-1] + self._params["wear_per_impulse"].size * 8:
-            raise ValueError(f"snapshot: got {len(data)} bytes, expected {sizes[-1] + self._params['wear'].size * 8}")
+            raise ArgumentError(
+                f"snapshot: got {len(data)} bytes, expected {sizes[-1] + self._params['wear'].size * 8}"
+            )
         self._states[...] = np.frombuffer(data[: sizes[0]], STATE)
         self._wrench = np.frombuffer(data[sizes[0] : sizes[1]]).reshape(-1, 3).copy()
         self._params["wear_per_impulse"] = np.frombuffer(data[sizes[1] :]).reshape(
@@ -208,7 +211,7 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
         terms = one.parts.terms
         for name in ("viscous", "hysteretic", "integer", "fraction", "ramp"):
             if getattr(terms, name) != getattr(first, name):
-                raise ValueError(
+                raise ArgumentError(
                     f"scenes[{index}].contact: got law {one.scene.contact.law} with exponent "
                     f"{one.scene.contact.exponent:g}, expected the terms of scenes[0]: {compiled[0].scene.contact.law} "
                     f"with exponent {compiled[0].scene.contact.exponent:g}"

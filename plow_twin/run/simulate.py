@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import SolverError
+from plow_twin.errors import ArgumentError, SolverError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
@@ -148,20 +148,20 @@ class Motion:
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
     """Raise `ValueError` for times that no run can have."""
     if not (np.isfinite(t_end) and t_end >= 0.0):
-        raise ValueError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
+        raise ArgumentError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
     if output_dt is not None and not (np.isfinite(output_dt) and output_dt > 0.0):
-        raise ValueError(f"output_dt: got {output_dt!r}, expected a finite time > 0 [s]")
+        raise ArgumentError(f"output_dt: got {output_dt!r}, expected a finite time > 0 [s]")
     if method not in get_args(Method):
-        raise ValueError(f"method: got {method!r}, expected one of {', '.join(get_args(Method))}")
+        raise ArgumentError(f"method: got {method!r}, expected one of {', '.join(get_args(Method))}")
     if method == "events":
         if dt is not None:
-            raise ValueError(f"dt: got {dt!r}, expected None with method='events'")
+            raise ArgumentError(f"dt: got {dt!r}, expected None with method='events'")
         return
     if dt is None or not (np.isfinite(dt) and dt > 0.0):
-        raise ValueError(f"dt: got {dt!r}, expected a finite time > 0 [s] with method={method!r}")
+        raise ArgumentError(f"dt: got {dt!r}, expected a finite time > 0 [s] with method={method!r}")
     for name, value in (("t_end", t_end), ("output_dt", output_dt)):
         if value is not None and abs(value / dt - round(value / dt)) > 1e-6 * max(1.0, value / dt):
-            raise ValueError(f"{name}: got {value!r}, expected a whole multiple of dt = {dt!r} [s]")
+            raise ArgumentError(f"{name}: got {value!r}, expected a whole multiple of dt = {dt!r} [s]")
 
 
 def output_times(t_end: float, output_dt: float | None) -> Array:

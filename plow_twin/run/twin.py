@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from plow_twin.errors import ArgumentError
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times, columns, empty_series
@@ -61,7 +62,7 @@ class Twin:
         max_evaluations: int | None = None,
     ) -> None:
         if excitation not in ("scene", "sampled"):
-            raise ValueError(f"excitation: got {excitation!r}, expected 'scene' or 'sampled'")
+            raise ArgumentError(f"excitation: got {excitation!r}, expected 'scene' or 'sampled'")
         self.scene = scene
         self.tol = tol
         self.excitation = excitation
@@ -112,7 +113,7 @@ class Twin:
         """
         if self.excitation == "scene":
             if wrench is not None:
-                raise ValueError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
+                raise ArgumentError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
             return self._advance_scene(np.array([t], dtype=np.float64))[0]
         sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
         return self.advance_samples(np.array([t], dtype=np.float64), sample.reshape(1, -1))[0]
@@ -133,11 +134,11 @@ class Twin:
             As `advance`; nothing has changed then.
         """
         if self.excitation != "sampled":
-            raise ValueError("advance_samples: got excitation='scene', expected excitation='sampled'")
+            raise ArgumentError("advance_samples: got excitation='scene', expected excitation='sampled'")
         times, samples = np.asarray(t, dtype=np.float64), np.ascontiguousarray(wrench, dtype=np.float64)
         check_times(self.time, times)
         if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
-            raise ValueError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
+            raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
         out = empty_series(times)
         ends = np.concatenate([self._wrench[None], samples])
         loop.advance_batch(
@@ -192,14 +193,14 @@ class Twin:
     def reset(self, t: float) -> None:
         """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
         if not np.isfinite(t):
-            raise ValueError(f"t: got {t!r}, expected a finite time in s")
+            raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
         self._states[0] = self._compiled.initial_state(t)
         self._wrench = np.zeros(3)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face from here on; only wear depends on it."""
         if not np.isfinite(speed_m_s):
-            raise ValueError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
+            raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
         if self._parts.terms.wear is not None:
             self._end_step()
             self._set_wear_rate(abs(float(speed_m_s)))
@@ -217,7 +218,7 @@ class Twin:
             When the data has not the size of a snapshot.
         """
         if len(data) != STATE.itemsize + 32:
-            raise ValueError(f"snapshot: got {len(data)} bytes, expected {STATE.itemsize + 32}")
+            raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {STATE.itemsize + 32}")
         saved = np.frombuffer(data[: STATE.itemsize], STATE)[0]
         for name in STATE.names or ():
             self._state[name] = saved[name]
@@ -252,7 +253,7 @@ class Twin:
         loop.advance_times(
             self._compiled.params,
             self._parts,
-            self._state,
+            self._states,
             self._work,
             self._totals,
             times,
@@ -290,7 +291,7 @@ def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None
     if max_evaluations is None:
         return DEFAULT_BUDGET, None
     if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:
-        raise ValueError(f"max_evaluations: got {max_evaluations!r}, expected an integer >= {LEAST_EVALUATIONS}")
+        raise ArgumentError(f"max_evaluations: got {max_evaluations!r}, expected an integer >= {LEAST_EVALUATIONS}")
     coarse = max(LEAST_EVALUATIONS // 4, max_evaluations // 16)
     budget = (int(max_evaluations) - 4 * coarse) // (order + PARTING_ORDER + AT_REST)
     return budget, Bound(coarse, np.zeros(1), np.zeros((6, 6)), np.zeros(3), np.zeros((4, PAIR_COUNT)))

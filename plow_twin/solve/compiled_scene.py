@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from plow_twin.errors import ArgumentError
 from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
@@ -87,7 +88,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     """
     low, high = TOLERANCE_RANGE
     if not low <= tol <= high:
-        raise ValueError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
+        raise ArgumentError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
     loads = compile_loads(() if sampled else scene.loads)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     gravity = scene.gravity.acceleration_m_s2

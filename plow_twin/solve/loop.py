@@ -14,7 +14,7 @@ from plow_twin.solve.method.flight import fly
 from plow_twin.solve.method.rest import write_rest
 from plow_twin.solve.method.taylor import one_by_one
 from plow_twin.solve.modes import within_range
-from plow_twin.solve.state import Status
+from plow_twin.solve.state import STATE, Status
 from plow_twin.solve.step import complete_step, lay_out_step
 from plow_twin.solve.totals import add_to_totals
 
@@ -103,32 +103,40 @@ def _clear(totals) -> None:
 
 
 @kernel()
-def _advance(p, parts, state, w, totals, target, stop_time, budget, bound) -> int:
-    """Proceed to `target`; when that fails, time goes on but the head stays as it was, and nothing is counted.
+def _undo(state, w, target) -> None:
+    """Let the head stay as it was before an advance, whose record has been put back, while time goes on to `target`.
 
-    With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
+    A step under way ends at the time before the advance: its place and wear there are in `w.saved`.
     """
-    saved = w.saved
-    _present(p, parts, state, w, saved[0])
-    set_row(saved, 1, row(state.damping_factor, 0))
-    set_row(saved, 2, row(state.wear_depth, 0))
-    for pair in range(8):
-        w.modes[pair] = state.mode[pair]
-    code = _proceed(p, parts, state, w, totals, target, stop_time, budget)
+    set_row(state.y, 0, row(w.saved, 0))
+    set_row(state.wear_depth, 0, row(w.saved, 1))
+    state.touch_time += target - state.time
+    state.step_start, state.step_size, state.elapsed, state.time = target, -1.0, 0.0, target
+
+
+@kernel()
+def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound):
+    """Proceed to `target`; return a `Status` and the steps taken.
+
+    When that fails, time goes on but the head stays as it was, and nothing is counted. `saved` is an array of one
+    record. With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
+    """
+    state = states[index]
+    saved[0] = state
+    _present(p, parts, state, w, w.saved[0])
+    _worn_now(state, w, parts.terms.wear, w.saved[1])
+    before = state.steps
+    code = _proceed(p, parts, state, w, totals, target, stop_time, before + budget)
     if bound is not None:
         bound.error[0] = 0.0
         if code == _BUDGET:
             code = end_coarsely(p, parts, state, totals, target, bound)
+    steps = state.steps - before
     if code != _OK:
-        set_row(state.y, 0, row(saved, 0))
-        set_row(state.damping_factor, 0, row(saved, 1))
-        set_row(state.wear_depth, 0, row(saved, 2))
-        for pair in range(8):
-            state.mode[pair] = w.modes[pair]
-        state.step_start, state.step_size, state.elapsed, state.time = target, -1.0, 0.0, target
-        state.touching = state.events_at_once = 0
+        states[index] = saved[0]
+        _undo(state, w, target)
         _clear(totals)
-    return code
+    return code, steps
 
 
 @kernel()
@@ -149,7 +157,7 @@ def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, pea
 def advance_times(
     p,
     parts,
-    state,
+    states,
     w,
     totals,
     times,
@@ -168,13 +176,12 @@ def advance_times(
     error_estimate,
     bound,
 ) -> None:
-    """Advance to each time under the scene's own loads and write a row for each."""
+    """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
+    state, saved = states[0], np.empty(1, STATE)
     for i in range(times.size):
-        before = state.steps
-        status[i] = _advance(p, parts, state, w, totals, times[i], np.inf, before + budget, bound)
+        status[i], steps[i] = _advance(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound)
         if bound is not None:
             error_estimate[i] = bound.error[0]
-        steps[i] = state.steps - before
         _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth)
 
 
@@ -209,21 +216,20 @@ def advance_batch(
     A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
     bits alone. `work` and `totals` are arrays of one.
     """
-    w, sums, piece = work[0], totals[0], parts.segments[0]
+    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, STATE)
     for m in range(first, last):
         p, state = params[m], states[m]
         state.piece = 0
         for i in range(times.size):
-            before = state.steps
             span = times[i] - state.step_start
             piece.knot = state.step_start
             for j in range(3):
                 piece.start[j] = wrench[m, i, j]
                 piece.slope[j] = (wrench[m, i + 1, j] - wrench[m, i, j]) / span if span > 1e-100 else 0.0
-            status[m, i] = _advance(p, parts, state, w, sums, times[i], times[i], before + budget, bound)
+            code, steps[m, i] = _advance(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound)
+            status[m, i] = code
             if bound is not None:
                 error_estimate[m, i] = bound.error[0]
-            steps[m, i] = state.steps - before
             _read_row(
                 p, parts, state, w, sums, i, q[m], v[m], penetration[m], rate[m], force[m], peak[m], impulse[m],
                 makes[m], wear_depth[m],

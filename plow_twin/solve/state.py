@@ -200,8 +200,7 @@ WORK: Final = np.dtype(
         ("hessian", "f8", (3, 3)),
         ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
-        ("saved", "f8", (3, PAIR_COUNT)),  # y, damping factors and wear depths before an advance
-        ("modes", "i8", (PAIR_COUNT,)),  # and the modes
+        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
     ]
