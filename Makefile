@@ -1,6 +1,6 @@
 # Needs Python 3.11 or 3.12, make and nothing else; everything goes into $(VENV).
 .DELETE_ON_ERROR:
-.PHONY: demo test stress lint bench clean
+.PHONY: demo test stress lint docs lowest bench clean
 
 SUPPORTED := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
@@ -16,6 +16,10 @@ PYTEST_ARGS ?=
 # two processes, each with whole files: much of the time goes to compiling and to waiting for nodes
 PARALLEL ?= -n 2 --dist loadfile
 BENCH_ARGS ?=
+SITE ?= out/site
+LOWEST ?= .venv-lowest
+LOWEST_TESTS ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_solve_*.py test/test_run_*.py \
+	test/test_stream_*.py test/test_record_*.py test/test_ros_*.py)
 
 demo: $(INSTALLED)
 	"$(VENV)/bin/plow-twin" demo --speed $(SPEED) --out "$(OUT)"
@@ -23,12 +27,23 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	"$(VENV)/bin/python" -m pytest -m "not stress" $(PARALLEL) $(PYTEST_ARGS)
 
+# other examples each time; a failure is had again by the seed that is printed: make stress SEED=...
 stress: $(INSTALLED)
-	"$(VENV)/bin/python" -m pytest -m stress $(PARALLEL) $(PYTEST_ARGS)
+	@seed=$${SEED:-$$(od -An -N4 -tu4 /dev/urandom | tr -d " ")}; echo "SEED=$$seed"; \
+	"$(VENV)/bin/python" -m pytest -m stress --hypothesis-profile=stress --hypothesis-seed=$$seed $(PARALLEL) $(PYTEST_ARGS)
 
 lint: $(INSTALLED)
 	"$(VENV)/bin/ruff" check .
 	"$(VENV)/bin/mypy"
+	"$(VENV)/bin/codespell"
+
+# the pages as one site, the API reference from the docstrings; warnings and broken links are errors
+docs: $(INSTALLED)
+	"$(VENV)/bin/mkdocs" build --strict --quiet --site-dir "$(abspath $(SITE))"
+
+# core, record and node with the lowest versions that setup.py names
+lowest: $(LOWEST)/.installed
+	"$(LOWEST)/bin/python" -m pytest -m "not stress" $(PARALLEL) $(PYTEST_ARGS) $(LOWEST_TESTS)
 
 # the peers come on top; where they cannot all be installed, those that lack are named as not run
 bench: PIP := "$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt
@@ -42,6 +57,12 @@ $(INSTALLED): setup.py setup.cfg package.xml pyproject.toml requirements/constra
 	"$(VENV)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/constraints.txt -e ".[$(EXTRAS)]"
 	@touch "$@"
 
+$(LOWEST)/.installed: setup.py requirements/lowest.txt
+	test -x "$(LOWEST)/bin/python" || "$(PYTHON)" -m venv "$(LOWEST)"
+	"$(LOWEST)/bin/python" -m pip install --quiet --disable-pip-version-check -c requirements/lowest.txt \
+		-e ".[$(if $(AMENT_PREFIX_PATH),,ros,)record,test]"
+	@touch "$@"
+
 clean:
-	rm -rf .venv build dist install log out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-lowest build dist install log out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find plow_twin test -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 SKIPS = ROOT / "test" / "skips.txt"
@@ -29,6 +29,9 @@ def _prepare_environment() -> None:
 
 _prepare_environment()
 settings.register_profile("plow_twin", deadline=None, derandomize=True, database=None)
+# `make stress` asks for this one and prints the seed: other examples each time, shrunk when one fails
+FRESH = (Phase.explicit, Phase.generate, Phase.shrink)
+settings.register_profile("stress", deadline=None, derandomize=False, database=None, print_blob=True, phases=FRESH)
 settings.load_profile("plow_twin")
 
 

@@ -6,9 +6,13 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+
+from plow_twin.build import NUMERIC_ROOMS
+from plow_twin.kernel.compiler import KERNEL_FOLDERS
 
 PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
@@ -75,6 +79,53 @@ def test_imports_point_one_way(path: Path) -> None:
     libraries = {name.split(".")[0] for name in _imports(path)} - {"plow_twin", "numpy"} - sys.stdlib_module_names
     allowed = LIBRARIES.get(room, set())
     assert libraries <= allowed, f"{room} must not import {sorted(libraries - allowed)}"
+
+
+def _module_name(path: Path) -> str:
+    name = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+    return name.removesuffix(".__init__")
+
+
+def _module_imports(path: Path, modules: set[str]) -> set[str]:
+    """Return the package's modules that one imports: lazily and for the type checker too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [[alias.name] for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            # `from folder import module` or `from module import name`
+            names = [[f"{node.module}.{alias.name}", node.module or ""] for alias in node.names]
+        found |= {
+            next(name for name in candidates if name in modules) for candidates in names if {*candidates} & modules
+        }
+    return found - {_module_name(path)}
+
+
+def test_no_module_imports_itself_by_a_detour() -> None:
+    modules = {_module_name(path) for path in _modules()}
+    graph = {_module_name(path): _module_imports(path, modules) for path in _modules()}
+    assert graph["plow_twin.cli.simulate"] > {"plow_twin.run.simulate", "plow_twin.cli.console"}
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
+    """A kernel outside would be read from the cache after a change, and replayed as the same build."""
+    compiled = [path for path in _modules() if "plow_twin.kernel.compiler.kernel" in _imported_names(path)]
+    assert len(compiled) > 10
+    rooms = {path.relative_to(PACKAGE).parts[0] for path in compiled}
+    assert rooms <= {*KERNEL_FOLDERS} and {*KERNEL_FOLDERS} <= {*NUMERIC_ROOMS}
+    assert all((PACKAGE / room).is_dir() for room in (*KERNEL_FOLDERS, *NUMERIC_ROOMS))
+    # numba's own decorator stands in one file only, whose change numba sees: it calls no kernel of another
+    direct = {path.relative_to(PACKAGE).as_posix() for path in _modules() if "numba" in {*_imports(path)}}
+    assert {name for name in direct if not name.startswith("kernel/")} == {"build.py", "record/template.py"}
+    modules = {_module_name(path) for path in compiled}
+    assert not _module_imports(PACKAGE / "record/template.py", modules) and "record" in NUMERIC_ROOMS
+
+
+def _imported_names(path: Path) -> set[str]:
+    nodes = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+    return {f"{node.module}.{alias.name}" for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
 
 
 @pytest.mark.parametrize(

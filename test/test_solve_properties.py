@@ -234,7 +234,11 @@ def search(structure: str, examples: int, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(twin_module, "DEFAULT_BUDGET", BUDGET)
     ended: Counter[Status] = Counter()
 
-    @settings(max_examples=examples, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+    # a scene that fails is shrunk where there is time for it
+    shrinking = settings.get_current_profile_name() == "stress"
+    phases = [Phase.generate, Phase.shrink] if shrinking else [Phase.generate]
+
+    @settings(max_examples=examples, phases=phases, suppress_health_check=list(HealthCheck))
     @given(cases(structure))
     def every_scene_is_solved_or_named(case: Case) -> None:
         ended[check(case)] += 1

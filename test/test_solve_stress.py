@@ -77,7 +77,13 @@ def test_violent_samples_give_finite_rows_or_a_status(kind: str) -> None:
     for array in (series.q, series.v, series.force, series.peak, series.impulse):
         assert np.isfinite(array).all()
     good = series.status == Status.OK
-    assert good.all() or kind == "spikes of 1e9 N"
+    if kind == "spikes of 1e9 N":
+        # the first spike throws the head out of the model: named from there on, and the last good pose stays
+        left = int(np.argmin(good))
+        assert 0 < left < 100 and (series.status[left:] == Status.OUT_OF_RANGE).all()
+        assert (series.q[left:] == series.q[left - 1]).all()
+    else:
+        assert good.all()
     assert series.steps.max() < 10_000
 
 

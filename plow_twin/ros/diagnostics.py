@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from plow_twin.ros.inputs import TOPICS
+from plow_twin.ros.part import Part
 from plow_twin.stream.driver import StreamState, counters
 
 if TYPE_CHECKING:
@@ -19,9 +20,6 @@ OK, WARN, ERROR, STALE = (
     DiagnosticStatus.ERROR,
     DiagnosticStatus.STALE,
 )
-
-#: Level, message and values of one part.
-Part = tuple[bytes, str, dict[str, str]]
 
 #: Parts of /diagnostics with their keys and what each means.
 KEYS: Final[dict[str, dict[str, str]]] = {

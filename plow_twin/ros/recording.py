@@ -12,8 +12,8 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
-from plow_twin.ros.diagnostics import Part
 from plow_twin.ros.parameters import Settings
+from plow_twin.ros.part import Part
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Publication

@@ -29,7 +29,7 @@ from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
-    from plow_twin.ros.diagnostics import Part
+    from plow_twin.ros.part import Part
     from plow_twin.ros.recording import Recording
 
 _CATCH_UP_S: Final = 0.002

@@ -150,10 +150,9 @@ class TwinBatch:
             When the data has not the size of a snapshot.
         """
         sizes = np.cumsum([self._states.nbytes, self._wrench.nbytes])
-        if len(data) != sizes[-1] + self._params["wear_per_impulse"].size * 8:
-            raise ArgumentError(
-                f"snapshot: got {len(data)} bytes, expected {sizes[-1] + self._params['wear'].size * 8}"
-            )
+        whole = sizes[-1] + self._params["wear_per_impulse"].nbytes
+        if len(data) != whole:
+            raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {whole}")
         self._states[...] = np.frombuffer(data[: sizes[0]], STATE)
         self._wrench = np.frombuffer(data[sizes[0] : sizes[1]]).reshape(-1, 3).copy()
         self._params["wear_per_impulse"] = np.frombuffer(data[sizes[1] :]).reshape(

@@ -1,0 +1,45 @@
+"""What the checks promise: examples that are new each time under stress, versions that are really the lowest."""
+
+from __future__ import annotations
+
+import re
+import runpy
+import subprocess
+
+from hypothesis import Phase, settings
+from scenes import ROOT
+
+VERSION = re.compile(r"^([\w.-]+)>=([\d.]+)$")
+
+
+def dry_run(target: str, *variables: str) -> str:
+    command = ["make", "--dry-run", "--always-make", target, *variables]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+
+
+def test_stress_draws_new_examples_prints_its_seed_and_shrinks() -> None:
+    stress = settings.get_profile("stress")
+    assert not stress.derandomize and stress.database is None and Phase.shrink in stress.phases
+    line = dry_run("stress")
+    assert "--hypothesis-profile=stress --hypothesis-seed=$seed" in line and 'echo "SEED=$seed"' in line
+    assert "--hypothesis" not in dry_run("test") and settings.get_profile("plow_twin").derandomize
+
+
+def test_the_lowest_versions_are_those_that_setup_names(monkeypatch) -> None:
+    stated: dict[str, str] = {}
+
+    def setup(**keywords) -> None:
+        for line in (*keywords["install_requires"], *keywords["extras_require"]["record"]):
+            name, version = VERSION.fullmatch(line).groups()
+            stated[name] = version
+
+    monkeypatch.chdir(ROOT)
+    monkeypatch.setattr("setuptools.setup", setup)
+    runpy.run_path(str(ROOT / "setup.py"))
+    lines = (ROOT / "requirements" / "lowest.txt").read_text().splitlines()
+    lowest = dict(line.split("==") for line in lines if not line.startswith("#"))
+    assert lowest.keys() == stated.keys()
+    for name, version in stated.items():
+        # `6` is the first release of 6, `1.26` the last patch of 1.26
+        assert lowest[name].removesuffix(".*").split(".")[: len(version.split("."))] == version.split("."), name
+    assert "1.26" in lowest["numpy"]
