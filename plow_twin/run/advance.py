@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import ArgumentError
-from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.state import Status
+from plow_twin.solve.state import ROW, Status
 
 
 @dataclass(frozen=True)
@@ -75,17 +74,22 @@ class _Rows:
 class AdvanceSeries(_Rows):
     """Many advances at once: the fields of `Advance`, each with a leading axis of length n."""
 
+    @staticmethod
+    def of(times: NDArray[np.float64], rows: NDArray[np.void]) -> AdvanceSeries:
+        """Return the fields of the rows, shape (n,), that the kernels fill; they share memory."""
+        return AdvanceSeries(times, *_fields(rows))
+
     def __len__(self) -> int:
         return len(self.t)
 
     def __getitem__(self, index: int) -> Advance:
-        fields = {name: getattr(self, name)[index] for name in _ROW_FIELDS}
+        arrays = {name: getattr(self, name)[index] for name in _ARRAYS}
         return Advance(
             t=float(self.t[index]),
             steps=int(self.steps[index]),
             status=Status(int(self.status[index])),
             error_estimate_m=float(self.error_estimate_m[index]),
-            **fields,
+            **arrays,
         )
 
 
@@ -93,39 +97,25 @@ class AdvanceSeries(_Rows):
 class AdvanceBatch(_Rows):
     """Advances of m twins: the fields of `AdvanceSeries`, each but `t` with a leading axis of length m."""
 
+    @staticmethod
+    def of(times: NDArray[np.float64], rows: NDArray[np.void]) -> AdvanceBatch:
+        """Return the fields of the rows, shape (m, n), that the kernels fill; they share memory."""
+        return AdvanceBatch(times, *_fields(rows))
+
     def __len__(self) -> int:
         return len(self.status)
 
     def __getitem__(self, member: int) -> AdvanceSeries:
-        return AdvanceSeries(self.t, **{name: getattr(self, name)[member] for name in _COLUMNS})
+        return AdvanceSeries(self.t, *(getattr(self, field.name)[member] for field in fields(_Rows)[1:]))
 
 
-_ROW_FIELDS: Final = ("q", "v", "penetration", "rate", "force", "peak", "impulse", "makes", "wear_depth")
-_COLUMNS: Final = (*_ROW_FIELDS, "steps", "status", "error_estimate_m")
-#: Numbers in a row of each field.
-_WIDTHS: Final = {"q": (3,), "v": (3,), **dict.fromkeys(_ROW_FIELDS[2:], (PAIR_COUNT,))}
-_COUNTS: Final = ("makes", "steps", "status")
+_NAMES: Final = ROW.names or ()
+#: Fields of a row that are arrays.
+_ARRAYS: Final = _NAMES[: _NAMES.index("steps")]
 
 
-def empty_series(times: NDArray[np.float64]) -> AdvanceSeries:
-    """Return rows of zeros for one twin at n times."""
-    return AdvanceSeries(times, **_zeros((len(times),)))
-
-
-def empty_batch(times: NDArray[np.float64], members: int) -> AdvanceBatch:
-    """Return rows of zeros for m twins at n times."""
-    return AdvanceBatch(times, **_zeros((members, len(times))))
-
-
-def _zeros(shape: tuple[int, ...]) -> dict[str, Any]:
-    return {
-        name: np.zeros(shape + _WIDTHS.get(name, ()), np.int64 if name in _COUNTS else np.float64) for name in _COLUMNS
-    }
-
-
-def columns(out: AdvanceSeries | AdvanceBatch) -> tuple[NDArray[np.float64] | NDArray[np.int64], ...]:
-    """Return the arrays that the kernels fill, in their order."""
-    return tuple(getattr(out, name) for name in _COLUMNS)
+def _fields(rows: NDArray[np.void]) -> tuple[NDArray[Any], ...]:
+    return tuple(rows[name] for name in _NAMES)
 
 
 def check_times(now: float, times: NDArray[np.float64]) -> None:

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError
 from plow_twin.model.scene import Scene
-from plow_twin.run.advance import AdvanceBatch, check_times, columns, empty_batch
+from plow_twin.run.advance import AdvanceBatch, check_times
 from plow_twin.run.twin import DEFAULT_BUDGET
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.implicit import new_implicit
-from plow_twin.solve.state import PARAMS, SEGMENT, STATE, TOTALS, WORK, Parts, Terms, new_records, new_work
+from plow_twin.solve.state import PARAMS, ROW, SEGMENT, STATE, TOTALS, WORK, Parts, Terms, new_records, new_work
 
 __all__ = ["TwinBatch"]
 
@@ -115,10 +115,10 @@ class TwinBatch:
             raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape {shape} or {shape[1:]}")
         ends = np.empty((len(self), len(times) + 1, 3))
         ends[:, 0], ends[:, 1:] = self._wrench, samples
-        out = empty_batch(times, len(self))
-        self._run(times, ends / self._masses, columns(out))
+        rows = np.zeros((len(self), len(times)), ROW)
+        self._run(times, ends / self._masses, rows)
         self._wrench = ends[:, -1].copy()
-        return out
+        return AdvanceBatch.of(times, rows)
 
     def reset(self, t: float) -> None:
         """Go back to the scenes' initial states, at model time `t`."""
@@ -149,28 +149,24 @@ class TwinBatch:
         ValueError
             When the data has not the size of a snapshot.
         """
-        sizes = np.cumsum([self._states.nbytes, self._wrench.nbytes])
-        whole = sizes[-1] + self._params["wear_per_impulse"].nbytes
-        if len(data) != whole:
-            raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {whole}")
-        self._states[...] = np.frombuffer(data[: sizes[0]], STATE)
-        self._wrench = np.frombuffer(data[sizes[0] : sizes[1]]).reshape(-1, 3).copy()
-        self._params["wear_per_impulse"] = np.frombuffer(data[sizes[1] :]).reshape(
-            self._params["wear_per_impulse"].shape
-        )
+        wear = self._params["wear_per_impulse"]
+        ends = np.cumsum([self._states.nbytes, self._wrench.nbytes, wear.nbytes])
+        if len(data) != ends[-1]:
+            raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {ends[-1]}")
+        self._states[...] = np.frombuffer(data[: ends[0]], STATE)
+        self._wrench = np.frombuffer(data[ends[0] : ends[1]]).reshape(-1, 3).copy()
+        wear[...] = np.frombuffer(data[ends[1] :]).reshape(wear.shape)
 
     def digest(self) -> str:
         """Return 16 hexadecimal digits that stand for the exact state."""
         return hashlib.blake2b(self.snapshot(), digest_size=8).hexdigest()
 
-    def _run(
-        self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: tuple[NDArray[np.generic], ...]
-    ) -> None:
+    def _run(self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: NDArray[np.void]) -> None:
         def run(index: int) -> None:
             worker = self._workers[index]
             loop.advance_batch(
                 self._params, worker.parts, self._states, worker.work, worker.totals, *self._edges[index : index + 2],
-                times, ends, DEFAULT_BUDGET, *rows, None,
+                times, ends, DEFAULT_BUDGET, rows, None,
             )  # fmt: skip
 
         if self._pool is None:

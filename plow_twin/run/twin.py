@@ -13,12 +13,24 @@ from numpy.typing import ArrayLike, NDArray
 from plow_twin.errors import ArgumentError
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
-from plow_twin.run.advance import Advance, AdvanceSeries, check_times, columns, empty_series
+from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, per_mass, wear_rate
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
-from plow_twin.solve.state import PARAMS, STATE, TOTALS, WORK, Bound, State, Status, first_of, new_records, new_work
+from plow_twin.solve.state import (
+    PARAMS,
+    ROW,
+    STATE,
+    TOTALS,
+    WORK,
+    Bound,
+    State,
+    Status,
+    first_of,
+    new_records,
+    new_work,
+)
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
@@ -139,14 +151,14 @@ class Twin:
         check_times(self.time, times)
         if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
             raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
-        out = empty_series(times)
+        rows = np.zeros(len(times), ROW)
         ends = np.concatenate([self._wrench[None], samples])
         loop.advance_batch(
             self._params, self._parts, self._states, self._works, self._all_totals, 0, 1, times,
-            per_mass(self.scene, ends)[None], self._budget, *(rows[None] for rows in columns(out)), self._bound,
+            per_mass(self.scene, ends)[None], self._budget, rows[None], self._bound,
         )  # fmt: skip
         self._wrench = samples[-1].copy() if len(samples) else self._wrench
-        return out
+        return AdvanceSeries.of(times, rows)
 
     def advance_marked(
         self, t: NDArray[np.float64], wrench: NDArray[np.float64], marks: NDArray[np.int64], *, rows: bool = True
@@ -174,21 +186,23 @@ class Twin:
         check_times(self.time, t)
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
             raise ValueError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
-        out = empty_series(t) if rows else None
-        status = np.zeros(len(t), np.int64) if out is None else out.status
-        saved = np.zeros(len(marks), STATE)
+        out = np.zeros(len(t), ROW) if rows else None
+        status = np.zeros(len(t), np.int64)
+        snapshots = np.zeros(len(marks), STATE)
         per = per_mass(self.scene, np.concatenate([self._wrench[None], wrench]))
         loop.advance_marked(
-            self._params, self._parts, self._states, self._works, self._all_totals, t, per, self._budget, marks, saved,
-            status, None if out is None else columns(out)[:9],
+            self._params, self._parts, self._states, self._works, self._all_totals, t, per, self._budget, marks,
+            snapshots, status, out,
         )  # fmt: skip
         self._wrench = wrench[-1].copy() if len(wrench) else self._wrench
         speed = np.float64(self._travel_speed).tobytes()
         digests = [
             _digest(state.tobytes() + wrench[mark - 1].tobytes() + speed)
-            for state, mark in zip(saved, marks, strict=True)
+            for state, mark in zip(snapshots, marks, strict=True)
         ]
-        return MarkedAdvance(out, status, digests)
+        if out is not None:
+            out["status"] = status
+        return MarkedAdvance(None if out is None else AdvanceSeries.of(t, out), status, digests)
 
     def reset(self, t: float) -> None:
         """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
@@ -249,19 +263,12 @@ class Twin:
 
     def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
         check_times(self.time, times)
-        out = empty_series(times)
+        rows = np.zeros(len(times), ROW)
         loop.advance_times(
-            self._compiled.params,
-            self._parts,
-            self._states,
-            self._work,
-            self._totals,
-            times,
-            self._budget,
-            *columns(out),
+            self._compiled.params, self._parts, self._states, self._work, self._totals, times, self._budget, rows,
             self._bound,
-        )
-        return out
+        )  # fmt: skip
+        return AdvanceSeries.of(times, rows)
 
     def _end_step(self) -> None:
         loop.interrupt_step(self._compiled.params, self._parts, self._state, self._work, self._totals)

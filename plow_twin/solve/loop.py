@@ -140,77 +140,48 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
 
 
 @kernel()
-def _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth) -> None:
-    """Write row i: the state at the present time and the totals, which are cleared."""
+def _read_row(p, parts, state, w, totals, out) -> None:
+    """Write a `ROW`: the state at the present time and the totals, which are cleared."""
     y = w.moved
     _present(p, parts, state, w, y)
-    pose_of(p, y, parts.terms.offset, q[i], v[i])
-    _worn_now(state, w, parts.terms.wear, wear_depth[i])
-    pair_outputs(p, state, wear_depth[i], y, penetration[i], rate[i], force[i])
+    pose_of(p, y, parts.terms.offset, out.q, out.v)
+    _worn_now(state, w, parts.terms.wear, out.wear_depth)
+    pair_outputs(p, state, out.wear_depth, y, out.penetration, out.rate, out.force)
     for pair in range(8):
-        peak[i, pair] = max(totals.peak[pair], force[i, pair])
-        impulse[i, pair], makes[i, pair] = totals.impulse[pair], totals.makes[pair]
+        out.peak[pair] = max(totals.peak[pair], out.force[pair])
+        out.impulse[pair], out.makes[pair] = totals.impulse[pair], totals.makes[pair]
     _clear(totals)
 
 
 @kernel()
-def advance_times(
-    p,
-    parts,
-    states,
-    w,
-    totals,
-    times,
-    budget,
-    q,
-    v,
-    penetration,
-    rate,
-    force,
-    peak,
-    impulse,
-    makes,
-    wear_depth,
-    steps,
-    status,
-    error_estimate,
-    bound,
-) -> None:
-    """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
-    state, saved = states[0], np.empty(1, STATE)
-    for i in range(times.size):
-        status[i], steps[i] = _advance(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound)
-        if bound is not None:
-            error_estimate[i] = bound.error[0]
-        _read_row(p, parts, state, w, totals, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth)
+def _advance_row(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, out) -> None:
+    """Proceed to `target` and write all that a `ROW` tells of it."""
+    out.status, out.steps = _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound)
+    if bound is not None:
+        out.error_estimate = bound.error[0]
+    _read_row(p, parts, states[index], w, totals, out)
+
+
+@kernel(inline=True)
+def _follow_line(piece, start, time, before, sample) -> None:
+    """Let the load run straight from one sample, held at `start`, to the next one at `time`."""
+    span = time - start
+    piece.knot = start
+    for j in range(3):
+        piece.start[j] = before[j]
+        piece.slope[j] = (sample[j] - before[j]) / span if span > 1e-100 else 0.0
 
 
 @kernel()
-def advance_batch(
-    params,
-    parts,
-    states,
-    work,
-    totals,
-    first,
-    last,
-    times,
-    wrench,
-    budget,
-    q,
-    v,
-    penetration,
-    rate,
-    force,
-    peak,
-    impulse,
-    makes,
-    wear_depth,
-    steps,
-    status,
-    error_estimate,
-    bound,
-) -> None:
+def advance_times(p, parts, states, w, totals, times, budget, rows, bound) -> None:
+    """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
+    saved = np.empty(1, STATE)
+    for i in range(times.size):
+        _advance_row(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound, rows[i])
+
+
+@kernel()
+def advance_batch(params, parts, states, work, totals, first, last, times, wrench, budget, rows, bound) -> None:
     """Advance members `first` to `last` - 1 to each time: arrays but times have an axis of members in front.
 
     A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
@@ -221,46 +192,30 @@ def advance_batch(
         p, state = params[m], states[m]
         state.piece = 0
         for i in range(times.size):
-            span = times[i] - state.step_start
-            piece.knot = state.step_start
-            for j in range(3):
-                piece.start[j] = wrench[m, i, j]
-                piece.slope[j] = (wrench[m, i + 1, j] - wrench[m, i, j]) / span if span > 1e-100 else 0.0
-            code, steps[m, i] = _advance(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound)
-            status[m, i] = code
-            if bound is not None:
-                error_estimate[m, i] = bound.error[0]
-            _read_row(
-                p, parts, state, w, sums, i, q[m], v[m], penetration[m], rate[m], force[m], peak[m], impulse[m],
-                makes[m], wear_depth[m],
-            )  # fmt: skip
+            _follow_line(piece, state.step_start, times[i], wrench[m, i], wrench[m, i + 1])
+            _advance_row(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound, rows[m, i])
 
 
 @kernel()
-def advance_marked(params, parts, states, work, totals, times, wrench, budget, marks, saved, status, rows) -> None:
-    """Advance one twin to each time, as `advance_together` does, and save its state where `marks` say.
+def advance_marked(params, parts, states, work, totals, times, wrench, budget, marks, snapshots, status, rows) -> None:
+    """Advance one twin to each time, as `advance_batch` does, and save its state where `marks` say.
 
-    `marks` are numbers of advances, rising; `saved` has room for as many states. `rows` are the columns of the outputs
-    or None: then nothing is read out.
+    `marks` are numbers of advances, rising; `snapshots` has room for as many states. `rows` may be None: then nothing
+    is read out.
     """
-    w, sums, piece = work[0], totals[0], parts.segments[0]
+    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, STATE)
     p, state = params[0], states[0]
     state.piece = 0
     mark = 0
     for i in range(times.size):
-        span = times[i] - state.step_start
-        piece.knot = state.step_start
-        for j in range(3):
-            piece.start[j] = wrench[i, j]
-            piece.slope[j] = (wrench[i + 1, j] - wrench[i, j]) / span if span > 1e-100 else 0.0
-        status[i] = _advance(p, parts, state, w, sums, times[i], times[i], state.steps + budget, None)
+        _follow_line(piece, state.step_start, times[i], wrench[i], wrench[i + 1])
+        status[i] = _advance(p, parts, states, 0, saved, w, sums, times[i], times[i], budget, None)[0]
         if rows is not None:
-            q, v, penetration, rate, force, peak, impulse, makes, wear_depth = rows
-            _read_row(p, parts, state, w, sums, i, q, v, penetration, rate, force, peak, impulse, makes, wear_depth)
+            _read_row(p, parts, state, w, sums, rows[i])
         else:
             _clear(sums)
         while mark < marks.size and marks[mark] == i + 1:
-            saved[mark] = states[0]
+            snapshots[mark] = states[0]
             mark += 1
 
 
@@ -282,7 +237,7 @@ def interrupt_step(p, parts, state, w, totals) -> None:
 def lay_out_again(p, parts, state, w) -> None:
     """Compute the step under way once more after a restore: its series are not part of the state.
 
-    Only the scene's own loads leave a step under way, and there it has no hard end.
+    Only the scene's own loads leave a step under way, and there nothing stops it.
     """
     if state.at_rest == 1:
         write_rest(p, state, w)
@@ -290,10 +245,7 @@ def lay_out_again(p, parts, state, w) -> None:
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
         # what laying it out has changed
-        state.implicit_size, state.explicit_size = (
-            state.implicit_size_before,
-            state.explicit_size_before,
-        )
+        state.implicit_size, state.explicit_size = state.implicit_size_before, state.explicit_size_before
         state.overdamped = state.overdamped_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
     recoveries, implicit_steps = state.recoveries, state.implicit_steps

@@ -217,6 +217,20 @@ TOTALS: Final = np.dtype(
     ]
 )
 
+#: What an advance tells: the motion at its end, and what happened since the advance before (`run.advance.Advance`).
+ROW: Final = np.dtype(
+    [
+        ("q", "f8", (3,)),
+        ("v", "f8", (3,)),
+        *((name, "f8", (PAIR_COUNT,)) for name in ("penetration", "rate", "force", "peak", "impulse")),
+        ("makes", "i8", (PAIR_COUNT,)),
+        ("wear_depth", "f8", (PAIR_COUNT,)),
+        ("steps", "i8"),
+        ("status", "i8"),
+        ("error_estimate", "f8"),
+    ]
+)
+
 Params: TypeAlias = np.record
 State: TypeAlias = np.record
 Work: TypeAlias = np.record
