@@ -44,6 +44,7 @@ LIBRARIES = {
     "kernel": {"numba", "llvmlite"},
     "model": {"scipy"},
     "solve": {"scipy"},
+    "estimate": {"scipy"},
     "run": set(),
     "scene_file": {"yaml", "jsonschema"},
     "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite", "lz4", "zstandard", "isal"},

@@ -12,6 +12,7 @@ import click
 from plow_twin.build import package_version
 from plow_twin.cli.console import FAILED, WRONG_INPUT
 from plow_twin.cli.demo import demo
+from plow_twin.cli.estimate import estimate
 from plow_twin.cli.info import info
 from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
@@ -51,7 +52,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, replay, view, info, study):
+for _verb in (simulate, demo, estimate, replay, view, info, study):
     commands.add_command(_verb)
 
 

@@ -1,0 +1,206 @@
+"""Synthetic truths for the estimate: a scene, its motion, and what a sensor and a load telemetry make of it.
+
+The truth is simulated at a tolerance and with a load sampling of its own; in the groups outside the model its law, the
+shape of its load, its sensor or its machine is another one than the estimate believes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin import Clearance, Contact, Scene, Table, simulate
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.model.loads import compile_loads
+from plow_twin.scene_file import dump_scene, load_scene
+
+Array = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parent.parent
+#: Load period of the paper's scene in s.
+PERIOD = np.pi
+#: Distance of the samples of the true load in s.
+_FINE = 1e-3
+#: Where a shift, a jam or a stuck sensor begins, as a share of the window.
+_FROM = 0.55
+
+
+@dataclass(frozen=True)
+class Group:
+    """How the truths of a group are drawn."""
+
+    title: str
+    noise_m: float = 5e-4
+    rate_hz: float = 100.0
+    periods: float = 10.0
+    stiffness: tuple[float, float] = (5e6, 3e7)
+    law: str = "hunt_crossley"
+    exponent: float = 1.0
+    load_error: float = 0.05
+    bias_m: float = 0.0
+    delay_s: float = 0.0
+    gaps: bool = False
+    stochastic: bool = False
+    load_step: float = 0.01
+    third_harmonic: float = 0.0
+    load_scale: float = 1.0
+    jam_m: float = 0.0
+    shift_m: float = 0.0
+    stuck: bool = False
+    noisier: float = 1.0
+    #: whether model, or sensor, are to be found suspect
+    model: str = "ok"
+    sensor: str = "ok"
+
+
+GROUPS = {
+    "plain": Group("0.5 mm, 100 Hz, load to 5 %"),
+    "sensor": Group("with bias, delay, gaps, missing components", bias_m=1e-3, delay_s=0.05, gaps=True),
+    "quiet": Group("0.2 mm", noise_m=2e-4),
+    "noisy": Group("2 mm", noise_m=2e-3),
+    "slow": Group("10 Hz", rate_hz=10.0),
+    "stochastic": Group("stochastic load", stochastic=True, load_step=2e-3),
+    "coarse_load": Group("stochastic load, sampled at 100 Hz", stochastic=True),
+    "middle": Group("K 3e7 .. 3e8", stiffness=(3e7, 3e8)),
+    "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
+    "kelvin_voigt": Group("truth: Kelvin-Voigt", law="kelvin_voigt", model="suspect"),
+    "exponent": Group("truth: exponent 1.5", exponent=1.5, stiffness=(5e7, 3e8), model="suspect"),
+    "shape": Group("truth: third harmonic of 15 %", third_harmonic=0.15, model="suspect"),
+    "scale": Group("truth: 1.4 times the load", load_scale=1.4, model="suspect"),
+    "jam": Group("packed coal: 4 mm less from a moment on", jam_m=4e-3, model="suspect"),
+    "shift": Group("sensor shifted by 3 mm", shift_m=3e-3, sensor="suspect"),
+    "stuck": Group("sensor stuck", stuck=True, sensor="suspect"),
+    "noisier": Group("sensor 4 times noisier from a moment on", noisier=4.0, sensor="suspect"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What is true, and what the estimate gets."""
+
+    group: Group
+    scene: Scene
+    nominal: Scene
+    load: Load
+    poses: Poses
+    bias: Array
+    delay: float
+    gain: Array
+    folder_rows: dict[str, Array] = field(default_factory=dict)
+
+    @property
+    def clearance(self) -> Array:
+        """True clearances, shape (2,), in m."""
+        return np.array([self.scene.clearance.horizontal_m, self.scene.clearance.vertical_m])
+
+    def write(self, folder: Path) -> None:
+        """Write the folder that `plow-twin estimate` takes."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "scene.yaml").write_text(dump_scene(self.nominal), encoding="utf-8")
+        for name, header, table in (
+            ("load.csv", "t,fx,fy,m", np.column_stack([self.load.t, self.load.wrench])),
+            ("pose.csv", "t,x,y,theta", np.column_stack([self.poses.t, self.poses.q])),
+        ):
+            lines = [",".join("" if np.isnan(value) else repr(float(value)) for value in row) for row in table]
+            (folder / name).write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+
+
+def draw(group: Group, seed: int) -> Truth:
+    """Draw a truth; the same seed gives the same one."""
+    rng = np.random.default_rng([20261121, seed])
+    nominal = load_scene(ROOT / "config" / "paper.yaml")
+    end = group.periods * PERIOD
+    fine = np.arange(0.0, end + _FINE, _FINE)
+    believed = compile_loads(nominal.loads).at(fine)
+    if group.stochastic:
+        believed = believed + _cutting(rng, fine) * np.array([8e3, 4e3, 1.1e4])
+    gain = group.load_scale * (1.0 + group.load_error * rng.standard_normal(3))
+    true_load = believed * gain
+    if group.third_harmonic:
+        size = group.third_harmonic * np.abs(believed).max(axis=0)
+        true_load = true_load + size * np.sin(3.0 * 2.0 * np.pi / PERIOD * fine + 1.0)[:, None]
+    scene = replace(
+        nominal,
+        clearance=Clearance(*rng.uniform(0.018, 0.034, 2)),
+        contact=_contact(group, rng),
+        loads=(Table("cutting", fine, true_load),),
+    )
+    t = np.arange(0.0, end, 1.0 / group.rate_hz)
+    delay = group.delay_s * rng.uniform()
+    bias = group.bias_m * rng.standard_normal(3) * np.array([1.0, 1.0, 3.0])
+    q = _motion(scene, group, np.maximum(t - delay, 0.0), end) + bias
+    measured = _sensor(group, rng, t, q)
+    keep = _kept(group, rng, t, measured)
+    knots = np.arange(0.0, end + group.load_step, group.load_step)
+    wrench = np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
+    poses, _ = Poses.of(t[keep], measured[keep])
+    load, _ = Load.of(knots, wrench)
+    return Truth(group, scene, nominal, load, poses, bias, delay, gain)
+
+
+def _contact(group: Group, rng: np.random.Generator) -> Contact:
+    low, high = np.log(group.stiffness)
+    stiffness = float(np.exp(rng.uniform(low, high)))
+    damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
+    if group.law == "kelvin_voigt":
+        damping = 10.0 ** rng.uniform(4.5, 5.3)
+    return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
+
+
+def _cutting(rng: np.random.Generator, t: Array) -> Array:
+    """Return broad-band noise of unit variance, shape (n, 3): white noise through a low pass of 20 Hz, skewed."""
+    decay = np.exp(-2.0 * np.pi * 20.0 * (t[1] - t[0]))
+    drive = rng.gamma(4.0, 0.5, (len(t), 3)) - 2.0
+    out = np.zeros((len(t), 3))
+    for index in range(1, len(t)):
+        out[index] = decay * out[index - 1] + np.sqrt(1.0 - decay**2) * drive[index]
+    return out
+
+
+def _motion(scene: Scene, group: Group, times: Array, end: float) -> Array:
+    """Return the true poses at `times`, shape (n, 3)."""
+    if not group.jam_m:
+        run = simulate(scene, end, _FINE, 1e-6)
+        return np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)
+    first = simulate(scene, _FROM * end, _FINE, 1e-6)
+    table = scene.loads[0]
+    assert isinstance(table, Table)
+    later = replace(
+        scene,
+        clearance=Clearance(scene.clearance.horizontal_m - group.jam_m, scene.clearance.vertical_m - group.jam_m),
+        loads=(Table("later", table.t - _FROM * end + 1e-12, table.wrench),),
+        initial=replace(scene.initial, q=tuple(map(float, first.q[-1])), v=tuple(map(float, first.v[-1]))),
+    )
+    second = simulate(later, end - _FROM * end, _FINE, 1e-6)
+    t = np.concatenate([first.t, second.t[1:] + _FROM * end])
+    q = np.concatenate([first.q, second.q[1:]])
+    return np.stack([np.interp(times, t, column) for column in q.T], axis=1)
+
+
+def _sensor(group: Group, rng: np.random.Generator, t: Array, q: Array) -> Array:
+    noise = group.noise_m * np.array([1.0, 1.0, 4.0]) * rng.standard_normal(q.shape)
+    late = t > _FROM * t[-1]
+    noise[late] *= group.noisier
+    measured: Array = q + noise
+    component = int(rng.integers(0, 2))
+    measured[late, component] += group.shift_m
+    if group.stuck:
+        first = int(np.flatnonzero(late)[0])
+        measured[first:, component] = measured[first, component]
+    return measured
+
+
+def _kept(group: Group, rng: np.random.Generator, t: Array, measured: Array) -> NDArray[np.bool_]:
+    """Return which rows arrive; single components are blanked in place."""
+    keep = np.ones(len(t), dtype=bool)
+    if group.gaps:
+        for _ in range(4):
+            start = rng.uniform(0.0, t[-1] - 2.0)
+            keep &= ~((t > start) & (t < start + rng.uniform(0.3, 1.5)))
+        keep &= rng.random(len(t)) > 0.05
+        blank = rng.random(len(t)) < 0.3
+        measured[blank, rng.integers(0, 3, blank.sum())] = np.nan
+    return keep

@@ -1,0 +1,86 @@
+"""`plow-twin estimate`: clearances and contact from a measured motion, with intervals."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, json_option, output_console, quiet_option, table
+
+if TYPE_CHECKING:
+    from plow_twin.estimate.result import Estimate, Interval
+
+
+@click.command(
+    epilog="Exit codes: 0 done, also where an estimate is withdrawn; 1 failed; 2 wrong usage or scene; 3 done with "
+    "counted loss."
+)
+@click.argument("source", metavar="INPUT", type=click.Path(path_type=Path, exists=True))
+@click.option(
+    "--scene", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="Nominal scene; INPUT's by default."
+)
+@json_option
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for estimate.json.")
+@quiet_option
+def estimate(source: Path, scene: Path | None, as_json: bool, out: Path | None, quiet: bool) -> int:
+    """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
+
+    INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed) and pose.csv (t,
+    x, y, theta: the measured pose, a cell left empty was not measured).
+    """
+    from plow_twin.estimate.estimate import estimate as run
+    from plow_twin.estimate.estimate import warm_up
+    from plow_twin.estimate.measurements import Load, Poses
+    from plow_twin.record.measured import read_measured
+
+    if not source.is_dir():
+        raise click.UsageError(f"INPUT: got the file {source}, expected a folder with load.csv and pose.csv")
+    measured = read_measured(source, scene)
+    load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:])
+    poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:])
+    begin = time.perf_counter()
+    with busy("compiling", quiet or as_json):
+        warm_up(measured.scene)
+    compile_s, begin = time.perf_counter() - begin, time.perf_counter()
+    with busy("estimating", quiet or as_json):
+        result = run(measured.scene, load, poses, measured.unreadable + lost_load + lost_poses)
+    facts = {**result.as_dict(), "wall_s": time.perf_counter() - begin, "compile_s": compile_s}
+    text = json.dumps(facts, indent=2, allow_nan=False)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "estimate.json").write_text(text + "\n", encoding="utf-8")
+    if as_json:
+        click.echo(text)
+    elif not quiet:
+        _show(result)
+    return DONE_WITH_LOSS if result.lost else DONE
+
+
+def _show(result: Estimate) -> None:
+    rows: list[tuple[str, Interval | None, float, str, str]] = [
+        ("horizontal clearance", result.horizontal, 1e3, "mm", result.horizontal_state.value),
+        ("vertical clearance", result.vertical, 1e3, "mm", result.vertical_state.value),
+        ("stiffness", result.stiffness, 1.0, "N/m^n", ""),
+        ("damping", result.damping, 1.0, "", ""),
+        ("load gain fx", result.gain_fx, 1.0, "", ""),
+        ("load gain fy", result.gain_fy, 1.0, "", ""),
+        ("load gain m", result.gain_m, 1.0, "", ""),
+        ("bias x", result.bias_x, 1e3, "mm", ""),
+        ("bias y", result.bias_y, 1e3, "mm", ""),
+        ("bias theta", result.bias_theta, 1e3, "mrad", ""),
+        ("delay", result.delay, 1e3, "ms", ""),
+    ]
+    view = table(f"Estimate from {result.t_start:.2f} s to {result.t_end:.2f} s", "", "mean", "5 %", "95 %", "", "")
+    for name, value, factor, unit, state in rows:
+        if value is not None:
+            numbers: list[Any] = [f"{factor * number:.5g}" for number in (value.mean, value.p05, value.p95)]
+            view.add_row(name, *numbers, unit, state)
+    console = output_console()
+    console.print(view)
+    console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)
+    for reason in result.reasons:
+        console.print(f"  {reason}", highlight=False)

@@ -1,0 +1,165 @@
+"""From measurements to an estimate: one call for a whole window."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.fit import Fit, Problem
+from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
+from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.estimate.search import search
+from plow_twin.estimate.start import range_of_motion
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, SOFTNESS, Unknowns
+from plow_twin.estimate.verdict import Verdict, judge, sandwich
+from plow_twin.model.scene import Scene
+
+Array = NDArray[np.float64]
+
+#: Largest standard deviation in m with which a clearance counts as estimated.
+OBSERVED = 1e-3
+#: Least time in contact in s of the walls of both sides.
+TOUCHED = 0.02
+#: Pairs of the left, right, top and bottom walls of the cavity.
+_SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
+
+
+def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0) -> Estimate:
+    """Estimate clearances, contact, load gains and the sensor's bias and delay from one window of measurements.
+
+    Parameters
+    ----------
+    scene : Scene
+        The nominal scene: its clearances and contact numbers are priors only; geometry, masses and gravity hold.
+    load : Load
+        The load believed.
+    poses : Poses
+        The measured poses.
+    lost : int
+        Rows that were left out before.
+    """
+    unknowns = Unknowns(scene)
+    poses = poses.between(float(load.t[0]), float(load.t[-1]) + 1e-9)
+    if len(poses.t) < FEWEST_POSES:
+        return prior_of(unknowns, (float(load.t[0]), float(load.t[-1])), lost)
+    period = min(load.period(), float(poses.t[-1] - poses.t[0]))
+    forward = Forward(scene, load.thinned())
+    found = search(forward, unknowns, poses, period)
+    if found is None:
+        return _without_fit(unknowns, poses, lost)
+    problem, fit = found
+    return summarise(problem, fit, judge(problem, fit, period), lost)
+
+
+def warm_up(scene: Scene) -> None:
+    """Compile the kernel that a scene needs, or load it from the cache on disk."""
+    load = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
+    Forward(scene, load).run(
+        replace(scene, loads=(), wear=None),
+        np.ones(3),
+        np.zeros(1),
+        np.zeros((1, 6)),
+        np.array([0, 1]),
+        np.array([1e-3]),
+    )
+
+
+def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estimate:
+    """Turn a fit into values, intervals and states."""
+    unknowns, poses = problem.unknowns, problem.window.poses
+    covariance = _covariance(problem, fit)
+    deviation, shared = np.sqrt(np.diag(covariance)), fit.shared
+    suspect = bool(verdict.model or verdict.sensor)
+    least, _ = range_of_motion(unknowns.scene, poses)
+    clearances, states = [], []
+    for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
+        touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
+        observed = touched > TOUCHED and deviation[index] < OBSERVED
+        value = Interval.normal(shared[index], deviation[index])
+        if not observed:
+            value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
+        clearances.append(value.above(0.0))
+        states.append(State.WITHDRAWN if suspect else State.ESTIMATED if observed else State.NOT_OBSERVABLE)
+    normal = [Interval.normal(value, spread) for value, spread in zip(shared, deviation, strict=True)]
+    gain_fx, gain_fy, gain_m = normal[GAIN]
+    bias_x, bias_y, bias_theta = normal[BIAS]
+    return Estimate(
+        t_start=float(poses.t[0]),
+        t_end=float(poses.t[-1]),
+        horizontal=clearances[0],
+        vertical=clearances[1],
+        horizontal_state=states[0],
+        vertical_state=states[1],
+        stiffness=_stiffness(unknowns, normal[SOFTNESS]),
+        damping=_damping(unknowns, normal[DAMPING]),
+        gain_fx=gain_fx,
+        gain_fy=gain_fy,
+        gain_m=gain_m,
+        bias_x=bias_x,
+        bias_y=bias_y,
+        bias_theta=bias_theta,
+        delay=normal[DELAY],
+        noise=(float(fit.noise[0]), float(fit.noise[1]), float(fit.noise[2])),
+        model="suspect" if verdict.model else "ok",
+        sensor="suspect" if verdict.sensor else "ok",
+        reasons=(*verdict.model, *verdict.sensor),
+        lost=lost,
+        figures={**verdict.figures, "iterations": float(fit.iterations), "work": float(problem.forward.work)},
+    )
+
+
+def _covariance(problem: Problem, fit: Fit) -> Array:
+    """Return the covariance of the shared unknowns: as the noise gives it, or as the swings scatter if that is more."""
+    size = len(fit.shared)
+    plain = fit.covariance[:size, :size]
+    scattered = np.diag(sandwich(fit, 1.0 / problem.deviation**2))
+    # a ratio from some twenty swings is itself uncertain by a quarter
+    ratio = np.maximum(scattered / np.diag(plain), 1.0)
+    scale = np.sqrt(ratio)
+    covariance: Array = plain * np.outer(scale, scale)
+    return covariance
+
+
+def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, noise: Array) -> Interval:
+    """Return the prior's interval, cut off where the head has already been."""
+    nominal, spread = unknowns.nominal()[index], max(unknowns.deviations()[index], deviation[index])
+    return Interval.normal(nominal, spread).above(reach - 3.0 * float(np.hypot(noise[index], 1e-4)))
+
+
+def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
+    """Return the stiffness; where the contact is too hard to tell, the interval is open to the hard side."""
+    soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
+    if unknowns.within(np.full(11, psi.p05))[SOFTNESS] > psi.p05:
+        hard = max(hard, unknowns.hardest_believed)
+    return Interval(unknowns.stiffness_of(psi.mean), soft, hard)
+
+
+def _damping(unknowns: Unknowns, value: Interval) -> Interval | None:
+    if not unknowns.damped:
+        return None
+    numbers = [unknowns.damping_of(number) for number in (value.mean, value.p05, value.p95)]
+    return Interval(*numbers)
+
+
+def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estimate:
+    """Return what is known before anything is measured."""
+    nominal, spread = unknowns.nominal(), unknowns.deviations()
+    horizontal, vertical = (Interval.normal(nominal[i], spread[i]).above(0.0) for i in (GX, GY))
+    psi = Interval.normal(nominal[SOFTNESS], spread[SOFTNESS])
+    return Estimate(
+        *span, horizontal, vertical, State.PRIOR, State.PRIOR, stiffness=_stiffness(unknowns, psi), lost=lost
+    )
+
+
+def _without_fit(unknowns: Unknowns, poses: Poses, lost: int) -> Estimate:
+    """Return what can be said where no motion of the model comes near the measured one."""
+    return replace(
+        prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost),
+        horizontal_state=State.WITHDRAWN,
+        vertical_state=State.WITHDRAWN,
+        model="suspect",
+        reasons=("no motion of the model comes near the measured one",),
+    )

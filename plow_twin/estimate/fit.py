@@ -1,0 +1,325 @@
+"""Least squares of the measured motion over the unknowns and the state at the start of each swing.
+
+The window is cut into swings, each begun in flight between the walls, where the state is best known and a small error
+of it does no harm. Each is simulated from a state of its own (multiple shooting), so neither the last bounces of a hard
+contact nor an error of the load's model can grow from swing to swing. Levenberg-Marquardt minimises Huber's function of
+the residuals and the prior. Runs from displaced starting states show which moments of a swing cannot be foretold: the
+measurements there get less weight by just that much.
+
+References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
+Optimization, ch. 10; Huber, Robust Statistics, ch. 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, SIZE, Unknowns
+
+Array = NDArray[np.float64]
+
+#: Normalised residual from which a measurement counts less (Huber).
+HUBER = 3.0
+#: Weight of the variance that cannot be foretold: where there is any, the Jacobian is noise too and must count little.
+JITTER_WEIGHT = 100.0
+#: Its weight where fits are compared.
+_COMPARED_WEIGHT = 5.0
+#: Steps of the solver after which no further iteration begins: what a fit may cost is counted, not timed.
+MOST_WORK = 2_500_000
+#: Displacements of a starting state: m, m, rad, m/s, m/s, rad/s.
+_DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
+#: Prior standard deviations of a starting state about its guess.
+_START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
+#: Standard deviations of the displacements that probe what can be foretold.
+_PROBED_STATE = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
+_PROBED = np.array([5e-5, 5e-5, 2e-3, 5e-3, 2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0])
+#: Longest step of the iteration in units of the prior's standard deviation.
+_LONGEST_STEP = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """What is fitted.
+
+    starts : (s + 1,) model times in s at which swings begin, and the end of the last
+    states : (s, 6) guesses of x, y, theta and their rates there
+    """
+
+    poses: Poses
+    starts: Array
+    states: Array
+
+    @property
+    def swings(self) -> int:
+        """Number of swings."""
+        return len(self.states)
+
+
+@dataclass(eq=False)
+class Point:
+    """One set of unknowns with its runs.
+
+    shared, states : (11,), (s, 6)
+    swing : (n,) swing of each pose, -1 where it lies in none
+    residual : (n, 3) measured minus predicted; NaN where nothing was measured
+    rate : (n, 3) predicted rates
+    contact : (s, 8) time in contact of each pair in s
+    """
+
+    shared: Array
+    states: Array
+    swing: NDArray[np.int64]
+    residual: Array
+    rate: Array
+    contact: Array
+    cost: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The best point, its covariance and what is left over.
+
+    covariance : (11 + 6 s, 11 + 6 s)
+    noise : (3,) standard deviation of the measurements
+    variance : (n, 3) variance of each measurement as weighted
+    jitter : (n, 3) variance of what cannot be foretold
+    jacobian : (n, 3, 17) of the predicted measurements by the shared unknowns and the state of the own swing
+    """
+
+    point: Point
+    covariance: Array
+    noise: Array
+    variance: Array
+    jitter: Array
+    jacobian: Array
+    iterations: int
+    converged: bool
+
+    @property
+    def loss(self) -> float:
+        """Twice the negative logarithm of the likelihood, to compare fits of the same measurements."""
+        variance = self.noise**2 + _COMPARED_WEIGHT * self.jitter
+        there = np.isfinite(self.point.residual)
+        z = np.abs(self.point.residual[there]) / np.sqrt(variance[there])
+        return float(np.where(z <= HUBER, z * z, HUBER * (2.0 * z - HUBER)).sum() + np.log(variance[there]).sum())
+
+    @property
+    def shared(self) -> Array:
+        """The shared unknowns, shape (11,)."""
+        return self.point.shared
+
+    @property
+    def deviation(self) -> Array:
+        """Standard deviations of the shared unknowns, shape (11,)."""
+        deviation: Array = np.sqrt(np.diag(self.covariance)[:SIZE])
+        return deviation
+
+
+class Problem:
+    """A window of measurements, the prior and the forward model together.
+
+    `horizon` limits each swing to its first seconds.
+    """
+
+    def __init__(
+        self, forward: Forward, unknowns: Unknowns, window: Window, prior: tuple[Array, Array] | None = None,
+        horizon: float = np.inf,
+    ) -> None:  # fmt: skip
+        self.forward, self.unknowns, self.window, self.horizon = forward, unknowns, window, horizon
+        self.mean, self.deviation = prior or (unknowns.nominal(), unknowns.deviations())
+
+    def evaluate(self, shared: Array, states: Array) -> Point | None:
+        """Run the model; None where it leaves the model's range."""
+        window = self.window
+        times = window.poses.t - shared[DELAY]
+        swing = np.searchsorted(window.starts, times, side="right") - 1
+        swing[swing >= window.swings] = -1
+        swing[times - window.starts[np.maximum(swing, 0)] > self.horizon] = -1
+        rows = np.flatnonzero(swing >= 0)
+        # times rise, so a swing's rows lie together
+        edges = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
+        motions = self.forward.run(
+            self.unknowns.scene_of(shared), shared[GAIN], window.starts[:-1], states, edges, times[rows]
+        )  # fmt: skip
+        if motions is None:
+            return None
+        residual, rate = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
+        residual[rows] = window.poses.q[rows] - motions.q - shared[BIAS]
+        rate[rows], contact = motions.v, motions.contact
+        return Point(shared, states, swing, residual, rate, contact)
+
+    def cost(self, point: Point, variance: Array) -> float:
+        """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
+
+        A measurement that a point does not reach costs as much as one that fits.
+        """
+        z = np.abs(point.residual) / np.sqrt(variance)
+        loss = np.where(z <= HUBER, z * z, HUBER * (2.0 * z - HUBER))
+        lacking = np.isnan(loss) & np.isfinite(self.window.poses.q)
+        shift = (point.shared - self.mean) / self.deviation
+        moved = (point.states - self.window.states) / _START_SPREAD
+        return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum())
+
+    def linearise(self, point: Point) -> Array:
+        """Return the Jacobian of the prediction, shape (n, 3, 17): shared unknowns, then the own swing's state."""
+        jacobian = np.zeros((len(point.residual), 3, SIZE + 6))
+        for j in (j for j in MOVING if j != DAMPING or self.unknowns.damped):
+            jacobian[:, :, j] = self._quotient(point, j)
+        jacobian[:, :, BIAS] = np.eye(3)
+        jacobian[:, :, DELAY] = -point.rate
+        for j in range(6):
+            jacobian[:, :, SIZE + j] = self._quotient_by_state(point, j)
+        return jacobian
+
+    def _quotient(self, point: Point, index: int) -> Array:
+        step = self.unknowns.steps()[index]
+        for signed in (step, -step):
+            moved = point.shared.copy()
+            moved[index] += signed
+            moved = self.unknowns.within(moved)
+            change = moved[index] - point.shared[index]
+            other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
+            if other is not None:
+                # residuals fall where the prediction rises
+                quotient: Array = np.nan_to_num((point.residual - other.residual) / change)
+                return quotient
+        return np.zeros_like(point.residual)
+
+    def _quotient_by_state(self, point: Point, index: int) -> Array:
+        for signed in (_DISPLACED[index], -_DISPLACED[index]):
+            moved = point.states.copy()
+            moved[:, index] += signed
+            other = self.evaluate(point.shared, moved)
+            if other is not None:
+                quotient: Array = np.nan_to_num((point.residual - other.residual) / signed)
+                return quotient
+        return np.zeros_like(point.residual)
+
+
+def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations: int, seed: int = 0) -> Fit | None:
+    """Fit from a starting point; None where the model cannot be run there.
+
+    `noise`, shape (3,), is a first guess; `seed` draws the displacements that show what cannot be foretold.
+    """
+    point = problem.evaluate(problem.unknowns.within(shared), states)
+    if point is None:
+        return None
+    damping, converged, done = 1e-3, False, 0
+    jacobian = problem.linearise(point)
+    jitter = unforeseen(problem, point, jacobian, seed)
+    while done < iterations and problem.forward.work < MOST_WORK:
+        done += 1
+        noise = noise_of(point.residual, noise, jitter)
+        variance = noise**2 + JITTER_WEIGHT * jitter
+        point.cost = problem.cost(point, variance)
+        normal, gradient = normal_equations(problem, point, jacobian, variance)
+        trial, damping = _descend(problem, point, variance, normal, gradient, damping)
+        if trial is None:
+            converged = True
+            break
+        gained = point.cost - trial.cost
+        point = trial
+        jacobian = problem.linearise(point)
+        if gained < 0.3:
+            converged = True
+            break
+        jitter = unforeseen(problem, point, jacobian, seed)
+    noise = noise_of(point.residual, noise, jitter)
+    variance = noise**2 + JITTER_WEIGHT * jitter
+    point.cost = problem.cost(point, variance)
+    normal, _ = normal_equations(problem, point, jacobian, variance)
+    covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    return Fit(point, covariance, noise, variance, jitter, jacobian, done, converged)
+
+
+def normal_equations(problem: Problem, point: Point, jacobian: Array, variance: Array) -> tuple[Array, Array]:
+    """Return the matrix and the right-hand side of the normal equations, prior included."""
+    swings = problem.window.swings
+    size = SIZE + 6 * swings
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    z = np.abs(point.residual) / np.sqrt(variance)
+    weight = np.nan_to_num(np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / variance) * np.isfinite(point.residual)
+    residual = np.nan_to_num(point.residual)
+    for index in range(swings):
+        inside = point.swing == index
+        rows = jacobian[inside].reshape(-1, SIZE + 6)
+        weighted = rows * weight[inside].reshape(-1, 1)
+        places = np.concatenate([np.arange(SIZE), SIZE + 6 * index + np.arange(6)])
+        normal[np.ix_(places, places)] += weighted.T @ rows
+        gradient[places] += weighted.T @ residual[inside].ravel()
+    diagonal = np.diag_indices(size)
+    normal[diagonal] += np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / _START_SPREAD**2, swings)])
+    gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2
+    gradient[SIZE:] += ((problem.window.states - point.states) / _START_SPREAD**2).ravel()
+    return normal, gradient
+
+
+def _descend(
+    problem: Problem, point: Point, variance: Array, normal: Array, gradient: Array, damping: float
+) -> tuple[Point | None, float]:
+    """Return the next point, or None where no step gains, and the damping for the next step."""
+    scale = np.diag(normal)
+    deviations = np.concatenate([problem.deviation, np.tile(_START_SPREAD, problem.window.swings)])
+    for _ in range(6):
+        step = np.linalg.solve(normal + damping * np.diag(scale), gradient)
+        step *= min(1.0, _LONGEST_STEP / max(np.abs(step / deviations)[:SIZE].max(), 1e-12))
+        step = np.clip(step, -deviations, deviations)
+        shared = problem.unknowns.within(point.shared + step[:SIZE])
+        trial = problem.evaluate(shared, point.states + step[SIZE:].reshape(-1, 6))
+        if trial is not None:
+            trial.cost = problem.cost(trial, variance)
+            if trial.cost < point.cost:
+                return trial, max(damping * 0.2, 1e-6)
+        damping = max(damping * 8.0, 1e-3)
+    return None, damping
+
+
+def unforeseen(problem: Problem, point: Point, jacobian: Array, seed: int, probes: int = 3) -> Array:
+    """Return the variance by which the motion leaves its linearisation under small displacements, shape (n, 3).
+
+    Displaced points are run and compared with what the Jacobian foretells: smooth motion differs by little, the moments
+    after the last bounces of a hard contact by as much as they can.
+    """
+    rng = np.random.default_rng(seed)
+    total, count = np.zeros_like(point.residual), np.zeros_like(point.residual)
+    inside = point.swing >= 0
+    for _ in range(probes):
+        states = _PROBED_STATE * rng.standard_normal(point.states.shape)
+        shared = problem.unknowns.within(point.shared + _PROBED * rng.standard_normal(SIZE))
+        other = problem.evaluate(shared, point.states + states)
+        if other is None:
+            continue
+        change = np.zeros((len(inside), SIZE + 6))
+        change[:, :SIZE] = shared - point.shared
+        change[inside, SIZE:] = states[point.swing[inside]]
+        error = point.residual - other.residual - np.einsum("nij,nj->ni", jacobian, change)
+        there = np.isfinite(error)
+        total[there] += error[there] ** 2
+        count += there
+    return _spread(total / np.maximum(count, 1.0))
+
+
+def _spread(variance: Array, reach: int = 2) -> Array:
+    """Take the mean of each variance and its neighbours: a few probes tell it only roughly."""
+    padded = np.pad(variance, ((reach, reach), (0, 0)), mode="edge")
+    total = np.zeros_like(variance)
+    for shift in range(2 * reach + 1):
+        total += padded[shift : shift + len(variance)]
+    return total / (2 * reach + 1)
+
+
+def noise_of(residual: Array, before: Array, jitter: Array) -> Array:
+    """Return the standard deviation of each component's residuals by their median, shape (3,)."""
+    out = before.copy()
+    for i, column in enumerate(residual.T):
+        there = np.isfinite(column)
+        calm = there & (jitter[:, i] < 0.1 * before[i] ** 2)
+        there = calm if calm.sum() > 0.2 * there.sum() else there
+        if there.sum() > 10:
+            out[i] = 1.4826 * np.median(np.abs(column[there]))
+    return np.maximum(out, 1e-9)

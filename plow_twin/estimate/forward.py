@@ -1,0 +1,116 @@
+"""The forward model of the estimate: motions of one scene with other numbers, under the load believed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.measurements import Load
+from plow_twin.model.loads import Pieces
+from plow_twin.model.scene import Scene
+from plow_twin.solve.compiled_scene import compile_scene, inertias
+from plow_twin.solve.method.implicit import new_implicit
+from plow_twin.solve.restarts import run_restarts
+from plow_twin.solve.state import SEGMENT, STATE, TOTALS, Parts, Status, new_log, new_records, new_work
+
+Array = NDArray[np.float64]
+
+#: Tolerance of the pose relative to the clearance: a few micrometres, far below what sensors resolve.
+TOLERANCE = 1e-4
+#: Steps that one run may take for each second of motion, and beside them.
+_STEPS_PER_SECOND, _STEPS = 20_000, 2_000
+_LOG_SIZE = 4096
+#: Steps of the series that cost as much as an implicit one.
+_IMPLICIT_WORK = 10
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Poses and rates of all rows, shape (n, 3) each, and the time in contact of each pair and run in s, (s, 8)."""
+
+    q: Array
+    v: Array
+    contact: Array
+
+
+class Forward:
+    """Runs one scene with other numbers: all members have the same terms, so one compiled kernel serves them.
+
+    Parameters
+    ----------
+    scene : Scene
+        The nominal scene; its loads and its wear are not used.
+    load : Load
+        The load believed.
+    """
+
+    def __init__(self, scene: Scene, load: Load) -> None:
+        nominal = compile_scene(replace(scene, loads=(), wear=None), TOLERANCE, sampled=True)
+        self._terms = nominal.parts.terms
+        self._implicit = nominal.parts.implicit
+        if self._implicit is None and scene.contact.restitution is not None:
+            self._implicit = new_implicit()
+        pieces = Pieces.through(load.t, load.wrench)
+        self._start, self._slope = pieces.start / inertias(scene), pieces.slope / inertias(scene)
+        self._knots = pieces.knots
+        self._work, self._log = new_work(), new_log(_LOG_SIZE)
+        #: work done so far, in steps of the series
+        self.work = 0
+
+    def run(
+        self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array
+    ) -> Motions | None:
+        """Return the motions of `scene` under the load times `gain`, shape (3,), from several states.
+
+        Parameters
+        ----------
+        starts, states : ndarray, shape (s,), (s, 6)
+            Times in s and x, y, theta and their rates from which the runs begin.
+        edges : ndarray of int64, shape (s + 1,)
+            Run m fills the rows edges[m]:edges[m + 1].
+        times : ndarray, shape (n,)
+            Times of the rows in s, rising within each run and not before its start.
+
+        Returns
+        -------
+        Motions or None
+            None where the head leaves the model's range.
+        """
+        segments = np.zeros(len(self._knots), SEGMENT)
+        segments["knot"] = self._knots
+        segments["start"], segments["slope"] = self._start * gain, self._slope * gain
+        compiled = compile_scene(scene, TOLERANCE, sampled=True)
+        records = new_records(STATE, len(starts))
+        records["y"] = _bodies(states, scene.head.com_offset_m)
+        if self._terms.hysteretic is not None:
+            records["damping_factor"] = scene.contact.damping or 0.0
+        records["step_start"] = starts
+        records["time"] = starts
+        totals = new_records(TOTALS, len(starts))
+        q, v = np.zeros((len(times), 3)), np.zeros((len(times), 3))
+        spans = np.where(edges[1:] > edges[:-1], times[np.maximum(edges[1:], 1) - 1] - starts, 0.0)
+        budgets = (_STEPS_PER_SECOND * spans).astype(np.int64) + _STEPS
+        parts = Parts(self._terms, None, segments, self._implicit)
+        code = run_restarts(
+            compiled.params, parts, records, self._work, totals, self._log, edges, budgets, times, q, v
+        )  # fmt: skip
+        self.work += int(records["steps"].sum()) + _IMPLICIT_WORK * int(records["implicit_steps"].sum())
+        if code != Status.OK or not np.isfinite(q).all():
+            return None
+        return Motions(q, v, np.array(totals["time_in_contact"]))
+
+
+def _bodies(states: Array, offset: tuple[float, float]) -> Array:
+    """Convert poses and rates, shape (s, 6), to body coordinates, shape (s, 8) (`geometry.body_state`, row by row)."""
+    x, y, theta, vx, vy, omega = states.T
+    c, s = np.cos(theta), np.sin(theta)
+    rx, ry = offset
+    return np.stack(
+        [
+            c * x + s * y + rx, -s * x + c * y + ry, c * vx + s * vy - omega * ry, -s * vx + c * vy + omega * rx,
+            omega, c, s, theta,
+        ],
+        axis=1,
+    )  # fmt: skip

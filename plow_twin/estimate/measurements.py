@@ -1,0 +1,142 @@
+"""What the estimate starts from: the measured pose and the load believed, both as arrays on one clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.errors import PlowTwinError
+
+Array = NDArray[np.float64]
+
+#: Fewest measured poses from which anything is estimated.
+FEWEST_POSES = 20
+
+
+class EstimateError(PlowTwinError):
+    """The data cannot be used; says what was got and what is expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Measured poses.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Stamps in s, strictly increasing.
+    q : ndarray, shape (n, 3)
+        x, y [m] and theta [rad]; NaN where a component was not measured.
+    """
+
+    t: Array
+    q: Array
+
+    @staticmethod
+    def of(t: ArrayLike, q: ArrayLike) -> tuple[Poses, int]:
+        """Put rows in order of time; return them and how many had to be left out.
+
+        Rows without a finite stamp, without any finite component, or with a stamp that is there already are left out.
+
+        Raises
+        ------
+        EstimateError
+            For arrays of the wrong shape.
+        """
+        times, rows = np.asarray(t, dtype=np.float64), np.array(q, dtype=np.float64)
+        if times.ndim != 1 or rows.shape != (len(times), 3):
+            raise EstimateError(f"poses: got t {times.shape} and q {rows.shape}, expected (n,) and (n, 3)")
+        rows[~np.isfinite(rows)] = np.nan
+        index = _in_order(times, np.isfinite(rows).any(axis=1))
+        return Poses(times[index], rows[index]), len(times) - len(index)
+
+    def between(self, start: float, end: float) -> Poses:
+        """Return the poses stamped in [start, end)."""
+        inside = (self.t >= start) & (self.t < end)
+        return Poses(self.t[inside], self.q[inside])
+
+
+@dataclass(frozen=True, eq=False)
+class Load:
+    """The load believed, joined by straight lines; before the first and after the last sample the end value holds.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Times in s, strictly increasing.
+    wrench : ndarray, shape (n, 3)
+        Fx, Fy [N] and M [N m] about the cavity's centre, without gravity.
+    """
+
+    t: Array
+    wrench: Array
+
+    @staticmethod
+    def of(t: ArrayLike, wrench: ArrayLike) -> tuple[Load, int]:
+        """Put samples in order of time; return them and how many had to be left out (not finite, stamp repeated).
+
+        Raises
+        ------
+        EstimateError
+            For arrays of the wrong shape, or without two samples that can be used.
+        """
+        times, rows = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
+        if times.ndim != 1 or rows.shape != (len(times), 3):
+            raise EstimateError(f"load: got t {times.shape} and wrench {rows.shape}, expected (n,) and (n, 3)")
+        index = _in_order(times, np.isfinite(rows).all(axis=1))
+        if len(index) < 2:
+            raise EstimateError(f"load: got {len(index)} samples that can be used, expected at least 2")
+        return Load(times[index], rows[index]), len(times) - len(index)
+
+    def between(self, start: float, end: float) -> Load:
+        """Return the samples that matter in [start, end]."""
+        first = max(int(np.searchsorted(self.t, start, side="right")) - 1, 0)
+        last = min(int(np.searchsorted(self.t, end, side="left")) + 1, len(self.t))
+        return Load(self.t[first:last], self.wrench[first:last])
+
+    def period(self) -> float:
+        """Return the period in s of the strongest oscillation, or a tenth of the span where there is none."""
+        span = float(self.t[-1] - self.t[0])
+        count = int(min(max(64, 4 * len(self.t)), 8192))
+        grid = np.linspace(self.t[0], self.t[-1], count)
+        columns = np.stack([np.interp(grid, self.t, column) for column in self.wrench.T])
+        columns -= columns.mean(axis=1, keepdims=True)
+        sizes = columns.std(axis=1)
+        if not sizes.any():
+            return span / 10.0
+        columns /= np.where(sizes > 0.0, sizes, 1.0)[:, None]
+        power = (np.abs(np.fft.rfft(columns * np.hanning(count), axis=1)) ** 2).sum(axis=0)
+        power[:2] = 0.0
+        peak = int(np.argmax(power))
+        return span / peak if power[peak - 1 : peak + 2].sum() > 0.3 * power.sum() else span / 10.0
+
+    def thinned(self, share: float = 1e-3) -> Load:
+        """Leave out samples that straight lines give within `share` of the range (Ramer, Douglas and Peucker)."""
+        scale = np.ptp(self.wrench, axis=0)
+        rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
+        keep = np.zeros(len(rows), dtype=bool)
+        keep[[0, -1]] = True
+        stack = [(0, len(rows) - 1)]
+        while stack:
+            left, right = stack.pop()
+            if right - left < 2:
+                continue
+            part = slice(left + 1, right)
+            along = ((self.t[part] - self.t[left]) / (self.t[right] - self.t[left]))[:, None]
+            error = np.abs(rows[part] - rows[left] - along * (rows[right] - rows[left])).max(axis=1)
+            worst = int(np.argmax(error))
+            if error[worst] > share:
+                keep[left + 1 + worst] = True
+                stack += [(left, left + 1 + worst), (left + 1 + worst, right)]
+        return Load(self.t[keep], self.wrench[keep])
+
+
+def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
+    """Return the indices of usable rows in order of time, the first of equal stamps."""
+    candidates = np.flatnonzero(usable & np.isfinite(times))
+    _, first = np.unique(times[candidates], return_index=True)
+    index: NDArray[np.int64] = candidates[first]
+    return index

@@ -1,0 +1,120 @@
+"""What an estimate says: values with 90 % intervals, the state of each, and whether model and sensor can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from enum import Enum
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Quantile of the normal distribution at which a 90 % interval ends.
+NORMAL_P95: Final = 1.6448536269514722
+
+
+class State(Enum):
+    """How far a value can be relied on."""
+
+    ESTIMATED = "estimated"
+    NOT_OBSERVABLE = "not_observable"  #: the motion does not tell it: what was known before, with its interval
+    PRIOR = "prior"  #: nothing was measured
+    WITHDRAWN = "withdrawn"  #: model or sensor are suspect: the interval is not to be trusted
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A value with the 5 % and 95 % points of what it may be."""
+
+    mean: float
+    p05: float
+    p95: float
+
+    @staticmethod
+    def normal(mean: float, deviation: float) -> Interval:
+        """Return the interval of a normal distribution."""
+        half = NORMAL_P95 * float(deviation)
+        return Interval(float(mean), float(mean) - half, float(mean) + half)
+
+    def above(self, least: float) -> Interval:
+        """Return the interval of the same normal distribution cut off below `least`."""
+        from scipy.stats import truncnorm
+
+        deviation = (self.p95 - self.p05) / (2.0 * NORMAL_P95)
+        if deviation <= 0.0 or (least - self.mean) < -4.0 * deviation:
+            return self
+        cut = truncnorm((least - self.mean) / deviation, np.inf, loc=self.mean, scale=deviation)
+        return Interval(float(cut.mean()), float(cut.ppf(0.05)), float(cut.ppf(0.95)))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Everything that is estimated from one window.
+
+    Attributes
+    ----------
+    t_start, t_end : float
+        The window in s.
+    horizontal, vertical : Interval
+        Clearances in m; their states beside them.
+    stiffness, damping : Interval
+        K in N/m^n; the number that the law takes (its restitution, or its damping).
+    gain_fx, gain_fy, gain_m : Interval
+        Load over the load believed.
+    bias_x, bias_y, bias_theta : Interval
+        Measured minus true pose in m, m, rad.
+    delay : Interval
+        By which the stamps are later than the motion, in s.
+    noise : tuple of float
+        Standard deviation of the measured x, y, theta in m, m, rad.
+    model, sensor : str
+        `ok` or `suspect`; `reasons` says why.
+    lost : int
+        Rows that could not be used.
+    """
+
+    t_start: float
+    t_end: float
+    horizontal: Interval
+    vertical: Interval
+    horizontal_state: State
+    vertical_state: State
+    stiffness: Interval
+    damping: Interval | None = None
+    gain_fx: Interval | None = None
+    gain_fy: Interval | None = None
+    gain_m: Interval | None = None
+    bias_x: Interval | None = None
+    bias_y: Interval | None = None
+    bias_theta: Interval | None = None
+    delay: Interval | None = None
+    noise: tuple[float, float, float] | None = None
+    model: str = "ok"
+    sensor: str = "ok"
+    reasons: tuple[str, ...] = ()
+    lost: int = 0
+    figures: dict[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for JSON, as `plow-twin estimate --json` prints it."""
+
+        def clearance(value: Interval, state: State) -> dict[str, Any]:
+            return {"mean_m": value.mean, "p05_m": value.p05, "p95_m": value.p95, "state": state.value}
+
+        others = ("damping", "gain_fx", "gain_fy", "gain_m", "bias_x", "bias_y", "bias_theta", "delay")
+        return {
+            "t_start": self.t_start,
+            "t_end": self.t_end,
+            "horizontal": clearance(self.horizontal, self.horizontal_state),
+            "vertical": clearance(self.vertical, self.vertical_state),
+            "stiffness": asdict(self.stiffness),
+            **{name: asdict(value) for name in others if (value := getattr(self, name)) is not None},
+            "noise": None if self.noise is None else list(self.noise),
+            "model": self.model,
+            "sensor": self.sensor,
+            "reasons": list(self.reasons),
+            "lost": self.lost,
+            "figures": self.figures,
+        }

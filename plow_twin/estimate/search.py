@@ -1,0 +1,107 @@
+"""From nothing to the best fit: the horizon of each swing grows while the candidates become fewer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.fit import Fit, Problem, Window, fit
+from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.start import cut, first_vectors
+from plow_twin.estimate.unknowns import BIAS, DELAY, SOFTNESS, Unknowns
+
+Array = NDArray[np.float64]
+
+#: Periods in which candidates are compared.
+_FIRST_PERIODS = 3.0
+#: First guess of the noise: m, m, rad.
+_NOISE = np.array([1e-3, 1e-3, 4e-3])
+#: Penetration in m under the reference force below which a contact is hard: the head bounces long, and what it does
+#: after some bounces cannot be foretold.
+_HARD = 3e-3
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One round: the horizon as a share of the period, the iterations, and how many candidates stay after it."""
+
+    horizon: float
+    iterations: int
+    keep: int
+
+
+STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
+#: Shortest swing and horizon, as shares of the period, of hard and of soft contacts.
+_SHORT, _LONG = (0.04, 0.11), (0.35, np.inf)
+
+
+def search(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> tuple[Problem, Fit] | None:
+    """Return the best fit of all poses with its problem, or None where no start could be run."""
+    first = poses.between(float(poses.t[0]), float(poses.t[0]) + _FIRST_PERIODS * period)
+    window = cut(unknowns.scene, first, period, 0.2 * period)
+    vectors = first_vectors(Problem(forward, unknowns, window, horizon=STAGES[0].horizon * period), 6)
+    points = [(vector, states_at(window, vector), _NOISE) for vector in vectors]
+    fits: list[Fit] = []
+    for stage in STAGES:
+        problem = Problem(forward, unknowns, window, horizon=stage.horizon * period)
+        points = [(shared, better_states(problem, shared, states), noise) for shared, states, noise in points]
+        fits = [one for one in (fit(problem, *point, stage.iterations) for point in points) if one is not None]
+        fits = sorted(fits, key=lambda one: one.loss)[: stage.keep]
+        points = [(one.shared, one.point.states, one.noise) for one in fits]
+    return refine(forward, unknowns, poses, period, fits[0].shared, fits[0].noise) if fits else None
+
+
+def refine(
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array
+) -> tuple[Problem, Fit] | None:
+    """Fit all poses from a good start: the beginning of each swing first."""
+    shortest, horizon = _SHORT if np.exp(shared[SOFTNESS]) < _HARD else _LONG
+    window = cut(unknowns.scene, poses, period, shortest * period)
+    near = Problem(forward, unknowns, window, horizon=min(0.2, horizon) * period)
+    found = fit(near, shared, better_states(near, shared, states_at(window, shared)), noise, 8)
+    if found is None or horizon <= 0.2:
+        return None if found is None else (near, found)
+    whole = Problem(forward, unknowns, window, horizon=horizon * period)
+    found = fit(whole, found.shared, better_states(whole, found.shared, found.point.states), found.noise, 8)
+    return None if found is None else (whole, found)
+
+
+def states_at(window: Window, shared: Array) -> Array:
+    """Return the guesses of the starting states, freed of the bias, shape (s, 6)."""
+    states = window.states.copy()
+    states[:, :3] -= shared[BIAS]
+    return states
+
+
+def better_states(problem: Problem, shared: Array, states: Array) -> Array:
+    """Replace each starting state by the end of the swing before, where that fits the swing's first poses better."""
+    window, scene = problem.window, problem.unknowns.scene_of(shared)
+    gain = shared[4:7]
+    out, scale = states.copy(), np.maximum(np.nanstd(window.poses.q, axis=0), 1e-6)
+    times = window.poses.t - shared[DELAY]
+    for index in range(window.swings - 1):
+        span = window.starts[[index, index + 1]]
+        run = problem.forward.run(scene, gain, span[:1], out[index : index + 1], np.array([0, 1]), span[1:])
+        if run is None:
+            continue
+        reached = np.concatenate([run.q[0], run.v[0]])
+        rows = (times >= span[1]) & (times < span[1] + min(problem.horizon, 0.5 * (window.starts[index + 2] - span[1])))
+        if rows.sum() < 2:
+            out[index + 1] = reached
+            continue
+        both = np.stack([reached, out[index + 1]])
+        count = int(rows.sum())
+        runs = problem.forward.run(
+            scene, gain, np.repeat(span[1:], 2), both, np.array([0, count, 2 * count]), np.tile(times[rows], 2)
+        )
+        if runs is None:
+            continue
+        error = (np.tile(window.poses.q[rows] - shared[BIAS], (2, 1)) - runs.q) / scale
+        losses = [float(np.nanmean(np.minimum(part**2, 1.0))) for part in (error[:count], error[count:])]
+        if losses[0] < losses[1]:
+            out[index + 1] = reached
+    return out

@@ -1,0 +1,180 @@
+"""Where the fit starts: swings cut in flight, clearances from the range of motion, several stiffnesses tried."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.fit import Problem, Window
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GX, GY, SOFTNESS, Unknowns
+from plow_twin.model import geometry
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
+from plow_twin.model.scene import Scene
+
+Array = NDArray[np.float64]
+
+#: Penetrations in m under the reference force that are tried: hard and soft contacts.
+_PENETRATIONS = (1e-4, 7e-4, 1.5e-3, 2.5e-3, 4e-3, 6e-3, 8.5e-3, 1.2e-2, 1.7e-2, 2.4e-2, 4e-2)
+#: Spans in s of the parabolas that tell a starting state, and their misfit in standard deviations that will do.
+_SPANS, _FITS = (0.12, 0.09, 0.06), 1.4
+#: Moments tried for the start of a swing.
+_CANDIDATES = 12
+#: Distance from the walls from which the head counts as clear of them, in standard deviations of its noise.
+_CLEAR = 5.0
+
+
+def filled(poses: Poses) -> Array:
+    """Return the poses with gaps of single components bridged by straight lines, zeros for one never measured."""
+    out = np.zeros_like(poses.q)
+    for i, column in enumerate(poses.q.T):
+        there = np.isfinite(column)
+        if there.any():
+            out[:, i] = np.interp(poses.t, poses.t[there], column[there])
+    return out
+
+
+def smoothed(q: Array, width: int) -> Array:
+    """Return running medians over `width` rows."""
+    if width < 2 or len(q) < width:
+        return q
+    padded = np.pad(q, ((width // 2, width - 1 - width // 2), (0, 0)), mode="edge")
+    medians: Array = np.median(np.lib.stride_tricks.sliding_window_view(padded, width, axis=0), axis=-1)
+    return medians
+
+
+def reaches(scene: Scene, q: Array) -> Array:
+    """Return how far the corners reach toward the right, left, top and bottom walls beyond the frame's half size.
+
+    Shape (n, 4) in m; where a wall touches it is half of the clearance and the penetration.
+    """
+    rows = geometry.penetration_rows(scene)[:4]
+    c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
+    body = np.stack([c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1]], axis=1)
+    toward = body @ rows
+    half = np.array([scene.frame.width_m, scene.frame.width_m, scene.frame.height_m, scene.frame.height_m]) / 2.0
+    walls = (NORMAL_X > 0.0, NORMAL_X < 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)
+    return np.stack([toward[:, wall].max(axis=1) for wall in walls], axis=1) - half
+
+
+def smooth_width(poses: Poses, span: float = 0.06) -> int:
+    """Return how many rows lie in `span` seconds."""
+    return max(1, int(span / float(np.median(np.diff(poses.t)))))
+
+
+def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
+    """Return the clearances (2,) and the bias of x and y (2,) that the range of motion alone tells, in m."""
+    reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
+    right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
+    # seen from the head the corner goes left when the measured head goes right
+    return np.array([right + left, top + bottom]), 0.5 * np.array([left - right, bottom - top])
+
+
+def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
+    """Cut poses into swings, each begun in flight: away from the walls and on a parabola.
+
+    No swing is shorter than `shortest` in s.
+    """
+    interval = float(np.median(np.diff(poses.t)))
+    raw, t = filled(poses), poses.t
+    width = smooth_width(poses, 0.04)
+    reach = reaches(scene, smoothed(raw, width))
+    # distance from where the nearest wall touches
+    room = -(reach - np.quantile(reach, 0.99, axis=0)).max(axis=1)
+    noise = np.maximum(noise_level(raw), 1e-7)
+    clear = _CLEAR * np.hypot(*(noise[[0, 2]] * [1.0, geometry.half_diagonal(scene)])) / np.sqrt(width)
+    apart = max(shortest, 6 * interval)
+    starts, states = [float(t[0])], [_parabola(t, raw, float(t[0]), noise)[0]]
+    while t[-1] > starts[-1] + 2.0 * apart:
+        near = np.flatnonzero((t > starts[-1] + apart) & (t < starts[-1] + 2.0 * apart) & (room > clear))
+        if not len(near):
+            # nothing clear for long: a whole period at most is one swing
+            far = np.flatnonzero((t > starts[-1] + 2.0 * apart) & (room > clear))
+            end = min(float(t[far[0]]) if len(far) else np.inf, starts[-1] + period)
+            near = np.flatnonzero((t >= end) & (t < end + apart))
+            if not len(near) or t[-1] < end + apart:
+                break
+        near = near[np.argsort(-room[near], kind="stable")][:_CANDIDATES]
+        fits = [_parabola(t, raw, float(t[index]), noise) for index in near]
+        best = int(np.argmin([misfit for _, misfit in fits]))
+        starts.append(float(t[near[best]]))
+        states.append(fits[best][0])
+    return Window(poses, np.array([*starts, float(t[-1]) + 1e-6]), np.stack(states))
+
+
+def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, float]:
+    """Return pose and rate at `start` by parabolas through the poses about it, shape (6,), and how badly they fit.
+
+    The longest span that fits to the noise is taken: an impact within it would spoil the rates.
+    """
+    near, misfit = np.zeros(0, np.int64), np.inf
+    state = np.zeros(6)
+    for span in _SPANS:
+        low, high = np.searchsorted(t, [start - 0.5 * span, start + 0.5 * span])
+        if high - low < 6:
+            middle = int(np.searchsorted(t, start))
+            low, high = max(0, min(middle - 3, len(t) - 6)), max(0, min(middle - 3, len(t) - 6)) + 6
+        near = np.arange(low, min(high, len(t)))
+        basis = np.vander(t[near] - start, 3, increasing=True)
+        coefficients, *_ = np.linalg.lstsq(basis, q[near], rcond=None)
+        error = (q[near] - basis @ coefficients) / noise
+        now = float(np.sqrt((error**2).sum(axis=0) / max(len(near) - 3, 1)).max())
+        if now < misfit:
+            misfit, state = now, np.concatenate([coefficients[0], coefficients[1]])
+        if now < _FITS:
+            return np.concatenate([coefficients[0], coefficients[1]]), now
+    return state, misfit
+
+
+def noise_level(q: Array) -> Array:
+    """Return the standard deviation of what changes from row to row, by third differences, shape (3,)."""
+    if len(q) < 8:
+        return np.zeros(3)
+    level: Array = 1.4826 * np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / np.sqrt(20.0)
+    return level
+
+
+def first_vectors(problem: Problem, most: int) -> list[Array]:
+    """Return the most promising shared unknowns to start from, shape (11,) each, best first.
+
+    For each of several stiffnesses and dampings the clearances are set so that the simulated range of motion is the
+    measured one, and the delay so that the motions agree best.
+    """
+    unknowns, window = problem.unknowns, problem.window
+    measured, bias = range_of_motion(unknowns.scene, window.poses)
+    found: list[tuple[float, Array]] = []
+    for penetration in (None, *_PENETRATIONS):
+        for damping in (0.0, -1.0, 1.0) if unknowns.damped else (0.0,):
+            vector = unknowns.nominal()
+            vector[BIAS][:2] = bias
+            vector[DAMPING] += damping
+            if penetration is not None:
+                vector[SOFTNESS] = unknowns.softness_of(unknowns.force / penetration**unknowns.scene.contact.exponent)
+            vector[[GX, GY]] = measured - np.array([1.2, 1.6]) * np.exp(vector[SOFTNESS])
+            found += _matched(problem, vector, measured)
+    found.sort(key=lambda pair: pair[0])
+    return [vector for _, vector in found[:most]]
+
+
+def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
+    """Match the range of motion from a vector on; return what fits best with its loss, if it can be run."""
+    poses, unknowns = problem.window.poses, problem.unknowns
+    found = []
+    for _ in range(4):
+        vector = unknowns.within(vector)
+        states = problem.window.states.copy()
+        states[:, :3] -= vector[BIAS]
+        point = problem.evaluate(vector, states)
+        if point is None:
+            break
+        scale = np.nanstd(poses.q, axis=0)
+        error = point.residual / np.where(scale > 0.0, scale, 1.0)
+        found.append((float(np.nanmean(np.minimum(error * error, 1.0))), vector))
+        predicted = Poses(poses.t, poses.q - point.residual - vector[BIAS])
+        clearance, _ = range_of_motion(unknowns.scene, predicted)
+        vector = vector.copy()
+        vector[[GX, GY]] += 0.8 * (measured - clearance)
+    return sorted(found, key=lambda pair: pair[0])[:1]
+
+
+__all__ = ["DELAY", "Unknowns", "cut", "filled", "first_vectors", "range_of_motion"]

@@ -1,0 +1,141 @@
+"""What is estimated: the vector of unknowns, its prior, and the scene that a vector stands for.
+
+Softness stands for the stiffness: u = (F0 / K)^(1/n) is the penetration in m under the reference force F0, and the
+unknown is psi = ln(u + u0). For soft contacts it acts as ln K, for hard ones as the compliance: there the motion tells
+no more than that K is large, and psi has an end.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.scene import Clearance, Scene
+
+Array = NDArray[np.float64]
+
+GX: Final = 0
+GY: Final = 1
+SOFTNESS: Final = 2
+DAMPING: Final = 3
+GAIN: Final = slice(4, 7)
+BIAS: Final = slice(7, 10)
+DELAY: Final = 10
+SIZE: Final = 11
+NAMES: Final = (
+    "horizontal", "vertical", "softness", "damping", "gain_fx", "gain_fy", "gain_m",
+    "bias_x", "bias_y", "bias_theta", "delay",
+)  # fmt: skip
+#: Unknowns that change the motion; the others only change how it is measured.
+MOVING: Final = tuple(range(7))
+
+#: u0 in m: penetrations below it cannot be told from none.
+_RESOLVED = 1e-4
+#: Smallest softness in m that is simulated; harder contacts move the head alike.
+_HARDEST = 3e-5
+#: Largest softness in m.
+_SOFTEST = 0.12
+#: Smallest clearance in m that is simulated.
+_LEAST_CLEARANCE = 5e-4
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Standard deviations of the prior about the nominal scene."""
+
+    clearance_m: float = 8e-3
+    #: of ln(u + u0) and of ln of the damping (of the logit of a restitution)
+    softness: float = 2.5
+    damping: float = 1.2
+    gain: float = 0.07
+    bias_m: float = 5e-3
+    bias_rad: float = 0.02
+    delay_s: float = 0.05
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """The prior about a nominal scene, and what a vector of unknowns means."""
+
+    scene: Scene
+    spread: Spread = field(default_factory=Spread)
+    #: force F0 in N to which the softness refers
+    force: float = 1e5
+
+    @property
+    def damped(self) -> bool:
+        """Whether the law has a damping that can be estimated."""
+        contact = self.scene.contact
+        return bool(contact.damping) or (contact.restitution is not None and 0.0 < contact.restitution < 1.0)
+
+    def nominal(self) -> Array:
+        """Return the vector of the nominal scene, shape (11,)."""
+        contact, clearance = self.scene.contact, self.scene.clearance
+        vector = np.zeros(SIZE)
+        vector[[GX, GY]] = clearance.horizontal_m, clearance.vertical_m
+        vector[SOFTNESS] = self.softness_of(contact.stiffness)
+        if self.damped:
+            e = contact.restitution
+            vector[DAMPING] = math.log(e / (1.0 - e)) if e is not None else math.log(contact.damping or 1.0)
+        vector[GAIN] = 1.0
+        return vector
+
+    def deviations(self) -> Array:
+        """Return the prior's standard deviations, shape (11,)."""
+        s = self.spread
+        return np.array(
+            [
+                s.clearance_m, s.clearance_m, s.softness, s.damping if self.damped else 1e-6, s.gain, s.gain, s.gain,
+                s.bias_m, s.bias_m, s.bias_rad, s.delay_s,
+            ]
+        )  # fmt: skip
+
+    def steps(self) -> Array:
+        """Return the steps of difference quotients, shape (11,)."""
+        return np.array([2e-4, 2e-4, 0.05, 0.05, 0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0])
+
+    def softness_of(self, stiffness: float) -> float:
+        """Return psi of a stiffness."""
+        return math.log((self.force / stiffness) ** (1.0 / self.scene.contact.exponent) + _RESOLVED)
+
+    def stiffness_of(self, psi: float) -> float:
+        """Return the stiffness of psi, at most that of the hardest contact that is simulated."""
+        u = max(math.exp(psi) - _RESOLVED, _HARDEST)
+        return float(self.force / u**self.scene.contact.exponent)
+
+    @property
+    def hardest_believed(self) -> float:
+        """Stiffness up to which the prior reaches where the motion only tells that the contact is hard."""
+        return float(self.force / (1e-6) ** self.scene.contact.exponent)
+
+    def damping_of(self, value: float) -> float:
+        """Return the number that the law takes, its restitution or its damping."""
+        number = math.exp(float(np.clip(value, -30.0, 30.0)))
+        return min(number / (1.0 + number), 0.999) if self._restitution else number
+
+    def within(self, vector: Array) -> Array:
+        """Return the nearest vector that can be simulated."""
+        out = vector.copy()
+        out[[GX, GY]] = np.maximum(out[[GX, GY]], _LEAST_CLEARANCE)
+        out[SOFTNESS] = np.clip(out[SOFTNESS], math.log(_HARDEST + _RESOLVED), math.log(_SOFTEST + _RESOLVED))
+        if self._restitution:
+            out[DAMPING] = np.clip(out[DAMPING], -5.0, 5.0)
+        out[GAIN] = np.clip(out[GAIN], 0.2, 5.0)
+        return out
+
+    @property
+    def _restitution(self) -> bool:
+        return self.scene.contact.restitution is not None
+
+    def scene_of(self, vector: Array) -> Scene:
+        """Return the scene that a vector stands for."""
+        contact = replace(self.scene.contact, stiffness=self.stiffness_of(float(vector[SOFTNESS])))
+        if self.damped:
+            value = self.damping_of(float(vector[DAMPING]))
+            contact = replace(contact, restitution=value) if self._restitution else replace(contact, damping=value)
+        clearance = Clearance(float(vector[GX]), float(vector[GY]))
+        return replace(self.scene, clearance=clearance, contact=contact, loads=(), wear=None)

@@ -1,0 +1,229 @@
+"""Whether what is left over looks like noise: if not, the model or the sensor is not what it is taken for.
+
+Thresholds are set on seeds of their own (`benchmark/estimate.py --calibrate`); see docs/estimate.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.fit import Fit, Problem
+from plow_twin.estimate.start import noise_level
+from plow_twin.estimate.unknowns import BIAS, GAIN, GX, GY, SIZE
+
+Array = NDArray[np.float64]
+
+COMPONENTS = ("x", "y", "theta")
+
+#: Mean square of the residuals over that of their quick changes: 1 for white noise.
+MOST_COLOUR = 3.0
+#: Scatter of the residuals' means over the load's phase, over that within one phase: 1 where nothing repeats.
+MOST_REPEATED = 2.0
+#: Parts of a period that are told apart.
+PHASES = 24
+#: Gain beyond which the load is not what it is said to be.
+MOST_GAIN = 0.25
+#: Rows in a row with one and the same value, and the motion meanwhile in standard deviations of the noise.
+STUCK_ROWS, STUCK_MOTION = 12, 6.0
+#: Gain in chi^2 from which a change within the window counts, and its least size in m.
+CHANGE_CHI2, CHANGE_M = 60.0, 3e-4
+#: Quick noise of one part of the window over that of the rest.
+MOST_NOISE_RATIO = 2.0
+
+
+@dataclass
+class Verdict:
+    """What was found; `figures` are the statistics behind it."""
+
+    model: list[str] = field(default_factory=list)
+    sensor: list[str] = field(default_factory=list)
+    figures: dict[str, float] = field(default_factory=dict)
+
+
+def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
+    """Test the residuals of a fit; `period` is that of the load in s."""
+    verdict = Verdict()
+    _stuck(problem, fit, verdict)
+    _noise_change(fit, verdict)
+    _change_within(problem, fit, verdict)
+    _colour(fit, verdict)
+    _repeated(problem, fit, period, verdict)
+    for name, gain, deviation in zip(("fx", "fy", "m"), fit.shared[GAIN], fit.deviation[GAIN], strict=True):
+        excess = (abs(gain - 1.0) - MOST_GAIN) / max(deviation, 1e-9)
+        verdict.figures[f"gain_{name}"] = float(gain)
+        if excess > 2.0:
+            verdict.model.append(f"load {name}: {gain:.2f} times the load believed")
+    if not fit.converged:
+        verdict.figures["not_converged"] = 1.0
+    return verdict
+
+
+def foretold(fit: Fit) -> NDArray[np.bool_]:
+    """Return which measurements the model can foretell, shape (n, 3)."""
+    there: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
+    return there
+
+
+def _colour(fit: Fit, verdict: Verdict) -> None:
+    there = foretold(fit)
+    for i, name in enumerate(COMPONENTS):
+        quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
+        rows = fit.point.residual[there[:, i], i]
+        if quick <= 0.0 or len(rows) < 50:
+            continue
+        ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
+        # the ratio's own scatter: mean square and median of third differences
+        limit = 1.0 + (MOST_COLOUR - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
+        verdict.figures[f"colour_{name}"] = ratio
+        if ratio > limit and not verdict.sensor:
+            verdict.model.append(f"residual of {name}: {ratio:.2f} times its noise, expected at most {limit:.2f}")
+
+
+def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> None:
+    """Compare what the residuals have in common at the same phase of the load with what differs between periods.
+
+    An analysis of variance: what is left over by a wrong law, or a wrong shape of the load, comes again each period;
+    noise and disturbances do not, whatever their colour.
+    """
+    t, there = problem.window.poses.t, foretold(fit)
+    turns = np.floor((t - t[0]) / period).astype(int)
+    phase = np.minimum(((t - t[0]) / period % 1.0 * PHASES).astype(int), PHASES - 1)
+    between, within, cells = 0.0, 0.0, 0
+    freedom = 0
+    for i in range(3):
+        scale = fit.noise[i]
+        for k in range(PHASES):
+            inside = there[:, i] & (phase == k)
+            means = (
+                np.array([fit.point.residual[inside & (turns == turn), i].mean() for turn in np.unique(turns[inside])])
+                / scale
+            )
+            if len(means) < 3:
+                continue
+            between += len(means) * float(means.mean()) ** 2
+            within += float(((means - means.mean()) ** 2).sum())
+            cells += 1
+            freedom += len(means) - 1
+    if freedom < 30 or within <= 0.0:
+        return
+    ratio = (between / cells) / (within / freedom)
+    verdict.figures["repeated"] = ratio
+    if ratio > MOST_REPEATED and not verdict.sensor:
+        verdict.model.append(f"residuals repeat with the load: {ratio:.1f}, expected at most {MOST_REPEATED:g}")
+
+
+def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
+    """Return the standard deviation of one component by the changes between neighbours of the same swing."""
+    there = np.isfinite(residual)
+    value, part = residual[there], swing[there]
+    if len(value) < 10:
+        return 0.0
+    change = np.diff(value)[np.diff(part) == 0]
+    return float(1.4826 * np.median(np.abs(change)) / np.sqrt(2.0)) if len(change) else 0.0
+
+
+def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
+    measured = problem.window.poses.q
+    for i, name in enumerate(COMPONENTS):
+        column, residual = measured[:, i], fit.point.residual[:, i]
+        there = np.isfinite(column)
+        value, predicted = column[there], (column - residual)[there]
+        if len(value) < STUCK_ROWS:
+            continue
+        ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
+        lengths = np.diff(np.append(-1, ends))
+        for end, length in zip(ends[lengths >= STUCK_ROWS], lengths[lengths >= STUCK_ROWS], strict=True):
+            span = predicted[end - length + 1 : end + 1]
+            moved = float(np.nanmax(span) - np.nanmin(span)) if np.isfinite(span).any() else 0.0
+            if moved > STUCK_MOTION * max(noise_level(column[there][:, None])[0], 1e-5) or length > 50:
+                verdict.sensor.append(f"{name}: the same value {length} times in a row")
+                break
+
+
+def _noise_change(fit: Fit, verdict: Verdict) -> None:
+    for i, name in enumerate(COMPONENTS):
+        residual, swing = fit.point.residual[:, i], fit.point.swing
+        parts = [quick_noise(residual[index], swing[index]) for index in np.array_split(np.arange(len(residual)), 5)]
+        known = np.array([part for part in parts if part > 0.0])
+        if len(known) < 3:
+            continue
+        ratio = float(known.max() / np.median(known))
+        verdict.figures[f"noise_ratio_{name}"] = ratio
+        if ratio > MOST_NOISE_RATIO:
+            verdict.sensor.append(f"{name}: the noise of one part of the window is {ratio:.1f} times that of the rest")
+
+
+def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
+    """Look for the moment from which on a bias, or a clearance, is another one (score test, linearised)."""
+    blocks = swing_blocks(fit)
+    if len(blocks) < 6:
+        return
+    precision = np.diag(1.0 / problem.deviation**2)
+    normal = sum((block.normal for block in blocks), precision)
+    best: dict[str, tuple[float, Array, int]] = {}
+    for name, columns in (("bias", np.arange(SIZE)[BIAS]), ("clearance", np.array([GX, GY]))):
+        for split in range(2, len(blocks) - 1):
+            later_normal = sum((block.normal for block in blocks[split:]), np.zeros((SIZE, SIZE)))
+            later_score = sum((block.score for block in blocks[split:]), np.zeros(SIZE))
+            cross = later_normal[columns]
+            information = later_normal[np.ix_(columns, columns)] - cross @ np.linalg.solve(normal, cross.T)
+            information += precision[np.ix_(columns, columns)]
+            change = np.linalg.solve(information, later_score[columns])
+            gained = float(change @ later_score[columns])
+            if name not in best or gained > best[name][0]:
+                best[name] = (gained, change, split)
+    for name, (gained, _, _) in best.items():
+        verdict.figures[f"change_{name}"] = gained
+    (bias, shift, _), (clearance, growth, _) = best["bias"], best["clearance"]
+    if max(bias, clearance) < CHANGE_CHI2:
+        return
+    if bias >= clearance and (np.abs(shift) * [1.0, 1.0, 0.2]).max() > CHANGE_M:
+        verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
+    elif clearance > bias and np.abs(growth).max() > CHANGE_M:
+        verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Information and score of the shared unknowns in one swing, its starting state eliminated: (11, 11), (11,)."""
+
+    normal: Array
+    score: Array
+
+
+def swing_blocks(fit: Fit) -> list[Block]:
+    """Return information and score of each swing that has measurements."""
+    out = []
+    weight = np.where(np.isfinite(fit.point.residual), 1.0 / fit.variance, 0.0)
+    z = np.abs(np.nan_to_num(fit.point.residual)) / np.sqrt(fit.variance)
+    weight *= np.minimum(1.0, 3.0 / np.maximum(z, 1e-12))
+    residual = np.nan_to_num(fit.point.residual)
+    for index in range(len(fit.point.states)):
+        inside = fit.point.swing == index
+        if inside.sum() < 4:
+            continue
+        rows = fit.jacobian[inside].reshape(-1, SIZE + 6)
+        weighted = rows * weight[inside].reshape(-1, 1)
+        normal, score = weighted.T @ rows, weighted.T @ residual[inside].ravel()
+        own = normal[SIZE:, SIZE:] + np.diag(1e-6 + 1e-9 * np.diag(normal[SIZE:, SIZE:]))
+        gain = np.linalg.solve(own, normal[SIZE:, :SIZE]).T
+        out.append(Block(normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE], score[:SIZE] - gain @ score[SIZE:]))
+    return out
+
+
+def sandwich(fit: Fit, precision: Array) -> Array:
+    """Return the covariance of the shared unknowns that the scatter of the swings' scores gives, shape (11, 11).
+
+    Reference: White, Econometrica 50 (1982) 1: maximum likelihood of misspecified models.
+    """
+    blocks = swing_blocks(fit)
+    normal = sum((block.normal for block in blocks), np.diag(precision))
+    scores = np.stack([block.score for block in blocks]) if blocks else np.zeros((1, SIZE))
+    scores = scores - scores.mean(axis=0)
+    meat = scores.T @ scores * len(scores) / max(len(scores) - 1, 1) + np.diag(precision)
+    inverse = np.linalg.inv(normal)
+    covariance: Array = inverse @ meat @ inverse
+    return covariance

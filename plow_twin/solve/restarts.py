@@ -1,0 +1,38 @@
+"""One scene run many times, each time from a state of its own over an interval of its own, in one compiled call."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.loop import integrate
+from plow_twin.solve.modes import settle_modes
+from plow_twin.solve.state import Status
+
+_OK, _LOG_FULL = int(Status.OK), int(Status.LOG_FULL)
+
+
+@kernel()
+def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> int:
+    """Run state m through the times t[edges[m]:edges[m + 1]]; fill the same rows of q and v.
+
+    The states' place, rates and clock are set; which pairs touch is settled here. Returns the first `Status` that is
+    not OK, after which nothing more is run.
+    """
+    first = np.zeros(1, np.int64)
+    for m in range(states.size):
+        low, high = edges[m], edges[m + 1]
+        if low == high:
+            continue
+        settle_modes(p, states[m])
+        first[0] = 0
+        code = _LOG_FULL
+        while code == _LOG_FULL:
+            log.length[0] = 0
+            code = integrate(
+                p, parts, states[m], w, totals[m], log, t[high - 1], budgets[m], first, t[low:high], q[low:high],
+                v[low:high], None, None, None,
+            )  # fmt: skip
+        if code != _OK:
+            return code
+    return _OK

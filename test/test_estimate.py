@@ -1,0 +1,116 @@
+"""The estimate: intervals that hold on synthetic truths, and a word when they do not."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import ROOT, preset
+
+from plow_twin import Scene, Table, simulate
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.measurements import EstimateError, Load, Poses
+from plow_twin.estimate.result import Interval, State
+
+sys.path.insert(0, str(ROOT / "benchmark"))
+from estimate_truths import GROUPS, Truth, draw
+
+
+def estimated(truth: Truth) -> tuple[bool, bool]:
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
+    inside = [
+        value.p05 <= true <= value.p95
+        for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True)
+    ]
+    return inside[0], inside[1]
+
+
+def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
+    truth = draw(replace(GROUPS["sensor"], periods=6.0), 1)
+    truth.write(tmp_path)
+    # a row that is no number is counted, not guessed at
+    with (tmp_path / "pose.csv").open("a") as file:
+        file.write("99,what,0,0\n")
+    command = [sys.executable, "-m", "plow_twin", "estimate", str(tmp_path), "--json", "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 3, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts == json.loads((tmp_path / "out" / "estimate.json").read_text())
+    for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
+        value = facts[name]
+        assert value["state"] == "estimated" and value["p05_m"] < value["mean_m"] < value["p95_m"]
+        assert abs(value["mean_m"] - true) < 2e-4
+    assert facts["stiffness"]["mean"] == pytest.approx(truth.scene.contact.stiffness, rel=0.02)
+    assert facts["delay"]["mean"] == pytest.approx(truth.delay, abs=2e-3)
+    assert (facts["model"], facts["sensor"], facts["lost"]) == ("ok", "ok", 1)
+    assert facts["t_end"] > 18.0 and facts["wall_s"] > 0.0
+
+
+def test_intervals_hold_and_the_same_data_give_the_same_bits() -> None:
+    truths = [draw(replace(GROUPS["plain"], periods=5.0), seed) for seed in (2, 3)]
+    assert np.mean([estimated(truth) for truth in truths]) >= 0.75
+    again = [estimate(truths[0].nominal, truths[0].load, truths[0].poses) for _ in range(2)]
+    assert again[0] == again[1]
+
+
+@pytest.mark.parametrize("name", ["kelvin_voigt", "shape", "jam", "shift", "stuck"])
+def test_what_is_outside_the_model_is_flagged_and_withdrawn(name: str) -> None:
+    truth = draw(replace(GROUPS[name], periods=8.0), 5)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
+    assert result.horizontal_state is result.vertical_state is State.WITHDRAWN
+    assert result.reasons
+
+
+def test_a_wall_never_touched_is_not_observable() -> None:
+    """Pressed to the right for good, the head never meets the left wall: gx is what it was believed to be, or more."""
+    nominal = preset("paper")
+    t = np.arange(0.0, 20.0, 0.01)
+    wrench = np.stack([5e4 + 2e4 * np.sin(2.0 * t), 0.0 * t, -1e3 * np.sin(2.0 * t)], axis=1)
+    scene: Scene = replace(nominal, loads=(Table("one side", t, wrench),))
+    run = simulate(scene, 19.9, 0.01, 1e-6)
+    noise = np.random.default_rng(1).standard_normal(run.q.shape) * [5e-4, 5e-4, 2e-3]
+    poses, _ = Poses.of(run.t, run.q + noise)
+    load, _ = Load.of(t, wrench)
+    result = estimate(nominal, load, poses)
+    assert result.horizontal_state is not State.ESTIMATED
+    assert result.horizontal.p05 <= scene.clearance.horizontal_m <= result.horizontal.p95
+    assert result.horizontal.p95 - result.horizontal.p05 > 0.01
+
+
+def test_without_measurements_the_prior_is_what_there_is() -> None:
+    nominal = preset("paper")
+    load, _ = Load.of([0.0, 1.0], np.zeros((2, 3)))
+    poses, lost = Poses.of([0.1, 0.2, 0.2, np.nan], np.zeros((4, 3)))
+    result = estimate(nominal, load, poses, lost)
+    assert (result.horizontal_state, result.vertical_state, result.lost) == (State.PRIOR, State.PRIOR, 2)
+    assert result.horizontal.p05 < 0.025 < result.horizontal.p95
+
+
+def test_arrays_of_the_wrong_shape_are_named() -> None:
+    with pytest.raises(EstimateError, match=r"poses: got t \(2,\) and q \(3, 3\)"):
+        Poses.of([0.0, 1.0], np.zeros((3, 3)))
+    with pytest.raises(EstimateError, match="at least 2"):
+        Load.of([0.0], np.zeros((1, 3)))
+
+
+def test_a_load_is_thinned_within_its_share() -> None:
+    t = np.linspace(0.0, 10.0, 10_001)
+    load, _ = Load.of(t, np.stack([np.sin(2.0 * t), 0.0 * t, np.cos(2.0 * t)], axis=1) * 1e5)
+    thin = load.thinned(1e-3)
+    assert len(thin.t) < 500
+    for column, whole in zip(thin.wrench.T, load.wrench.T, strict=True):
+        assert np.abs(np.interp(t, thin.t, column) - whole).max() <= 1.001e-3 * 2e5
+    assert load.period() == pytest.approx(np.pi, rel=0.1)
+
+
+def test_an_interval_is_cut_off_where_the_head_has_been() -> None:
+    cut = Interval.normal(0.025, 0.008).above(0.03)
+    assert 0.03 < cut.p05 < cut.mean < cut.p95
+    assert Interval.normal(0.025, 0.001).above(0.0) == Interval.normal(0.025, 0.001)
