@@ -1,4 +1,4 @@
-"""The estimate on fresh synthetic truths, by group: errors, coverage, width, flags; beside what one would use otherwise.
+"""The estimate on fresh synthetic truths, by group: errors, coverage, width, flags; beside the range of motion.
 
     python benchmark/estimate.py --truths 10 --seed 1000          # all groups
     python benchmark/estimate.py --group plain --group hard --truths 20

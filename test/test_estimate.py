@@ -18,17 +18,7 @@ from plow_twin.estimate.measurements import EstimateError, Load, Poses
 from plow_twin.estimate.result import Interval, State
 
 sys.path.insert(0, str(ROOT / "benchmark"))
-from estimate_truths import GROUPS, Truth, draw
-
-
-def estimated(truth: Truth) -> tuple[bool, bool]:
-    result = estimate(truth.nominal, truth.load, truth.poses)
-    assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
-    inside = [
-        value.p05 <= true <= value.p95
-        for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True)
-    ]
-    return inside[0], inside[1]
+from estimate_truths import GROUPS, draw
 
 
 def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
@@ -54,14 +44,28 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
 
 def test_intervals_hold_and_the_same_data_give_the_same_bits() -> None:
     truths = [draw(replace(GROUPS["plain"], periods=5.0), seed) for seed in (2, 3)]
-    assert np.mean([estimated(truth) for truth in truths]) >= 0.75
-    again = [estimate(truths[0].nominal, truths[0].load, truths[0].poses) for _ in range(2)]
-    assert again[0] == again[1]
+    results = [estimate(truth.nominal, truth.load, truth.poses) for truth in truths]
+    inside = [
+        value.p05 <= true <= value.p95
+        for truth, result in zip(truths, results, strict=True)
+        for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True)
+    ]
+    assert sum(inside) >= 3
+    assert all((result.model, result.sensor) == ("ok", "ok") for result in results)
+    assert estimate(truths[0].nominal, truths[0].load, truths[0].poses) == results[0]
 
 
-@pytest.mark.parametrize("name", ["kelvin_voigt", "shape", "jam", "shift", "stuck"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "kelvin_voigt",
+        "jam",
+        "shift",
+        *(pytest.param(name, marks=pytest.mark.stress) for name in ("exponent", "shape", "scale", "stuck", "noisier")),
+    ],
+)
 def test_what_is_outside_the_model_is_flagged_and_withdrawn(name: str) -> None:
-    truth = draw(replace(GROUPS[name], periods=8.0), 5)
+    truth = draw(replace(GROUPS[name], periods=6.0), 1)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
     assert result.horizontal_state is result.vertical_state is State.WITHDRAWN
@@ -69,7 +73,7 @@ def test_what_is_outside_the_model_is_flagged_and_withdrawn(name: str) -> None:
 
 
 def test_a_wall_never_touched_is_not_observable() -> None:
-    """Pressed to the right for good, the head never meets the left wall: gx is what it was believed to be, or more."""
+    """Pressed to the right for good, the head never meets the left wall: gx is as before."""
     nominal = preset("paper")
     t = np.arange(0.0, 20.0, 0.01)
     wrench = np.stack([5e4 + 2e4 * np.sin(2.0 * t), 0.0 * t, -1e3 * np.sin(2.0 * t)], axis=1)

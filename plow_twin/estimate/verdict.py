@@ -21,7 +21,7 @@ COMPONENTS = ("x", "y", "theta")
 #: Mean square of the residuals over that of their quick changes: 1 for white noise.
 MOST_COLOUR = 3.0
 #: Scatter of the residuals' means over the load's phase, over that within one phase: 1 where nothing repeats.
-MOST_REPEATED = 2.0
+MOST_REPEATED = 1.5
 #: Parts of a period that are told apart.
 PHASES = 24
 #: Gain beyond which the load is not what it is said to be.
