@@ -116,13 +116,13 @@ class Probe:
     def figures(self, part: str) -> dict[str, str]:
         """Return the figures of a report that was sent after this call."""
         count = len(self.reports)
-        name = f"plow_twin: {part}"
+        name = f"{self.node.get_namespace()}/plow_twin: {part}"
         self.until(lambda: any(name in report for report in self.reports[count:]), f"diagnostics {part}")
         return {item.key: item.value for item in self.reports[-1][name].values}
 
     def until_figure(self, part: str, key: str, *expected: str, timeout_s: float = WAIT_S) -> None:
         """Wait until a figure of the diagnostics has one of the values."""
-        name = f"plow_twin: {part}"
+        name = f"{self.node.get_namespace()}/plow_twin: {part}"
         self.until(
             lambda: self.reports and name in self.reports[-1] and value(self.reports[-1][name], key) in expected,
             f"{part} {key} = {expected}",

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, TwistStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
 from rclpy.qos import ReliabilityPolicy
 from ros_processes import ROOT, bench, value
@@ -182,6 +184,90 @@ def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for
         assert stamp_ns(forces[-1].header) == T0 + 41 * MS
 
 
+def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tmp_path: Path) -> None:
+    scene = _scene_file(tmp_path, replace(PAPER, wear=WEAR))
+    record = tmp_path / "run"
+    with bench(tmp_path, scene=scene, excitation_timeout=0.2, record_path=record, **RELIABLE_INPUT) as running:
+        probe = running.probe
+        forces, quality = probe.listen(JointState, "contact_forces"), probe.listen(JointState, "quality")
+        send = probe.excitation()
+        wrench = compile_loads(PAPER.loads).at(np.arange(600) * 1e-3).tolist()
+        for index in range(300):
+            send(T0 + index * MS, wrench[index])
+            probe.pace(index)
+        probe.until(lambda: quality, "advances without a sample")
+        assert tuple(quality[0].name) == ("held", "corrected")
+        for index in range(300, 600):  # as late as that from now on
+            send(T0 + index * MS, wrench[index])
+            probe.pace(index)
+        probe.until(lambda: forces and stamp_ns(forces[-1].header) > T0 + 700 * MS, "silence again")
+        figures = probe.figures("input")
+        running.twin.stop()
+    assert figures["samples_used"] == "600"
+    assert 1 <= int(figures["rolled_back"]) < 300  # the first batch; what follows is on time again
+    marks = [tuple(message.position) for message in quality]
+    assert [mark for mark, _ in itertools.groupby(marks)] == [(1.0, 0.0), (0.0, 1.0), (0.0, 0.0), (1.0, 0.0)]
+    held = {stamp_ns(message.header) for message in quality if message.position[0]}
+    series = _offline(replace(PAPER, wear=WEAR), [T0 + index * MS for index in range(600)], np.array(wrench))
+    sampled = [message for message in forces if stamp_ns(message.header) not in held]
+    assert (np.array(sampled[-1].position) == series.penetration[-1]).all()
+    report = replay(record)
+    assert (report.exit_code, report.divergences) == (0, 0), report
+    assert report.compared["contact_peaks"] >= len(forces) and not report.not_compared
+    # what a subscriber received is what the file holds
+    topic = f"{running.namespace}/contact_forces"
+    recorded = [item.message() for item in RunReader(record) if getattr(item, "topic", "") == topic]
+    assert len(recorded) >= len(forces)
+    for ours, theirs in zip(forces, recorded, strict=False):
+        assert stamp_ns(ours.header) == theirs.stamp_ns
+        for quantity in ("position", "velocity", "effort"):
+            assert np.array(getattr(ours, quantity)).tobytes() == getattr(theirs, quantity).tobytes()
+
+
+def _pads(clearance: JointState) -> list[float]:
+    return [float(value) for value in clearance.position[2:10]]
+
+
+def test_wear_outlives_reset_clock_step_cleanup_and_restart_and_is_set_by_its_service_only(tmp_path: Path) -> None:
+    scene = _scene_file(tmp_path, replace(PAPER, wear=replace(WEAR, coefficient_m2_n=1e-12)))
+    kept = {"scene": scene, "excitation_timeout": 0.2, "wear_state_path": tmp_path / "wear", **RELIABLE_INPUT}
+    (tmp_path / "again").mkdir()
+    with bench(tmp_path, **kept) as running:
+        probe = running.probe
+        clearances, send = probe.listen(JointState, "clearance"), probe.excitation()
+        for index in range(600):
+            send(T0 + index * MS, (32e3, 0.0, -45e3))
+            probe.pace(index)
+        probe.until(lambda: clearances and stamp_ns(clearances[-1].header) > T0 + 900 * MS, "half a second of silence")
+        worn = _pads(clearances[-1])
+        assert max(worn) > 0.0
+        assert worn == _pads(next(item for item in clearances if stamp_ns(item.header) >= T0 + 700 * MS))
+        service = f"{running.namespace}/plow_twin"
+        assert probe.call(Trigger, f"{service}/reset", Trigger.Request()).success
+        send(T0 - 3_000 * MS, (0.0, 0.0, 0.0))
+        probe.until(lambda: stamp_ns(clearances[-1].header) < T0, "the step back")
+        assert _pads(clearances[-1]) == worn
+        for transition in (4, 2, 1, 3):  # deactivate, cleanup, configure, activate
+            request = ChangeState.Request(transition=Transition(id=transition))
+            assert probe.call(ChangeState, f"{service}/change_state", request).success
+        running.twin.stop()
+    saved = json.loads((tmp_path / "wear" / "wear.json").read_text())
+    assert [saved["depth_m"][name] for name in PAIR_NAMES] == worn
+    with bench(tmp_path / "again", **kept) as running:
+        probe = running.probe
+        clearances, send = probe.listen(JointState, "clearance"), probe.excitation()
+        send(T0, (0.0, 0.0, 0.0))
+        probe.until(lambda: clearances, "the wear of before")
+        assert _pads(clearances[-1]) == worn
+        assert probe.call(Trigger, f"{running.namespace}/plow_twin/set_wear", Trigger.Request()).success
+        probe.until(lambda: send(T0, (0.0, 0.0, 0.0)) or max(_pads(clearances[-1])) == 0.0, "new pads")
+        running.twin.stop()
+    assert set(json.loads((tmp_path / "wear" / "wear.json").read_text())["depth_m"].values()) == {0.0}
+    with bench(tmp_path / "again", "unconfigured", hardware_id="other", **kept) as running:
+        running.probe.until(lambda: running.probe.status[-1].level == b"\x02", "a refusal")
+        assert "wear of another head" in running.probe.status[-1].message
+
+
 def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> None:
     with bench(tmp_path, excitation_timeout=60.0) as running:
         probe = running.probe
@@ -195,30 +281,35 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         send(0, good)
         send(T0, good)
         send(T0 + 3 * MS, good, force_z=1.0)
-        send(T0 + 2 * MS, good)
+        send(T0 + 2 * MS, good)  # late, and worked in
+        send(T0 + 4 * MS, (1e8, 0.0, 0.0))
         other.publish(JointState(name=["fx1"], effort=[1.0]))
         send(T0 + 4 * MS, good)
-        probe.until(lambda: len(forces) == 3, "three good samples")
-        probe.until_figure("input", "samples_in", "10")
+        probe.until(lambda: len(forces) == 4, "four good samples")
+        probe.until_figure("input", "samples_in", "11")
         figures = probe.figures("input")
-        levels = {report["plow_twin: input"].level for report in probe.reports if "plow_twin: input" in report}
+        levels = {
+            status.level for report in probe.reports for name, status in report.items() if name.endswith(": input")
+        }
     dropped = {key: int(count) for key, count in figures.items() if key.startswith("dropped_")}
     assert {key: count for key, count in dropped.items() if count} == {
         "dropped_non_finite": 3,
         "dropped_unstamped": 1,
         "dropped_duplicate": 1,
-        "dropped_out_of_order": 1,
+        "dropped_implausible": 1,
         "dropped_not_selected": 1,
     }
+    assert figures["rolled_back"] == "1"
     assert figures["out_of_plane"] == "1"
     assert b"\x02" in levels  # an unstamped sample is an error
-    assert [stamp_ns(message.header) - T0 for message in forces] == [0, 3 * MS, 4 * MS]
+    assert [stamp_ns(message.header) - T0 for message in forces] == [0, 3 * MS, 3 * MS, 4 * MS]
     for quantity in ("position", "velocity", "effort"):
         assert np.isfinite(_column(forces, quantity)).all()
 
 
 def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> None:
-    with bench(tmp_path, excitation_timeout=60.0, failure_limit=3) as running:
+    no_limits = {"limit_force": "1e300", "limit_moment": "1e300"}
+    with bench(tmp_path, excitation_timeout=60.0, failure_limit=3, **no_limits) as running:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
         send = probe.excitation()
@@ -238,10 +329,12 @@ def test_an_absurd_load_gives_an_error_status_and_no_message(tmp_path: Path) -> 
         for index in (7, 8):
             send(T0 + index * MS, (0.0, 0.0, 0.0))
         probe.until_figure("state", "solver_failures", "5")
-        parts = [report["plow_twin: state"] for report in probe.reports]
+        parts = [report[f"{running.namespace}/plow_twin: state"] for report in probe.reports]
         levels = [part.level for part in parts if value(part, "solver_failures") == "5"]
         assert levels[0] == b"\x02"
-        probe.until(lambda: probe.reports[-1]["plow_twin: state"].level == b"\x00", "no failure since")
+        probe.until(
+            lambda: probe.reports[-1][f"{running.namespace}/plow_twin: state"].level == b"\x00", "no failure since"
+        )
     forces = forces[:2]
     assert [stamp_ns(message.header) - T0 for message in forces] == [0, 5 * MS]
 

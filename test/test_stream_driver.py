@@ -12,7 +12,7 @@ from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driver import Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
-from plow_twin.stream.journal import Entry, Hold, Reset, Sample
+from plow_twin.stream.journal import Entry, Hold, Reset, Sample, Unload
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
@@ -51,7 +51,7 @@ def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     for now_ms in (121, 131):
         assert driver.silence(now_ms * MS) is not None
     held = bench.journal[2:]
-    first: Entry = Sample(T0 + 21 * MS, (0.0, 0.0, 0.0)) if hold == "zero" else Hold(T0 + 21 * MS)
+    first: Entry = Unload(T0 + 21 * MS) if hold == "zero" else Hold(T0 + 21 * MS)
     assert held == [first, Hold(T0 + 31 * MS)]
     assert driver.state is StreamState.STALE
 

@@ -11,7 +11,19 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.messages import Message, Text, WrenchStamped
-from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset, Sample, Snapshot, Travel
+from plow_twin.stream.journal import (
+    Digest,
+    Entry,
+    Hold,
+    Loss,
+    Parameter,
+    Reset,
+    Sample,
+    SetWear,
+    Snapshot,
+    Travel,
+    Unload,
+)
 
 
 @dataclass(frozen=True)
@@ -24,8 +36,10 @@ class Dropped:
 
 _KINDS: Final[dict[str, type[Any]]] = {
     "hold": Hold,
+    "unload": Unload,
     "travel": Travel,
     "reset": Reset,
+    "wear": SetWear,
     "parameter": Parameter,
     "snapshot": Snapshot,
     "digest": Digest,
@@ -90,10 +104,16 @@ def _bytes(value: Any) -> bytes:
     return base64.b64decode(value, validate=True)
 
 
+def _floats(value: Any) -> tuple[float, ...]:
+    read = _exactly(float)
+    return tuple(read(item) for item in value)
+
+
 _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "int": _exactly(int),
     "float": _exactly(float, int),
     "str": _exactly(str),
     "bytes": _bytes,
+    "tuple[float, ...]": _floats,
     "ParameterValue": _exactly(bool, int, float, str),
 }

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 #: Base names of the topics that follow from the journal alone.
 FRAME_TOPICS: Final = ("contact_forces", "contact_peaks", "head_state", "clearance", "wear_rate")
+#: Names of `quality`: 1 where a publication was computed without a sample, and where late samples have been worked in.
+QUALITY_NAMES: Final = ("held", "corrected")
 
 #: Those of them that not every publication has.
 SLOW_TOPICS: Final = frozenset({"clearance", "wear_rate"})
@@ -37,6 +39,12 @@ def publication_messages(publication: Publication, frame_id: str, child_frame_id
         messages["clearance"] = JointState(stamp_ns, frame_id, CLEARANCE_NAMES, position=slow.clearance)
         messages["wear_rate"] = JointState(stamp_ns, frame_id, PAD_NAMES, velocity=slow.wear_rate)
     return messages
+
+
+def quality(publication: Publication, frame_id: str) -> JointState:
+    """Return the marks of a publication as position; sent only when it or the one before it is marked."""
+    marks = np.array([publication.held, publication.corrected], np.float64)
+    return JointState(publication.stamp_ns, frame_id, QUALITY_NAMES, position=marks)
 
 
 def publication_templates(frame_id: str, child_frame_id: str) -> dict[str, Template]:

@@ -45,7 +45,7 @@ from plow_twin.record.reader import (
 from plow_twin.record.template import Bytes, Indexes, Template, differs, read_numbers
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
-from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot
+from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot, Unload
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.session import Session
 
@@ -190,7 +190,9 @@ class _Replay:
         self.publications: Publications | None = (
             None  # of the last run of samples; its last publication may have messages to come
         )
-        self.session = Session(twin, header.origin_ns)
+        self.session = Session(
+            twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
+        )
         self.topics = {header.topic(name): name for name in FRAME_TOPICS}
         self.next_sequence = 0
         self.synced = False  # the session is where the live one was
@@ -209,6 +211,9 @@ class _Replay:
         breaks = np.ones(count, bool)  # entries that no run goes on into
         breaks[1:] = np.diff(entries.sequence) != 1
         breaks |= ~entries.sample
+        late = 1 + np.flatnonzero(np.diff(entries.stamp_ns) < 0)  # worked in one by one
+        breaks[late] = True
+        breaks[late[late + 1 < count] + 1] = True
         for index, entry in entries.others.items():
             if isinstance(entry, Digest) and index and entries.sequence[index] - entries.sequence[index - 1] == 1:
                 breaks[index] = False
@@ -234,7 +239,8 @@ class _Replay:
 
     def _is_run(self, entries: Entries, place: int) -> bool:
         expected = (int(entries.sequence[place]) - self.next_sequence) & _SEQUENCE_MASK == 0
-        return self.synced and expected and bool(entries.sample[place]) and self.session.twin.excitation == "sampled"
+        plain = self.session.plain and self.session.twin.excitation == "sampled"
+        return self.synced and expected and bool(entries.sample[place]) and plain
 
     def _messages(self, sent: _Sent, begin: int, end: int) -> None:
         for index in range(begin, end):
@@ -308,7 +314,7 @@ class _Replay:
         if isinstance(entry, Snapshot) and self.synced:
             entry = self.session.snapshot()  # with the windows of the publications that are written
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
-        publication = self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold) else None
+        publication = self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold | Unload) else None
         if publication is not None and publication.finite:
             places = np.array([record.sequence]), np.array([record.log_time_ns])
             self.sink.write_publications(*places, Publications.of([publication]))
@@ -415,7 +421,7 @@ class _Replay:
 
     def _apply(self, entry: Any) -> None:
         self.report.samples += isinstance(entry, Sample)
-        if isinstance(entry, Sample | Hold):
+        if isinstance(entry, Sample | Hold | Unload):
             self.report.steps += 1
             self.resumed = False
             self.first_ns = entry.stamp_ns if self.first_ns is None else self.first_ns

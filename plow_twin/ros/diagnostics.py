@@ -10,6 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from plow_twin.ros.inputs import TOPICS
 from plow_twin.ros.part import Part
 from plow_twin.stream.driver import StreamState, counters
+from plow_twin.stream.intake import Verdict
 
 if TYPE_CHECKING:
     from plow_twin.ros.runtime import Runtime
@@ -34,12 +35,15 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "real_time_factor_mean": "the same from the first to the newest advance [1]",
         "solver_failures": "failed advances",
         "resets": "resets of the model, by jumps, failures and the service",
+        "wear_saved": "folder that keeps the wear; empty: none",
+        "wear_error": "why the wear could not be saved; empty: it could",
     },
     "input": {
         "source": "excitation source in use",
         "samples_in": "samples that arrived on the excitation topics",
         "samples_used": "samples that the model was advanced to",
         "newest_sample_age_s": "the node's time minus the stamp of the newest sample used [s]; empty without one",
+        "rolled_back": "of these, samples that were late and have been worked in by going back",
         "samples_missing": "samples that expected_rate asks for and that never came",
         "samples_lost": "samples that the followed publisher sent and that never arrived, by its own numbering",
         "samples_not_followed": "samples of other publishers of the source than the one followed; not used",
@@ -49,8 +53,10 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "dropped_non_finite": "dropped: a number is not finite",
         "dropped_unstamped": "dropped: the stamp is zero or negative",
         "dropped_duplicate": "dropped: the stamp is that of the sample before",
-        "dropped_out_of_order": "dropped: older than the sample before, by less than jump_back",
-        "dropped_late": "dropped: newer than the sample before, but the hold policy has passed it",
+        "dropped_out_of_order": "dropped: older than the sample before by less than jump_back, and than rollback_span",
+        "dropped_late": "dropped: newer than the sample before, but behind the model and all it keeps",
+        "dropped_implausible": "dropped: larger, or changed faster, than limit_force and the others allow",
+        "dropped_unsteady": "dropped: the stamps jump again and again, and the model is not reset each time",
         "dropped_malformed": "dropped: names do not match the loads of the scene",
         "dropped_not_selected": "ignored: not the selected excitation source",
         "dropped_inactive": "ignored: the node was not active",
@@ -60,14 +66,18 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "holds": "advances under the hold policy",
         "travel_used": "speeds along the face used",
         "travel_dropped": "speeds along the face dropped",
+        "travel_implausible": "of these, larger than limit_travel",
         "head_pose_used": "measured poses used",
         "head_pose_dropped": "measured poses dropped",
+        "head_pose_implausible": "of these, larger than limit_pose",
         "head_pose_residual": "model minus newest measured pose: x, y [m], theta [rad]; empty without one",
         "refused_publishers": "publishers of incompatible quality of service",
     },
     "output": {
         "published": "messages on contact_forces",
         "withheld": "messages not published because a number was not finite",
+        "held": "of the messages published, those computed without a sample",
+        "corrected": "of the messages published, those after late samples have been worked in",
         "latency_p50_ms": "reception of a sample to publication of its forces, median [ms]",
         "latency_p99_ms": "the same, 99 % [ms]",
         "latency_max_ms": "the same, largest [ms]",
@@ -86,7 +96,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
 #: Keys of `status` and what each means.
 STATUS_KEYS: Final[dict[str, str]] = {
     "lifecycle": "unconfigured, inactive, active or finalized",
-    "stream": "waiting, running, stale or failed",
+    "stream": "waiting, running, stale, ended or failed",
     "stale_inputs": "inputs that have gone silent, separated by commas",
     "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated or not_observable",
     "vertical": "the same of the vertical clearance",
@@ -104,7 +114,13 @@ def markdown_tables() -> dict[str, str]:
     }
 
 
-_LEVELS: Final = {StreamState.WAITING: OK, StreamState.RUNNING: OK, StreamState.STALE: WARN, StreamState.FAILED: ERROR}
+_LEVELS: Final = {
+    StreamState.WAITING: OK,
+    StreamState.RUNNING: OK,
+    StreamState.STALE: WARN,
+    StreamState.ENDED: ERROR,
+    StreamState.FAILED: ERROR,
+}
 
 
 def status(
@@ -123,12 +139,14 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None) -> tuple[bytes
         return (ERROR if reason else OK), reason or lifecycle, values
     state = runtime.driver.state
     values["stream"] = state.name.lower()
-    values["stale_inputs"] = "excitation" if state is StreamState.STALE else ""
+    values["stale_inputs"] = "excitation" if state in (StreamState.STALE, StreamState.ENDED) else ""
     values |= dict.fromkeys(("horizontal", "vertical", "pads"), "prior")
     values |= {f"publishers_{topic}": str(count) for topic, count in runtime.inputs.publishers.items()}
     if lifecycle != "active":
         return OK, lifecycle, values
     message = f"{state.value}: {runtime.driver.failure}" if state is StreamState.FAILED else state.value
+    if runtime.unsteady:
+        return ERROR, f"{message}; the stamps jump again and again: too many resets, samples are dropped", values
     if runtime.inputs.other_sender:
         return max(_LEVELS[state], WARN), f"{message}; another publisher sends too and is not followed", values
     return _LEVELS[state], message, values
@@ -160,6 +178,11 @@ class Health:
                 "solver_failures": str(driver.failures),
                 "resets": str(driver.resets),
             }
+            keeper = runtime.wear_keeper
+            if keeper is not None:
+                values |= {"wear_saved": str(keeper.folder), "wear_error": keeper.error}
+                if keeper.error:
+                    level, message = ERROR, keeper.error
         return level, message, values
 
     def input(self, runtime: Runtime) -> Part:
@@ -177,6 +200,8 @@ class Health:
             "messages_lost": str(inputs.lost),
             "travel_used": str(inputs.travel.used),
             "travel_dropped": str(inputs.travel.arrived - inputs.travel.used),
+            "travel_implausible": str(inputs.travel.counts[Verdict.IMPLAUSIBLE]),
+            "head_pose_implausible": str(inputs.head_pose.counts[Verdict.IMPLAUSIBLE]),
             "head_pose_used": str(inputs.head_pose.used),
             "head_pose_dropped": str(inputs.head_pose.arrived - inputs.head_pose.used),
             "head_pose_residual": "" if residual is None else "{:.6g} {:.6g} {:.6g}".format(*residual),
@@ -190,9 +215,9 @@ class Health:
         grown = self._grown({**counted, **more}, _TROUBLE)
         if peak > inputs.depth // 2:
             grown.insert(0, f"input queue at {peak} of {inputs.depth}")
-        if runtime.driver.state is StreamState.STALE:
+        if runtime.driver.state in (StreamState.STALE, StreamState.ENDED):
             grown.insert(0, "excitation stale")
-        if "dropped_unstamped" in grown:
+        if "dropped_unstamped" in grown or "dropped_unsteady" in grown:
             return ERROR, "; ".join(grown), values
         return (WARN if grown else OK), "; ".join(grown) or "no trouble since the last report", values
 
@@ -202,6 +227,8 @@ class Health:
         values = {
             "published": str(runtime.published),
             "withheld": str(runtime.withheld),
+            "held": str(runtime.held_frames),
+            "corrected": str(runtime.corrected_frames),
             "latency_p50_ms": _ms(latency.quantile(0.5)),
             "latency_p99_ms": _ms(latency.quantile(0.99)),
             "latency_max_ms": _ms(latency.largest_s) if latency.count else "",
@@ -240,6 +267,9 @@ _TROUBLE: Final = (
     "dropped_duplicate",
     "dropped_out_of_order",
     "dropped_late",
+    "dropped_implausible",
+    "dropped_unsteady",
+    "rolled_back",
     "dropped_malformed",
     "dropped_not_selected",
     "jumps_back",

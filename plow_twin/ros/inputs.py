@@ -21,6 +21,7 @@ from plow_twin.ros.messages import ToolForces, read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.limits import Limits
 from plow_twin.stream.senders import Senders
 
 #: Depth of the optional inputs' queues.
@@ -103,6 +104,11 @@ class Inputs:
         except BaseException:  # an override of the quality of service may be wrong for any of them
             self.close()
             raise
+
+    def set_limits(self, travel_m_s: float, pose_m: float) -> None:
+        """Set the largest speed along the face [m/s] and the largest displacement of the head [m] that are used."""
+        self.travel.limits = Limits((travel_m_s,), (math.inf,))
+        self.head_pose.limits = Limits((pose_m, pose_m, math.pi), (math.inf,) * 3)
 
     @property
     def other_sender(self) -> bool:

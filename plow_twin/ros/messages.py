@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import struct
 from array import array
 from collections.abc import Mapping
@@ -10,14 +9,14 @@ from typing import Final
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from plow_twin.model.loads import load_direction
 from plow_twin.model.scene import Constant, Harmonic, Scene
+from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.outputs import Publication
 
 Wrench = tuple[float, float, float]
 
@@ -90,42 +89,38 @@ class ToolForces:
 class JointStateWriter:
     """One `JointState` of named numbers that is written over for each message."""
 
-    def __init__(self, frame_id: str, names: tuple[str, ...], quantities: tuple[str, ...] = _QUANTITIES) -> None:
-        self.message = JointState(name=list(names))
-        self.message.header.frame_id = frame_id
-        self._views = []
-        for quantity in quantities:
-            setattr(self.message, quantity, array("d", bytes(8 * len(names))))
-            # the message's own array, which need not be the one that was set
-            self._views.append(np.frombuffer(getattr(self.message, quantity)))
+    def __init__(self, first: plain.JointState) -> None:
+        self.message = JointState(name=list(first.name))
+        self.message.header.frame_id = first.frame_id
+        self._views: list[tuple[str, NDArray[np.float64]]] = []
+        for quantity in _QUANTITIES:
+            if len(getattr(first, quantity)):
+                setattr(self.message, quantity, array("d", bytes(8 * len(first.name))))
+                # the message's own array, which need not be the one that was set
+                self._views.append((quantity, np.frombuffer(getattr(self.message, quantity))))
 
-    def write(self, stamp: int, *values: ArrayLike) -> JointState:
-        """Return the message with the values of its quantities, in order of `quantities`."""
-        set_stamp(self.message.header, stamp)
-        for view, value in zip(self._views, values, strict=True):
-            view[:] = value
+    def write(self, message: plain.JointState) -> JointState:
+        """Return the ROS message of the same numbers."""
+        set_stamp(self.message.header, message.stamp_ns)
+        for quantity, view in self._views:
+            view[:] = getattr(message, quantity)
         return self.message
 
 
 class OdometryWriter:
-    """One `Odometry` that is written over: pose in the slide's frame, twist in the head's own axes.
+    """One `Odometry` that is written over; the covariances stay zero: unknown."""
 
-    The covariances stay zero: unknown.
-    """
+    def __init__(self, first: plain.Odometry) -> None:
+        self.message = Odometry(child_frame_id=first.child_frame_id)
+        self.message.header.frame_id = first.frame_id
 
-    def __init__(self, frame_id: str, child_frame_id: str) -> None:
-        self.message = Odometry(child_frame_id=child_frame_id)
-        self.message.header.frame_id = frame_id
-
-    def write(self, publication: Publication) -> Odometry:
-        """Return the message of one publication."""
-        set_stamp(self.message.header, publication.stamp_ns)
-        x, y, theta = publication.q.tolist()
-        vx, vy, omega = publication.v.tolist()
-        cos, sin = math.cos(theta), math.sin(theta)
+    def write(self, message: plain.Odometry) -> Odometry:
+        """Return the ROS message of the same numbers."""
+        set_stamp(self.message.header, message.stamp_ns)
         pose, twist = self.message.pose.pose, self.message.twist.twist
-        pose.position.x, pose.position.y = x, y
-        pose.orientation.z, pose.orientation.w = math.sin(0.5 * theta), math.cos(0.5 * theta)
-        twist.linear.x, twist.linear.y = cos * vx + sin * vy, cos * vy - sin * vx
-        twist.angular.z = omega
+        pose.position.x, pose.position.y, pose.position.z = message.position
+        turn = pose.orientation
+        turn.x, turn.y, turn.z, turn.w = message.orientation
+        twist.linear.x, twist.linear.y, twist.linear.z = message.linear
+        twist.angular.x, twist.angular.y, twist.angular.z = message.angular
         return self.message

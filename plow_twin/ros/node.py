@@ -15,6 +15,7 @@ from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.record import messages as plain
 from plow_twin.ros import diagnostics
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
@@ -43,6 +44,8 @@ class TwinNode(LifecycleNode):
         self.lifecycle = "unconfigured"
         #: why the last configure failed
         self.reason = ""
+        #: wear depths of the scenes that have been configured: cleanup does not lose them
+        self._kept_wear: dict[str, tuple[float, ...]] = {}
         self._health = diagnostics.Health()
         self._published_status: tuple[Any, ...] = ()
         self._table = ParameterServer(self, lambda: self.runtime is None, self._parameter_changed)
@@ -67,7 +70,7 @@ class TwinNode(LifecycleNode):
         """Load the scene, compile the solver, open the recording, make all topics; fails with a reason."""
         settings = self._table.settings
         try:
-            self.runtime = Runtime(self, settings, self._publish_status, self._stop_asked)
+            self.runtime = Runtime(self, settings, self._publish_status, self._stop_asked, self._kept_wear)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
         except Exception:  # rclpy would swallow it
@@ -115,8 +118,10 @@ class TwinNode(LifecycleNode):
         # a frozen runtime, being part of cycles, would never be given back
         gc.unfreeze()
         runtime, self.runtime = self.runtime, None
-        lost = runtime.close() if runtime is not None else None
-        if lost is not None:
+        if runtime is None:
+            return
+        self._kept_wear[runtime.identity] = tuple(runtime.driver.session.wear_depth.tolist())
+        for lost in runtime.close():
             self.get_logger().error(lost)
 
     def _running(self) -> Runtime:
@@ -156,10 +161,10 @@ class TwinNode(LifecycleNode):
             return
         self._published_status = report
         level, message, values = report
-        name, head = self.get_name(), self._table.settings.hardware_id
+        name, head = self.get_fully_qualified_name(), self._table.settings.hardware_id
         self._status.publish(diagnostics.status(name, head, level, message, values.items()))
         if self.runtime is not None:
-            self.runtime.record_status(name, head, report)
+            self.runtime.record_status(plain.DiagnosticStatus(level[0], name, message, head, tuple(values.items())))
 
     def _publish_diagnostics(self) -> None:
         runtime = self.runtime
@@ -174,7 +179,7 @@ class TwinNode(LifecycleNode):
         array.header.stamp = self.get_clock().now().to_msg()
         head = self._table.settings.hardware_id
         array.status = [
-            diagnostics.status(f"{self.get_name()}: {part}", head, level, message, values.items())
+            diagnostics.status(f"{self.get_fully_qualified_name()}: {part}", head, level, message, values.items())
             for part, (level, message, values) in parts.items()
         ]
         self._diagnostics.publish(array)

@@ -26,7 +26,7 @@ def descriptor(spec: Field[Any]) -> ParameterDescriptor:
     if isinstance(spec.default, float):
         low, high = spec.metadata["low"], spec.metadata["high"]
         message.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-    elif "unit" in spec.metadata:
+    elif "unit" in spec.metadata and not isinstance(spec.default, tuple):
         low, high = spec.metadata["low"], spec.metadata["high"]
         message.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
     return message
@@ -79,7 +79,7 @@ class ParameterServer:
             self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))
         return [
             Parameter(parameter.name, value=parameters.coerce(parameter.name, parameter.value))
-            if parameter.name in SPECS and parameter.type_ is Parameter.Type.INTEGER
+            if parameter.name in SPECS and parameter.type_ is not Parameter.Type.NOT_SET
             else parameter
             for parameter in asked
         ]
@@ -88,15 +88,22 @@ class ParameterServer:
         values = {parameter.name: parameter.value for parameter in asked}
         reasons = [str(problem) for problem in parameters.problems(values)]
         if not self._unconfigured():
+            # the same value again, as a file of all parameters holds, changes nothing
             reasons += [
                 f"{name}: takes effect {Effect.CONFIGURE.value}"
-                for name in values
-                if name in SPECS and SPECS[name].metadata["effect"] is Effect.CONFIGURE
+                for name, value in values.items()
+                if name in SPECS
+                and SPECS[name].metadata["effect"] is Effect.CONFIGURE
+                and parameters.coerce(name, value) != getattr(self.settings, name)
             ]
         return SetParametersResult(successful=not reasons, reason="; ".join(reasons))
 
     def _after(self, changed: list[Parameter]) -> None:
-        values = {parameter.name: parameter.value for parameter in changed if parameter.name in SPECS}
+        values = {
+            parameter.name: parameters.coerce(parameter.name, parameter.value)
+            for parameter in changed
+            if parameter.name in SPECS
+        }
         self.settings = replace(self.settings, **values)
         for name, value in values.items():
             if SPECS[name].metadata["effect"] is Effect.NOW:

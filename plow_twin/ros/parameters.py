@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
 from typing import Any, Final
@@ -34,6 +35,10 @@ class ParameterError(PlowTwinError, ValueError):
 
 
 def _number(default: float, unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
+    return field(default=default, metadata={"unit": unit, "low": low, "high": high, "effect": effect, "doc": doc})
+
+
+def _list(default: tuple[float, ...], unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
     return field(default=default, metadata={"unit": unit, "low": low, "high": high, "effect": effect, "doc": doc})
 
 
@@ -79,6 +84,21 @@ class Settings:
     step_rate: float = _number(
         100.0, "Hz", 1.0, 1000.0, Effect.CONFIGURE, "rate of advances under the scene's own loads and the hold policy"
     )
+    rollback_span: float = _number(
+        2.0,
+        "s",
+        0.0,
+        600.0,
+        Effect.CONFIGURE,
+        "how much older than the newest sample a late one may be and still be worked in; 0: late samples are dropped",
+    )
+    wear_state_path: str = _plain(
+        "",
+        Effect.CONFIGURE,
+        "folder that keeps the wear of the pads, which outlives the process then; that of another head or scene is "
+        "refused; empty: none",
+    )
+    wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, Effect.CONFIGURE, "interval at which the wear is saved")
     frame_id: str = _plain("slide_frame", Effect.CONFIGURE, "frame of all outputs: centre of the slide, x right, y up")
     child_frame_id: str = _plain("head_frame", Effect.CONFIGURE, "frame of the head in head_state")
     record_path: str = _plain(
@@ -97,6 +117,31 @@ class Settings:
     hold_policy: str = _choice(
         "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last one held, or zero"
     )
+    hold_limit: float = _number(
+        60.0, "s", 0.0, 86400.0, Effect.NOW, "silence beyond the timeout after which the model stands still"
+    )
+    limit_force: float = _number(
+        0.0, "N", 0.0, 1e300, Effect.NOW, "largest force component that is used; 0: ten times what the scene comes to"
+    )
+    limit_moment: float = _number(
+        0.0, "N m", 0.0, 1e300, Effect.NOW, "largest moment that is used; 0: ten times what the scene comes to"
+    )
+    limit_force_rate: float = _number(
+        0.0, "N/s", 0.0, 1e300, Effect.NOW, "fastest change of a force that is used; 0: limit_force in a millisecond"
+    )
+    limit_moment_rate: float = _number(
+        0.0, "N m/s", 0.0, 1e300, Effect.NOW, "fastest change of the moment; 0: limit_moment in a millisecond"
+    )
+    limit_travel: float = _number(10.0, "m/s", 0.0, 1000.0, Effect.NOW, "largest speed along the face that is used")
+    limit_pose: float = _number(1.0, "m", 0.0, 1000.0, Effect.NOW, "largest measured displacement that is used")
+    set_wear: tuple[float, ...] = _list(
+        (0.0,) * 8,
+        "m",
+        0.0,
+        1.0,
+        Effect.NOW,
+        "wear depth of the eight pads that the service ~/set_wear sets; all 0: new pads",
+    )
     jump_back: float = _number(
         1.0, "s", 0.0, 3600.0, Effect.NOW, "a stamp older than the newest by more than this resets the model"
     )
@@ -109,21 +154,42 @@ class Settings:
 
 
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
+#: A number that YAML 1.1 takes for a text: its mantissa has no point.
+_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Declared by rclpy itself.
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 
 
 def coerce(name: str, value: Any) -> Any:
-    """Return the value in the parameter's own type where that loses nothing: an integer for a double."""
-    if isinstance(SPECS[name].default, float) and isinstance(value, int) and not isinstance(value, bool):
+    """Return the value in the parameter's own type where that loses nothing.
+
+    An integer for a double; a text such as `1e-9`, which YAML takes for one, and any sequence for a list.
+    """
+    default = SPECS[name].default
+    if isinstance(default, tuple):
+        return tuple(float(item) for item in value) if _is_list(value) else value
+    if not isinstance(default, float):
+        return value
+    if isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(value, str) and _NUMBER.fullmatch(value):
         return float(value)
     return value
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, Sequence) and all(
+        isinstance(item, int | float) and not isinstance(item, bool) for item in value
+    )
 
 
 def expected(spec: Field[Any]) -> str:
     """Say in words what a parameter must be."""
     if "choices" in spec.metadata:
         return f"one of {', '.join(spec.metadata['choices'])}"
+    if isinstance(spec.default, tuple):
+        low, high = spec.metadata["low"], spec.metadata["high"]
+        return f"{len(spec.default)} numbers from {low:g} to {high:g} [{spec.metadata['unit']}]"
     if "unit" in spec.metadata:
         kind = "an integer" if isinstance(spec.default, int) else "a number"
         return f"{kind} from {spec.metadata['low']:g} to {spec.metadata['high']:g} [{spec.metadata['unit']}]"
@@ -171,13 +237,18 @@ def _admissible(spec: Field[Any], value: Any) -> bool:
         return value in spec.metadata["choices"]
     if "unit" in spec.metadata:
         low, high = spec.metadata["low"], spec.metadata["high"]
-        return bool(math.isfinite(value) and low <= value <= high)
+        numbers = value if isinstance(value, tuple) else (value,)
+        return len(numbers) == (len(default) if isinstance(default, tuple) else 1) and all(
+            math.isfinite(number) and low <= number <= high for number in numbers
+        )
     return True
 
 
 def _yaml_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_yaml_value, value))}]"
     if isinstance(value, float):
         # YAML 1.1 reads 1e-09 as a text: the mantissa needs a point
         return f"{value!r}" if "e" not in repr(value) else f"{value:.1e}"

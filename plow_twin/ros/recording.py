@@ -10,10 +10,9 @@ from typing import Final
 
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
-from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.messages import Message
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
 from plow_twin.ros.parameters import Settings
-from plow_twin.ros.part import Part
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Publication
@@ -86,11 +85,9 @@ class Recording:
         """Take the messages of a publication that has been published."""
         self._recorder.publication(publication)
 
-    def status(self, stamp_ns: int, name: str, hardware_id: str, report: Part) -> None:
-        """Take a status that has been published."""
-        level, message, values = report
-        status = DiagnosticStatus(level[0], name, message, hardware_id, tuple(values.items()))
-        self._recorder.output(self._topics["status"], stamp_ns, status)
+    def message(self, topic: str, stamp_ns: int, message: Message) -> None:
+        """Take another message that has been published on the topic of that base name."""
+        self._recorder.output(self._topics[topic], stamp_ns, message)
 
     @property
     def behind(self) -> bool:
@@ -100,7 +97,7 @@ class Recording:
     def renew(self, session: Session) -> None:
         """Journal a snapshot when entries were lost and there is room again."""
         if self._recorder.snapshot_wanted:
-            self._recorder.journal(session.snapshot())
+            self._recorder.journal(session.renew())
 
     def close(self) -> LossReport:
         """Write what is queued and close the file."""

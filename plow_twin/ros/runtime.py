@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -15,21 +17,25 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from plow_twin.model.scene import Scene
+from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.outputs import publication_messages, quality
+from plow_twin.record.wear_state import scene_identity
 from plow_twin.ros.inputs import Inputs
 from plow_twin.ros.parameters import Settings
-from plow_twin.ros.publishers import TOPICS, OutputPublishers
+from plow_twin.ros.publishers import QUALITY, TOPICS, OutputPublishers
 from plow_twin.ros.solver_start import warm_up
+from plow_twin.ros.wear_keeper import WearKeeper
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Entry
+from plow_twin.stream.limits import Limits, excitation_limits
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
-    from plow_twin.ros.part import Part
     from plow_twin.ros.recording import Recording
 
 _CATCH_UP_S: Final = 0.002
@@ -48,17 +54,24 @@ class Runtime:
         Called when the state of the stream may have changed.
     stop_asked
         Whether the process shall end; looked at while the solver is compiled.
+    kept_wear
+        Wear depths [m] of earlier runtimes of this process, by the scene's identity.
 
     Raises
     ------
-    SceneError, RecordingError, OSError
-        The scene or the recording cannot be used.
+    SceneError, RecordingError, WearStateError, OSError
+        The scene, the recording or the saved wear cannot be used.
     StartAbandoned
         A stop was asked for before the solver was ready.
     """
 
     def __init__(
-        self, node: Node, settings: Settings, changed: Callable[[], None], stop_asked: Callable[[], bool]
+        self,
+        node: Node,
+        settings: Settings,
+        changed: Callable[[], None],
+        stop_asked: Callable[[], bool],
+        kept_wear: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
     ) -> None:
         self._node = node
         self._settings = settings
@@ -74,21 +87,36 @@ class Runtime:
         self.age = DurationHistogram()
         #: publications that were not published because a number was not finite
         self.withheld = 0
+        #: frames computed without a sample, and frames after late samples have been worked in
+        self.held_frames = self.corrected_frames = 0
         self._received_ns = 0
         self._q: NDArray[np.float64] | None = None
+        self._seen: tuple[Any, ...] = ()
+        self.wear_keeper: WearKeeper | None = None
+        #: what the wear's identity is
+        self.identity = scene_identity(self.scene)
+        depth = kept_wear.get(self.identity)
+        if settings.wear_state_path:
+            self.wear_keeper = WearKeeper(Path(settings.wear_state_path), settings.hardware_id, self.scene)
+            depth = self.wear_keeper.load() or depth
         with ExitStack() as made:
-            self._make(twin, made)
+            self._make(twin, depth, made)
             made.pop_all()
 
-    def _make(self, twin: Twin, made: ExitStack) -> None:
+    def _make(self, twin: Twin, wear_depth: tuple[float, ...] | None, made: ExitStack) -> None:
         """Open the recording and make everything on the node; what is made is noted to be undone on an error."""
         node, settings = self._node, self._settings
         self.recording = self._record()
         if self.recording:
             made.callback(self.recording.close)
-        self._publishers = OutputPublishers(node, settings.frame_id, settings.child_frame_id)
+        self._publishers = OutputPublishers(node)
         made.callback(self._publishers.close)
-        session = Session(twin, on_entry=self.recording.journal if self.recording else _ignore)
+        session = Session(
+            twin,
+            on_entry=self.recording.journal if self.recording else _ignore,
+            rollback_span_s=settings.rollback_span,
+            wear_depth=wear_depth,
+        )
         every_sample = settings.publish_mode == "on_sample"
         self.driver = Driver(session, self._intake(), policy(settings), every_sample=every_sample)
         self.inputs = Inputs(
@@ -101,6 +129,7 @@ class Runtime:
             self.driver.travel,
             self._changed,
         )
+        self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
         made.callback(self.inputs.close)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timers: list[Any] = []
@@ -108,7 +137,11 @@ class Runtime:
             self._timers.append(self._timer(rate, callback))
             made.callback(node.destroy_timer, self._timers[-1])
         self._services: list[Any] = []
-        for name, answer in (("~/reset", self._on_reset), ("~/switch_publisher", self._on_switch)):
+        for name, answer in (
+            ("~/reset", self._on_reset),
+            ("~/switch_publisher", self._on_switch),
+            ("~/set_wear", self._on_set_wear),
+        ):
             self._services.append(node.create_service(Trigger, name, answer))
             made.callback(node.destroy_service, self._services[-1])
         session.start()
@@ -117,6 +150,11 @@ class Runtime:
     def published(self) -> int:
         """Number of publications."""
         return self._publishers.published
+
+    @property
+    def unsteady(self) -> bool:
+        """Whether the stamps jump so often that resets are refused."""
+        return self.driver.unsteady(time.monotonic_ns())
 
     @property
     def scene_name(self) -> str:
@@ -137,11 +175,10 @@ class Runtime:
         newest_ns = self.driver.newest_ns
         return None if newest_ns is None else (self._ros_time_ns() - newest_ns) * 1e-9
 
-    def record_status(self, name: str, hardware_id: str, report: Part) -> None:
+    def record_status(self, status: DiagnosticStatus) -> None:
         """Put a published status into the recording."""
         if self.recording:
-            stamp_ns = self.driver.session.stamp_ns
-            self.recording.status(self._ros_time_ns() if stamp_ns is None else stamp_ns, name, hardware_id, report)
+            self.recording.message("status", self._stamp_ns(), status)
 
     def activate(self) -> None:
         """Start taking samples."""
@@ -156,28 +193,35 @@ class Runtime:
         for timer in self._timers:
             timer.cancel()
 
-    def close(self) -> str | None:
-        """Release everything; return what was lost of the recording, or None."""
+    def close(self) -> list[str]:
+        """Release everything; return what was lost, in words."""
         self.deactivate()
         for timer in self._timers:
             self._node.destroy_timer(timer)
         for service in self._services:
             self._node.destroy_service(service)
         self.inputs.close()
+        lost = []
+        if self.wear_keeper:
+            self.wear_keeper.close(self.driver.session.wear_depth)
+            lost += [self.wear_keeper.error] if self.wear_keeper.error else []
         self.driver.close()
         self._publishers.close()
         report = self.recording.close() if self.recording else None
-        if report is None or report.complete:
-            return None
-        return f"recording incomplete: lost {dict(report.lost)}, closed {report.closed}, error {report.error}"
+        if report is not None and not report.complete:
+            lost.append(f"recording incomplete: lost {dict(report.lost)}, closed {report.closed}, error {report.error}")
+        return lost
 
     def parameter(self, name: str, value: Any, settings: Settings) -> None:
         """Take over a parameter that takes effect at once."""
         self._settings = settings
         self.driver.policy = policy(settings)
+        self.driver.intake.limits = limits(settings, self.scene)
+        self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
-        self.driver.parameter(name, value)
+        if not isinstance(value, tuple):  # a list acts through the service that takes it, and its entry
+            self.driver.parameter(name, value)
 
     def _intake(self) -> Intake:
         settings = self._settings
@@ -185,6 +229,7 @@ class Runtime:
             jump_back_s=settings.jump_back,
             jump_forward_s=settings.jump_forward,
             expected_rate_hz=settings.expected_rate,
+            limits=limits(settings, self.scene),
         )
 
     def _record(self) -> Recording | None:
@@ -206,6 +251,8 @@ class Runtime:
             periodic.append((settings.step_rate, self._on_silence))
         if settings.publish_mode == "fixed_rate":
             periodic.append((settings.publish_rate, lambda: self._publish(self.driver.due())))
+        if self.wear_keeper:
+            periodic.append((1.0 / settings.wear_save_period, self._save_wear))
         return periodic
 
     def _timer(self, rate_hz: float, callback: Callable[[], None]) -> Any:
@@ -213,6 +260,15 @@ class Runtime:
         timer = self._node.create_timer(1.0 / rate_hz, callback, clock=self._steady)
         timer.cancel()
         return timer
+
+    def _save_wear(self) -> None:
+        if self.wear_keeper:
+            self.wear_keeper.save(self.driver.session.wear_depth)
+
+    def _stamp_ns(self) -> int:
+        """Return the time that the model has reached, or the node's before the first sample [ns]."""
+        stamp_ns = self.driver.session.stamp_ns
+        return self._ros_time_ns() if stamp_ns is None else stamp_ns
 
     def _ros_time_ns(self) -> int:
         return int(self._node.get_clock().now().nanoseconds)
@@ -238,11 +294,23 @@ class Runtime:
         self._advanced()
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        stamp_ns = self.driver.session.stamp_ns
-        self.driver.reset(self._ros_time_ns() if stamp_ns is None else stamp_ns, "service")
+        self.driver.reset(self._stamp_ns(), "service")
         self._changed()
         response.success = True
-        response.message = "initial state restored; the next sample starts model time anew"
+        response.message = "initial motion restored, the wear stays; the next sample starts model time anew"
+        return response
+
+    def _on_set_wear(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        depth = self._settings.set_wear
+        try:
+            self.driver.set_wear(self._stamp_ns(), depth, "service")
+        except ValueError as error:
+            response.success, response.message = False, f"parameter set_wear: {error}"
+            return response
+        self._save_wear()
+        self._changed()
+        response.success = True
+        response.message = f"the pads are worn by {list(depth)} m from now on; the motion starts anew"
         return response
 
     def _on_switch(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -261,7 +329,10 @@ class Runtime:
             if self.sim_time and self.recording.behind:
                 # under /clock nothing is late: a bounded pause lets the recorder's thread catch up
                 time.sleep(_CATCH_UP_S)
-        self._changed()
+        seen = (self.driver.state, self.inputs.other_sender, self.unsteady)
+        if seen != self._seen:
+            self._seen = seen
+            self._changed()
 
     def _publish(self, publication: Publication | None) -> None:
         if publication is None:
@@ -270,11 +341,18 @@ class Runtime:
             self.withheld += 1
             return
         self._q = publication.q
-        self._publishers.publish(publication, self._forces_sent)
+        self.held_frames += publication.held
+        self.corrected_frames += publication.corrected
+        messages = publication_messages(publication, self._settings.frame_id, self._settings.child_frame_id)
+        if publication.marked:
+            messages[QUALITY] = quality(publication, self._settings.frame_id)
+        self._publishers.publish(messages, self._forces_sent)
         if self._received_ns and not self.sim_time:
             self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
         if self.recording:
             self.recording.publication(publication)
+            if publication.marked:
+                self.recording.message(QUALITY, publication.stamp_ns, messages[QUALITY])
 
     def _forces_sent(self) -> None:
         if self._received_ns:
@@ -283,7 +361,14 @@ class Runtime:
 
 def policy(settings: Settings) -> Policy:
     """Return the part of the settings that rules over silence and failures."""
-    return Policy(settings.excitation_timeout, settings.hold_policy, settings.failure_limit)
+    return Policy(settings.excitation_timeout, settings.hold_policy, settings.hold_limit, settings.failure_limit)
+
+
+def limits(settings: Settings, scene: Scene) -> Limits:
+    """Return what a measured load can be at most."""
+    return excitation_limits(
+        scene, settings.limit_force, settings.limit_moment, settings.limit_force_rate, settings.limit_moment_rate
+    )
 
 
 def _ignore(entry: Entry) -> None:

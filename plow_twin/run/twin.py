@@ -204,11 +204,32 @@ class Twin:
             out["status"] = status
         return MarkedAdvance(None if out is None else AdvanceSeries.of(t, out), status, digests)
 
-    def reset(self, t: float) -> None:
-        """Go back to the scene's initial state, at model time `t`; the wear too is the scene's initial one."""
+    @property
+    def wrench(self) -> NDArray[np.float64]:
+        """The last sample: Fx, Fy [N] and M [N m], shape (3,); zero before the first."""
+        return self._wrench.copy()
+
+    def reset(self, t: float, *, wear_depth: ArrayLike | None = None) -> None:
+        """Go back to the scene's initial state at model time `t`.
+
+        Parameters
+        ----------
+        t : float
+            Model time in s.
+        wear_depth : array_like, shape (8,), optional
+            Wear depth of each pad in m, at least 0. Without it the scene's initial one.
+
+        Raises
+        ------
+        ArgumentError
+            For a time or depth out of range; nothing has changed then.
+        """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
-        self._states[0] = self._compiled.initial_state(t)
+        depth = None if wear_depth is None else np.asarray(wear_depth, dtype=np.float64)
+        if depth is not None and (depth.shape != (PAIR_COUNT,) or not (np.isfinite(depth) & (depth >= 0.0)).all()):
+            raise ArgumentError(f"wear_depth: got {wear_depth!r}, expected {PAIR_COUNT} finite depths >= 0 in m")
+        self._states[0] = self._compiled.initial_state(t, depth)
         self._wrench = np.zeros(3)
 
     def set_travel_speed(self, speed_m_s: float) -> None:

@@ -57,13 +57,15 @@ class CompiledScene:
     parts: Parts
     loads: LoadSet
 
-    def initial_state(self, time: float = 0.0) -> State:
-        """Return the scene's initial state."""
+    def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
+        """Return the scene's initial state, its pads worn by `wear_depth` [m] instead of the scene's initial depth."""
         state = new_record(STATE)
         state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
         if self.parts.terms.hysteretic is not None:
             state.damping_factor[:] = self.scene.contact.damping or 0.0
-        if self.scene.wear is not None:
+        if wear_depth is not None:
+            state.wear_depth[:] = wear_depth
+        elif self.scene.wear is not None:
             state.wear_depth[:] = self.scene.wear.initial_depth_m
         state.step_start = state.time = time
         settle_modes(self.params, state)

@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import math
+from bisect import insort
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.run.twin import Status
 from plow_twin.stream.health import RealTimeFactor
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
-from plow_twin.stream.journal import Entry, Hold, Parameter, ParameterValue, Reset, Sample, Travel
+from plow_twin.stream.journal import (
+    Entry,
+    Hold,
+    Parameter,
+    ParameterValue,
+    Reset,
+    Sample,
+    SetWear,
+    Travel,
+    Unload,
+)
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
@@ -19,6 +33,9 @@ Arrival = tuple[int, tuple[float, float, float]]
 
 #: Most model time that one call may catch up when the excitation is silent [ns]: the work of a call stays bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
+#: At most so many resets by jumps and failures in that time [ns]: clocks out of step must not reset the model for ever.
+_MOST_RESETS: Final = 5
+_RESET_WINDOW_NS: Final = 10 * NS_PER_S
 
 
 class StreamState(Enum):
@@ -27,6 +44,7 @@ class StreamState(Enum):
     WAITING = "waiting for the first sample"
     RUNNING = "running"
     STALE = "excitation stale"
+    ENDED = "excitation stale for longer than hold_limit, the model stands still"
     FAILED = "solver failed, last good state kept"
 
 
@@ -36,11 +54,13 @@ class Policy:
 
     After `excitation_timeout_s` without a sample the model goes on by the steady clock, that far behind it, so that a
     sample late by less is still used. `hold` is `hold` (the last load stays) or `zero` (it falls to zero within the
-    first call). After `failure_limit` failed advances in a row the model is reset; 0: never.
+    first call); after `hold_limit_s` of it the model stands still. After `failure_limit` failed advances in a row the
+    model is reset; 0: never.
     """
 
     excitation_timeout_s: float = 0.5
     hold: str = "hold"
+    hold_limit_s: float = 60.0
     failure_limit: int = 10
 
 
@@ -69,6 +89,11 @@ class Driver:
         self.failures = 0
         self.resets = 0
         self.holds = 0
+        #: samples that were late and have been worked in by going back
+        self.rolled_back = 0
+        #: steady times of the latest resets [ns], and of the latest one refused
+        self._resets_ns: deque[int] = deque()
+        self._unsteady_ns: int | None = None
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._failures_in_row = 0
         self._received_ns = 0
@@ -90,18 +115,29 @@ class Driver:
 
         The caller publishes each publication before it asks for the next, so that a recording holds them in order.
         """
-        accepted: list[Sample] = []
+        run: list[Sample] = []
         for stamp_ns, wrench in arrived:
-            verdict = self.intake.judge(stamp_ns, wrench, self.session.stamp_ns)
+            late = bool(run) and self._is_late(run[0])
+            # what comes before the last of the run is judged by what the model knows then
+            if run and not late and stamp_ns <= run[-1].stamp_ns:
+                yield from self._use(run, now_ns)
+                run, late = [], False
+            if late and any(sample.stamp_ns == stamp_ns for sample in run):
+                self.intake.refuse(Verdict.DUPLICATE)
+                continue
+            verdict = self._judge(stamp_ns, wrench, now_ns)
             if not verdict.used:
                 continue
+            if run and (verdict.resets or (late and self.every_sample and verdict is Verdict.ACCEPTED)):
+                yield from self._use(run, now_ns)
+                run = []
             if verdict.resets:
-                yield from self._use(accepted, now_ns)
-                accepted = []
-                self._restart_model(stamp_ns, verdict.value)
-            self._received_ns, self._newest_ns, self._zeroed = now_ns, stamp_ns, False
-            accepted.append(Sample(stamp_ns, wrench))
-        yield from self._use(accepted, now_ns)
+                self._restart_model(stamp_ns, verdict.value, now_ns)
+            if self._newest_ns is None or stamp_ns > self._newest_ns:
+                self._newest_ns = stamp_ns
+            self._received_ns, self._zeroed = now_ns, False
+            insort(run, Sample(stamp_ns, wrench), key=_stamp)
+        yield from self._use(run, now_ns)
 
     def due(self) -> Publication | None:
         """Return what is to be published of all since the last publication, or None when there was no advance since."""
@@ -111,17 +147,20 @@ class Driver:
         """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
         if self._newest_ns is None:
             return None
-        overdue_ns = now_ns - self._received_ns - round(self.policy.excitation_timeout_s * NS_PER_S)
-        if overdue_ns <= 0:
+        silent_ns = now_ns - self._received_ns - round(self.policy.excitation_timeout_s * NS_PER_S)
+        if silent_ns <= 0:
             return None
+        limit_ns = round(self.policy.hold_limit_s * NS_PER_S)
         reached_ns = self.session.stamp_ns if self.session.stamp_ns is not None else self._newest_ns
-        stamp_ns = min(self._newest_ns + overdue_ns, reached_ns + _LARGEST_HOLD_NS)
+        stamp_ns = min(self._newest_ns + min(silent_ns, limit_ns), reached_ns + _LARGEST_HOLD_NS)
         if stamp_ns <= reached_ns:
+            if silent_ns > limit_ns:
+                self.state = StreamState.ENDED
             return None
         self.holds += 1
         if self.policy.hold == "zero" and not self._zeroed:
             self._zeroed = True
-            return self._advance(Sample(stamp_ns, (0.0, 0.0, 0.0)), now_ns, StreamState.STALE)
+            return self._advance(Unload(stamp_ns), now_ns, StreamState.STALE)
         return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Publication | None:
@@ -136,7 +175,9 @@ class Driver:
             self._behind_ns = stamp_ns - reached_ns
         self._resumed = self._resumed and stamp_ns <= 0
         stamp_ns -= self._behind_ns
-        verdict = self.clock.judge(stamp_ns, (), self.session.stamp_ns)
+        verdict = self.clock.judge(stamp_ns, (), self.session.stamp_ns, may_reset=self._may_reset(now_ns))
+        if verdict is Verdict.UNSTEADY:
+            self._unsteady_ns = now_ns
         if not verdict.used:
             return None
         if verdict.resets:
@@ -145,7 +186,7 @@ class Driver:
             self._behind_ns = 0
             self.clock.restart()
             self.clock.judge(stamp_ns, ())
-            self._restart_model(stamp_ns, f"clock {verdict.value}")
+            self._restart_model(stamp_ns, f"clock {verdict.value}", now_ns)
         return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
@@ -156,9 +197,29 @@ class Driver:
         """Journal a parameter that has changed."""
         self.session.apply(Parameter(name, value))
 
+    def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
+        """Set the wear depth of each pad [m]: other pads, or a measurement; the motion starts anew.
+
+        Raises
+        ------
+        ValueError
+            Not 8 finite depths of at least 0; nothing has changed then.
+        """
+        depth = tuple(float(value) for value in depth_m)
+        if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):
+            raise ValueError(f"wear depth: got {list(depth_m)!r}, expected {PAIR_COUNT} finite depths >= 0 in m")
+        self.session.apply(SetWear(stamp_ns, depth, reason))
+        self._begin_again()
+        self.intake.restart()
+        self.clock.restart()
+
+    def unsteady(self, now_ns: int) -> bool:
+        """Tell whether a reset was refused lately because there were too many."""
+        return self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
+
     def reset(self, stamp_ns: int, reason: str) -> None:
-        """Put the model back to its initial state; the next sample starts its time anew."""
-        self._restart_model(stamp_ns, reason)
+        """Put the motion back to its initial state, the wear stays; the next sample starts the time anew."""
+        self._restart_model(stamp_ns, reason, None)
         self.intake.restart()
         self.clock.restart()
 
@@ -171,16 +232,40 @@ class Driver:
         """End the journal."""
         self.session.close()
 
-    def _restart_model(self, stamp_ns: int, reason: str) -> None:
+    def _is_late(self, sample: Sample) -> bool:
+        reached_ns = self.session.stamp_ns
+        return reached_ns is not None and sample.stamp_ns <= reached_ns
+
+    def _judge(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Verdict:
+        session = self.session
+        verdict = self.intake.judge(stamp_ns, wrench, session.stamp_ns, session.history, self._may_reset(now_ns))
+        if verdict is Verdict.UNSTEADY:
+            self._unsteady_ns = now_ns
+        return verdict
+
+    def _may_reset(self, now_ns: int) -> bool:
+        while self._resets_ns and now_ns - self._resets_ns[0] >= _RESET_WINDOW_NS:
+            self._resets_ns.popleft()
+        return len(self._resets_ns) < _MOST_RESETS
+
+    def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
+        """Reset the model; what was asked for (`now_ns` None) does not count against the limit."""
+        if now_ns is not None:
+            self._resets_ns.append(now_ns)
         self.session.apply(Reset(stamp_ns, reason))
         self.resets += 1
+        self._begin_again()
+
+    def _begin_again(self) -> None:
         self._failures_in_row = 0
         self._newest_ns = self._counted_ns = None
         self.state = StreamState.WAITING
 
     def _use(self, samples: list[Sample], now_ns: int) -> Iterator[Publication]:
-        """Advance to samples: one by one where each is published, else in one go."""
-        if self.every_sample:
+        """Advance to samples: one by one where each is published, else in one go, as late ones are in any case."""
+        late = sum(self._is_late(sample) for sample in samples)
+        self.rolled_back += late
+        if self.every_sample and not late:
             for sample in samples:
                 publication = self._advance(sample, now_ns, StreamState.RUNNING)
                 if publication is not None:
@@ -191,7 +276,10 @@ class Driver:
             # an end that is good ends a row of failures, whatever came before it
             for status in series.status[-1:] if not series.status.any() else series.status:
                 self._judge_advance(Status(int(status)), StreamState.RUNNING)
-            self._give_up_after_failures()
+            self._give_up_after_failures(now_ns)
+        publication = self.due() if self.every_sample else None
+        if publication is not None:
+            yield publication
 
     def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Publication | None:
         advance = self.session.apply(entry)
@@ -199,7 +287,7 @@ class Driver:
             return None
         self._advanced(now_ns)
         self._judge_advance(advance.status, state)
-        self._give_up_after_failures()
+        self._give_up_after_failures(now_ns)
         return self.due() if self.every_sample else None
 
     def _advanced(self, now_ns: int) -> None:
@@ -219,9 +307,16 @@ class Driver:
         self.state = StreamState.FAILED
         self.failure = status.text
 
-    def _give_up_after_failures(self) -> None:
-        if 0 < self.policy.failure_limit <= self._failures_in_row:
-            self.reset(self.session.stamp_ns or 0, f"{self._failures_in_row} failed advances: {self.failure}")
+    def _give_up_after_failures(self, now_ns: int) -> None:
+        if 0 < self.policy.failure_limit <= self._failures_in_row and self._may_reset(now_ns):
+            reason = f"{self._failures_in_row} failed advances: {self.failure}"
+            self._restart_model(self.session.stamp_ns or 0, reason, now_ns)
+            self.intake.restart()
+            self.clock.restart()
+
+
+def _stamp(sample: Sample) -> int:
+    return sample.stamp_ns
 
 
 def counters(driver: Driver) -> dict[str, int]:
@@ -230,6 +325,7 @@ def counters(driver: Driver) -> dict[str, int]:
     return {
         "samples_in": intake.arrived,
         "samples_used": intake.used,
+        "rolled_back": driver.rolled_back,
         "samples_missing": intake.missing,
         **{f"dropped_{verdict.value}": intake.counts[verdict] for verdict in Verdict if not verdict.used},
         "jumps_back": intake.counts[Verdict.JUMP_BACK],

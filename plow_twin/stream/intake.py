@@ -9,6 +9,9 @@ import math
 from collections.abc import Sequence
 from enum import Enum
 
+from plow_twin.stream.history import History
+from plow_twin.stream.limits import Limits
+
 NS_PER_S = 1_000_000_000
 
 
@@ -24,8 +27,14 @@ class Verdict(Enum):
     UNSTAMPED = "unstamped"
     DUPLICATE = "duplicate"
     OUT_OF_ORDER = "out_of_order"
-    #: newer than the last sample, but the model has already passed it under the hold policy
+    #: newer than the last sample, but the model has already passed it, and it is older than all that is remembered
     LATE = "late"
+    #: behind the time reached, and accepted: it is worked in at its place
+    WORKED_IN = "worked_in"
+    #: a value is larger, or changes faster, than it can be
+    IMPLAUSIBLE = "implausible"
+    #: the stamps jump again and again: the model is not reset each time
+    UNSTEADY = "unsteady"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"
     #: came on a topic that is not the selected excitation source
@@ -44,7 +53,7 @@ class Verdict(Enum):
         return self in _RESETS
 
 
-_USED = frozenset({Verdict.ACCEPTED, Verdict.JUMP_BACK, Verdict.JUMP_FORWARD})
+_USED = frozenset({Verdict.ACCEPTED, Verdict.JUMP_BACK, Verdict.JUMP_FORWARD, Verdict.WORKED_IN})
 _RESETS = frozenset({Verdict.JUMP_BACK, Verdict.JUMP_FORWARD})
 
 
@@ -59,18 +68,27 @@ class Intake:
         A stamp newer than the model's time by more than this [s] is a step of the sender's clock.
     expected_rate_hz
         Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: not known.
+    limits
+        What the values can be at most; None: anything finite.
     """
 
     def __init__(
-        self, *, jump_back_s: float = 1.0, jump_forward_s: float = 10.0, expected_rate_hz: float = 0.0
+        self,
+        *,
+        jump_back_s: float = 1.0,
+        jump_forward_s: float = 10.0,
+        expected_rate_hz: float = 0.0,
+        limits: Limits | None = None,
     ) -> None:
         self.jump_back_s = jump_back_s
         self.jump_forward_s = jump_forward_s
         self.expected_rate_hz = expected_rate_hz
+        self.limits = limits
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
         #: samples that were used although a component outside the plane was not zero
         self.out_of_plane = 0
         self._newest_ns: int | None = None
+        self._newest_values: Sequence[float] = ()
         #: samples missing up to the last jump; since then: first stamp, samples used
         self._missing_before = 0
         self._first_ns = 0
@@ -94,7 +112,14 @@ class Intake:
         """Number of samples used."""
         return sum(count for verdict, count in self.counts.items() if verdict.used)
 
-    def judge(self, stamp_ns: int, values: Sequence[float], reached_ns: int | None = None) -> Verdict:
+    def judge(
+        self,
+        stamp_ns: int,
+        values: Sequence[float],
+        reached_ns: int | None = None,
+        history: History | None = None,
+        may_reset: bool = True,
+    ) -> Verdict:
         """Return the verdict on one sample and count it.
 
         Parameters
@@ -105,14 +130,21 @@ class Intake:
             All its numbers.
         reached_ns
             Time that the model has reached [ns], None before its first sample.
+        history
+            What a late sample can be worked into.
+        may_reset
+            Whether a step of the sender's clock may reset the model now.
         """
-        verdict = self._judge(stamp_ns, values, reached_ns)
+        verdict = self._judge(stamp_ns, values, reached_ns, history)
+        if verdict.resets and not may_reset:
+            verdict = Verdict.UNSTEADY
         self.counts[verdict] += 1
         if verdict.used:
             if self._newest_ns is None or verdict.resets:
                 self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
             self._since_first += 1
-            self._newest_ns = stamp_ns
+            if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
+                self._newest_ns, self._newest_values = stamp_ns, values
         return verdict
 
     def refuse(self, verdict: Verdict) -> None:
@@ -126,11 +158,15 @@ class Intake:
         self._missing_before = self.missing
         self._newest_ns = None
 
-    def _judge(self, stamp_ns: int, values: Sequence[float], reached_ns: int | None) -> Verdict:
+    def _judge(
+        self, stamp_ns: int, values: Sequence[float], reached_ns: int | None, history: History | None
+    ) -> Verdict:
         if not all(map(math.isfinite, values)):
             return Verdict.NON_FINITE
         if stamp_ns <= 0:
             return Verdict.UNSTAMPED
+        if self.limits is not None and self.limits.exceeded(values):
+            return Verdict.IMPLAUSIBLE
         newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
         if newest_ns is None:
             return Verdict.ACCEPTED
@@ -140,8 +176,15 @@ class Intake:
         if ahead_ns > self.jump_forward_s * NS_PER_S:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
-            return Verdict.ACCEPTED
+            return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
         # against the sender's own stamps: how far the hold policy went ahead says nothing of its clock
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
+        if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:
+            return Verdict.DUPLICATE if stamp_ns in history else Verdict.WORKED_IN
         return Verdict.LATE if self._newest_ns is None or stamp_ns > newest_ns else Verdict.OUT_OF_ORDER
+
+    def _too_fast(self, stamp_ns: int, values: Sequence[float]) -> bool:
+        if self.limits is None or self._newest_ns is None:
+            return False
+        return self.limits.too_fast(self._newest_values, values, (stamp_ns - self._newest_ns) * 1e-9)

@@ -15,6 +15,7 @@ ParameterValue = bool | int | float | str
 class Sample:
     """Advance to `stamp_ns` with the load linear from the previous sample.
 
+    A stamp behind the time reached is that of a late sample, which is worked in at its place.
     `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, gravity not included.
     """
 
@@ -30,8 +31,15 @@ class Hold:
 
 
 @dataclass(frozen=True)
+class Unload:
+    """Advance to `stamp_ns` with no sample and the load falling to zero on a straight line."""
+
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
 class Travel:
-    """Travel at `speed_m_s` along the face from here on."""
+    """Travel at `speed_m_s` along the face from `stamp_ns` on."""
 
     stamp_ns: int
     speed_m_s: float
@@ -39,9 +47,18 @@ class Travel:
 
 @dataclass(frozen=True)
 class Reset:
-    """Back to the initial state; the next stamp is the new origin of model time."""
+    """Motion back to the initial state, the wear stays; the next stamp is the new origin of model time."""
 
     stamp_ns: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class SetWear:
+    """The pads are worn by `depth_m` (8 numbers) from here on: other pads, or a measurement; the motion is reset."""
+
+    stamp_ns: int
+    depth_m: tuple[float, ...]
     reason: str
 
 
@@ -76,4 +93,4 @@ class Loss:
     count: int
 
 
-Entry = Sample | Hold | Travel | Reset | Parameter | Snapshot | Digest | Loss
+Entry = Sample | Hold | Unload | Travel | Reset | SetWear | Parameter | Snapshot | Digest | Loss

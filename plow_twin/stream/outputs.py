@@ -48,6 +48,8 @@ class Publication:
 
     `penetration` [m], `rate` [m/s] and `force` [N] are those at the stamp, shape (8,); `makes` counts all makes so
     far, `impulse` [N s] and `peak` [N] are those since the publication before; `q` [m, m, rad] and `v` have shape (3,).
+    `held`: computed without a sample. `corrected`: late samples were worked in, and `impulse` and `peak` are those
+    since the time to which the model went back. `marked`: one of the two is so, or was so in the publication before.
     """
 
     stamp_ns: int
@@ -60,6 +62,9 @@ class Publication:
     q: Array
     v: Array
     slow: Slow | None
+    held: bool = False
+    corrected: bool = False
+    marked: bool = False
 
     @property
     def finite(self) -> bool:
@@ -156,26 +161,49 @@ class Outputs:
         #: stamp and pad depths of the last slow part; None before the first
         self._slow_ns: int | None = None
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
+        self._held = False
+        #: from when on what was told before has been computed again [ns]
+        self._corrected_ns: int | None = None
+        self._marked = False
 
-    def add(self, stamp_ns: int, advance: Advance) -> None:
-        """Take in one good advance that ended at `stamp_ns`."""
+    def add(self, stamp_ns: int, advance: Advance, held: bool = False) -> None:
+        """Take in one good advance that ended at `stamp_ns`; `held`: computed without a sample."""
         self._advance = advance
-        self._stamp_ns = stamp_ns
+        self._stamp_ns, self._held = stamp_ns, held
         self._makes += advance.makes
         self._impulse += advance.impulse
         np.maximum(self._peak, advance.peak, out=self._peak)
 
-    def add_series(self, stamps_ns: Sequence[int], series: AdvanceSeries) -> None:
+    def add_series(self, stamps_ns: Sequence[int], series: AdvanceSeries, held: bool = False) -> None:
         """Take in many advances that ended at `stamps_ns`; those that failed count for nothing."""
         good = np.flatnonzero(series.status == 0)
         if good.size == 0:
             return
         last = int(good[-1])
-        self._advance, self._stamp_ns = series[last], stamps_ns[last]
+        self._advance, self._stamp_ns, self._held = series[last], stamps_ns[last], held
         self._makes += series.makes[good].sum(axis=0)
         # row by row, as `add` does: the sum has the same bits
         self._impulse = np.add.reduce(np.concatenate((self._impulse[None], series.impulse[good])), axis=0)
         np.maximum(self._peak, series.peak[good].max(axis=0), out=self._peak)
+
+    def correct(self, stamp_ns: int) -> int:
+        """Note that all from `stamp_ns` on is computed again; return from when on it is since the last publication."""
+        self._corrected_ns = stamp_ns if self._corrected_ns is None else min(stamp_ns, self._corrected_ns)
+        return self._corrected_ns
+
+    def clear_window(self) -> None:
+        """Let impulses and peaks begin here."""
+        self._impulse[:] = 0.0
+        self._peak[:] = 0.0
+
+    @property
+    def slow_before(self) -> tuple[int | None, Array]:
+        """Stamp and pad depths of the last slow part that was published."""
+        return self._slow_ns, self._slow_wear_depth
+
+    @slow_before.setter
+    def slow_before(self, before: tuple[int | None, Array]) -> None:
+        self._slow_ns, self._slow_wear_depth = before
 
     @property
     def pending(self) -> tuple[int, Advance] | None:
@@ -190,6 +218,7 @@ class Outputs:
         """Forget what has not been published; the makes go on counting."""
         self._advance = None
         self._slow_ns = None
+        self._corrected_ns = None
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
 
@@ -198,6 +227,8 @@ class Outputs:
         advance, self._advance = self._advance, None
         if advance is None:
             return None
+        corrected = self._corrected_ns is not None
+        mark = self._held or corrected
         publication = Publication(
             self._stamp_ns,
             advance.penetration,
@@ -209,7 +240,11 @@ class Outputs:
             advance.q,
             advance.v,
             self._slow_part(advance.wear_depth),
+            self._held,
+            corrected,
+            mark or self._marked,
         )
+        self._corrected_ns, self._marked = None, mark
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
         return publication
@@ -253,6 +288,8 @@ class Outputs:
         self._impulse = np.add.accumulate(left)[-1].copy()
         self._peak = np.maximum(self._peak, rows.peak[begin:].max(axis=0, initial=0.0))
         self._advance = rows[len(stamps) - 1] if begin < len(stamps) else None
+        if len(taken):
+            self._corrected_ns = None
         return publications
 
     def _slow_rows(self, stamps: NDArray[np.int64], wear_depth: Array) -> tuple[NDArray[np.int64], Array, Array]:
@@ -269,7 +306,7 @@ class Outputs:
         stamps, wear_depth = stamps[index], wear_depth[index]
         elapsed_s, grown = np.ones(len(stamps)), np.zeros(wear_depth.shape)
         elapsed_s[1:], grown[1:] = np.diff(stamps) * 1e-9, np.diff(wear_depth, axis=0)
-        if before_ns is not None:
+        if before_ns is not None and stamps[0] > before_ns:
             elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - wear_before
         self._slow_ns, self._slow_wear_depth = int(stamps[-1]), wear_depth[-1].copy()
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
@@ -281,8 +318,9 @@ class Outputs:
         before_ns = self._slow_ns
         if before_ns is not None and self._stamp_ns // SLOW_PERIOD_NS == before_ns // SLOW_PERIOD_NS:
             return None
-        grown = np.zeros(PAIR_COUNT) if before_ns is None else wear_depth - self._slow_wear_depth
-        elapsed_s = 1.0 if before_ns is None else (self._stamp_ns - before_ns) * 1e-9
+        grown, elapsed_s = np.zeros(PAIR_COUNT), 1.0
+        if before_ns is not None and self._stamp_ns > before_ns:
+            grown, elapsed_s = wear_depth - self._slow_wear_depth, (self._stamp_ns - before_ns) * 1e-9
         self._slow_ns, self._slow_wear_depth = self._stamp_ns, wear_depth.copy()
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         intervals = np.stack((low, high), axis=1).ravel()

@@ -4,11 +4,27 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Parameter, Reset, Sample, Snapshot, Travel
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.stream.history import History
+from plow_twin.stream.journal import (
+    Digest,
+    Entry,
+    Hold,
+    Loss,
+    Parameter,
+    Reset,
+    Sample,
+    SetWear,
+    Snapshot,
+    Travel,
+    Unload,
+)
 from plow_twin.stream.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -19,7 +35,11 @@ if TYPE_CHECKING:
 
 #: A digest follows each so many advances.
 DIGEST_INTERVAL: Final = 100
-_HEADER: Final = struct.Struct("<?qqq")
+#: Is a stamp known, origin, stamp reached, advances, held, speed along the face, number of speeds to come.
+_HEADER: Final = struct.Struct("<?qqq?dq")
+_TRAVEL: Final = struct.Struct("<qd")
+_WEAR_SIZE: Final = 8 * PAIR_COUNT
+_NO_LOAD: Final = (0.0, 0.0, 0.0)
 
 
 def _ignore(entry: Entry) -> None:
@@ -32,6 +52,13 @@ class Session:
     The same entries in the same order give the same motion, the same publications (`outputs`) and the same digests, bit
     for bit, whatever the clock did meanwhile. Model time is (stamp - origin), the origin being the first stamp.
 
+    Motion and wear are two states: a `Reset` puts back the motion and keeps the wear, only `SetWear` sets it. While the
+    load is held or taken away (`Hold`, `Unload`) nothing wears: what the load does then is not known. With the scene's
+    own loads it is known, and a `Hold` only says how far to go.
+
+    A sample whose stamp lies behind the time reached is late: the session goes back to the newest snapshot before it,
+    works it in and runs again up to the newest sample; what was computed without a sample after that one is dropped.
+
     Parameters
     ----------
     twin
@@ -41,14 +68,41 @@ class Session:
     on_entry
         Receives each entry in order of time just before it is applied, and each digest after the advance that it
         covers. An entry that the twin then refuses (a number is not finite) has been emitted: a replay refuses it too.
+    rollback_span_s
+        How much older than the newest sample a late one may be [s]; 0: late samples are refused.
+    wear_depth
+        Wear depth of each pad to begin with [m], shape (8,); None: the scene's.
     """
 
-    def __init__(self, twin: Twin, origin_ns: int | None = None, on_entry: Callable[[Entry], object] = _ignore) -> None:
+    def __init__(
+        self,
+        twin: Twin,
+        origin_ns: int | None = None,
+        on_entry: Callable[[Entry], object] = _ignore,
+        *,
+        rollback_span_s: float = 0.0,
+        wear_depth: Sequence[float] | None = None,
+    ) -> None:
         self.twin = twin
         self.origin_ns = origin_ns
         #: the time that the model has reached [ns], None before the first stamp
         self.stamp_ns: int | None = None
         self.outputs = Outputs(twin.scene)
+        scene, self._sampled = twin.scene, twin.excitation == "sampled"
+        #: what late samples can be worked into
+        self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
+        #: wear depth of each pad [m], shape (8,)
+        self.wear_depth: NDArray[np.float64] = np.zeros(PAIR_COUNT)
+        if scene.wear is not None:
+            self.wear_depth[:] = scene.wear.initial_depth_m
+        if wear_depth is not None:
+            self.wear_depth[:] = wear_depth
+            twin.reset(twin.time, wear_depth=self.wear_depth)
+        #: whether the motion goes on without samples
+        self.held = False
+        self._wears = scene.wear is not None and scene.wear.coefficient_m2_n != 0.0
+        self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
+        self._travels: list[Travel] = []
         self._on_entry = on_entry
         self._advances = 0
 
@@ -69,26 +123,31 @@ class Session:
         Raises
         ------
         ValueError
-            The entry cannot be applied (its stamp lies before the time reached, a number is not finite); the
+            The entry cannot be applied (its stamp lies too far behind the time reached, a number is not finite); the
             motion is unchanged then.
         """
         match entry:
-            case Sample(stamp_ns, wrench):
-                return self._advance(entry, stamp_ns, wrench)
-            case Hold(stamp_ns):
-                return self._advance(entry, stamp_ns, None)
-            case Travel(_, speed):
+            case Sample():
+                *_, series = self.apply_samples([entry])
+                return series[-1]
+            case Hold() | Unload():
+                return self._apply_hold(entry)
+            case Travel():
                 self._on_entry(entry)
-                self.twin.set_travel_speed(speed)
+                self._apply_travel(entry)
             case Reset():
                 self._on_entry(entry)
-                self._reset()
+                self._restart(self.wear_depth)
+            case SetWear(_, depth):
+                self._on_entry(entry)
+                self._restart(np.array(depth))
             case Parameter():
                 # acts through the entries that follow it
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)
                 self._restore(data)
+                self._forget()
             case Digest() | Loss():
                 pass
         return None
@@ -103,53 +162,24 @@ class Session:
         ValueError
             As `apply`.
         """
+        for earlier, later in pairwise(samples):
+            if later.stamp_ns < earlier.stamp_ns:
+                raise ValueError(f"stamp: got {later.stamp_ns} ns, expected at least {earlier.stamp_ns} ns")
         while samples:
-            count = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
-            part, samples = samples[:count], samples[count:]
-            yield self._advance_part(part)
+            late = self._is_late(samples[0].stamp_ns)
+            count = len(samples) if late else DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
+            part, samples = list(samples[:count]), samples[count:]
+            if late:
+                self._check_late(part[0].stamp_ns)
+            for sample in part:
+                self._on_entry(sample)
+            yield self._work_in(part[0].stamp_ns, part) if late else self._run(part)
+            self._count(len(part))
 
-    def snapshot(self) -> Snapshot:
-        """Return the exact state of twin, outputs and session."""
-        known = self.stamp_ns is not None
-        header = _HEADER.pack(known, self.origin_ns or 0, self.stamp_ns or 0, self._advances)
-        stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        return Snapshot(stamp_ns, header + self.outputs.state() + self.twin.snapshot())
-
-    def _advance(self, entry: Entry, stamp_ns: int, wrench: tuple[float, float, float] | None) -> Advance:
-        if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
-            raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
-        self._on_entry(entry)
-        if self.origin_ns is None:
-            self.origin_ns = stamp_ns
-        advance = self.twin.advance((stamp_ns - self.origin_ns) * 1e-9, wrench)
-        self.stamp_ns = stamp_ns
-        if not advance.status:
-            self.outputs.add(stamp_ns, advance)
-        self._advances += 1
-        if self._advances % DIGEST_INTERVAL == 0:
-            self._on_entry(Digest(stamp_ns, self.twin.digest()))
-        return advance
-
-    def _advance_part(self, samples: Sequence[Sample]) -> AdvanceSeries:
-        stamps_ns = [sample.stamp_ns for sample in samples]
-        before_ns = self.stamp_ns if self.stamp_ns is not None else stamps_ns[0]
-        for stamp_ns, earlier_ns in zip(stamps_ns, (before_ns, *stamps_ns), strict=False):
-            if stamp_ns < earlier_ns:
-                raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {earlier_ns} ns")
-        for sample in samples:
-            self._on_entry(sample)
-        if self.origin_ns is None:
-            self.origin_ns = stamps_ns[0]
-        origin_ns = self.origin_ns
-        series = self.twin.advance_samples(
-            [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
-        )
-        self.stamp_ns = stamps_ns[-1]
-        self.outputs.add_series(stamps_ns, series)
-        self._advances += len(samples)
-        if self._advances % DIGEST_INTERVAL == 0:
-            self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
-        return series
+    @property
+    def plain(self) -> bool:
+        """Whether samples only move the motion on: nothing is held, and no speed is to come."""
+        return not self.held and not self._travels
 
     def advance_marked(
         self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], marks: NDArray[np.int64], *, rows: bool = True
@@ -167,33 +197,227 @@ class Session:
         Raises
         ------
         ValueError
-            A sample cannot be applied; the motion is unchanged then.
+            A sample cannot be applied, or the session is not `plain`; the motion is unchanged then.
         """
         reached = self.stamp_ns if self.stamp_ns is not None else int(stamps[0])
-        if stamps[0] < reached or (stamps[1:] < stamps[:-1]).any():
-            raise ValueError(f"stamp: expected stamps that do not fall, from {reached} ns on")
+        if not self.plain or stamps[0] < reached or (stamps[1:] < stamps[:-1]).any():
+            raise ValueError(f"stamp: expected samples only, with stamps that do not fall, from {reached} ns on")
         origin = int(stamps[0]) if self.origin_ns is None else self.origin_ns
-        done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows)
+        before = self.snapshot().data
+        done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows or self._wears)
+        self.history.add_snapshot(int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns, before)
+        self.history.add_later(stamps, wrench)
         self.origin_ns, self.stamp_ns = origin, int(stamps[-1])
+        if done.rows is not None:
+            self.wear_depth = done.rows.wear_depth[-1].copy()
         self._advances += len(stamps)
         return done
 
     def restore(self, snapshot: Snapshot, pending: tuple[int, Advance] | None, origin_ns: int | None) -> None:
         """Go back to a snapshot, with what the next publication was to show (`Outputs.pending`); nothing is emitted."""
         self._restore(snapshot.data)
+        self.history.cut(self.stamp_ns)
         self.origin_ns = origin_ns
         self.outputs.set_pending(pending)
 
-    def _reset(self) -> None:
-        self.twin.reset(0.0)
+    def renew(self) -> Snapshot:
+        """Return the exact state for a journal that goes on from here, and forget what was before it."""
+        snapshot = self.snapshot()
+        self._forget()
+        return snapshot
+
+    def snapshot(self) -> Snapshot:
+        """Return the exact state of twin, outputs and session."""
+        known = self.stamp_ns is not None
+        header = _HEADER.pack(
+            known,
+            self.origin_ns or 0,
+            self.stamp_ns or 0,
+            self._advances,
+            self.held,
+            self._speed,
+            len(self._travels),
+        )
+        travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
+        stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
+        data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot()
+        return Snapshot(stamp_ns, data)
+
+    def _run(self, samples: list[Sample]) -> AdvanceSeries:
+        """Advance to samples; a speed along the face is taken over at its stamp, on the load's straight line there."""
+        self._resume_wear()
+        series = None
+        while samples:
+            travel = self._travels[0] if self._travels else None
+            if travel is not None and travel.stamp_ns < samples[0].stamp_ns:
+                self._travel_on_the_way(travel, samples[0])
+                continue
+            count = self.history.until_snapshot(samples)
+            if travel is not None:
+                count = min(count, sum(sample.stamp_ns <= travel.stamp_ns for sample in samples))
+            part, samples = samples[:count], samples[count:]
+            series = self._advance(part)
+            if self.history.add(part):
+                self._remember()
+        assert series is not None, "there is at least one sample"
+        return series
+
+    def _advance(self, samples: list[Sample]) -> AdvanceSeries:
+        stamps_ns = [sample.stamp_ns for sample in samples]
+        if self.origin_ns is None:
+            self.origin_ns = stamps_ns[0]
+        origin_ns = self.origin_ns
+        series = self.twin.advance_samples(
+            [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
+        )
+        self.stamp_ns, self.wear_depth = stamps_ns[-1], series.wear_depth[-1].copy()
+        self.outputs.add_series(stamps_ns, series, self.held)
+        return series
+
+    def _travel_on_the_way(self, travel: Travel, sample: Sample) -> None:
+        """Advance to the stamp of a speed that comes before the next sample, and take it over."""
+        self._travels.pop(0)
+        if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
+            share = (travel.stamp_ns - self.stamp_ns) / (sample.stamp_ns - self.stamp_ns)
+            load = self.twin.wrench
+            self._advance([Sample(travel.stamp_ns, tuple((load + share * (sample.wrench - load)).tolist()))])
+        self._set_speed(travel)
+
+    def _is_late(self, stamp_ns: int) -> bool:
+        """Tell whether the model has passed a stamp; without a sample there it has passed its own time too."""
+        if self.stamp_ns is None or stamp_ns > self.stamp_ns:
+            return False
+        return stamp_ns < self.stamp_ns or (self.held and self.history.oldest_ns is not None)
+
+    def _check_late(self, stamp_ns: int) -> None:
+        oldest_ns = self.history.oldest_ns
+        if oldest_ns is None or stamp_ns <= oldest_ns:
+            limit = "the time reached" if oldest_ns is None else "later than the oldest state kept"
+            bound_ns = self.stamp_ns if oldest_ns is None else oldest_ns
+            raise ValueError(f"stamp: got {stamp_ns} ns, expected at least {limit}, {bound_ns} ns")
+
+    def _work_in(self, stamp_ns: int, late: list[Sample], *travels: Travel) -> AdvanceSeries:
+        """Go back to before a late stamp, and run again with late samples and speeds.
+
+        The next publication tells of all from the first stamp worked in since the one before it.
+        """
+        corrected_ns = self.outputs.correct(stamp_ns)
+        if corrected_ns <= (self.history.oldest_ns or 0):
+            corrected_ns = stamp_ns
+        again = self._rewind(corrected_ns, *travels)
+        known = [sample for sample in again if sample.stamp_ns < corrected_ns]
+        if known:
+            self._run(known)
+        self.outputs.clear_window()
+        return self._run(sorted([*again[len(known) :], *late], key=lambda sample: sample.stamp_ns))
+
+    def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
+        """Go back to the newest snapshot before `stamp_ns`; return the samples after it.
+
+        The speeds after it, and those in `more`, are to come again.
+        """
+        data, samples, travels = self.history.rewind(stamp_ns)
+        advances, pending, slow = self._advances, self._travels, self.outputs.slow_before
+        self._restore(data)
+        self._advances, self.outputs.slow_before = advances, slow
+        # one that was to come at the snapshot may have been applied, or be to come still
+        known = dict.fromkeys((*self._travels, *travels, *pending, *more))
+        self._travels = sorted(known, key=lambda travel: travel.stamp_ns)
+        return samples
+
+    def _apply_hold(self, entry: Hold | Unload) -> Advance:
+        stamp_ns = entry.stamp_ns
+        if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
+            raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
+        self._on_entry(entry)
+        if self.origin_ns is None:
+            self.origin_ns = stamp_ns
+        if self._sampled:
+            self._suspend_wear()
+        while self._travels and self._travels[0].stamp_ns <= stamp_ns:
+            travel = self._travels.pop(0)
+            if not self._sampled and self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
+                self._advance_without_sample(travel.stamp_ns, None)
+            self._set_speed(travel)
+        advance = self._advance_without_sample(stamp_ns, _NO_LOAD if isinstance(entry, Unload) else None)
+        self._count(1)
+        return advance
+
+    def _advance_without_sample(self, stamp_ns: int, wrench: tuple[float, float, float] | None) -> Advance:
+        assert self.origin_ns is not None
+        advance = self.twin.advance((stamp_ns - self.origin_ns) * 1e-9, wrench)
+        self.stamp_ns, self.wear_depth = stamp_ns, advance.wear_depth.copy()
+        if not advance.status:
+            self.outputs.add(stamp_ns, advance, self.held)
+        return advance
+
+    def _suspend_wear(self) -> None:
+        if not self.held:
+            self._remember()
+            self.held = True
+            if self._wears:
+                self.twin.set_travel_speed(0.0)
+
+    def _resume_wear(self) -> None:
+        if self.held:
+            self.held = False
+            if self._wears:
+                self.twin.set_travel_speed(self._speed)
+
+    def _apply_travel(self, travel: Travel) -> None:
+        """Take over a speed: now, once its stamp is reached, or back at its stamp."""
+        newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
+        if not self._wears:
+            self._speed = travel.speed_m_s
+        elif self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
+            self._travels = sorted([*self._travels, travel], key=lambda item: item.stamp_ns)
+        elif newest_ns is None or oldest_ns is None or travel.stamp_ns <= oldest_ns or travel.stamp_ns >= newest_ns:
+            self._set_speed(travel)
+        else:
+            self._work_in(travel.stamp_ns, [], travel)
+
+    def _set_speed(self, travel: Travel) -> None:
+        self._speed = travel.speed_m_s
+        self.history.add_travel(travel)
+        if not self.held:
+            self.twin.set_travel_speed(self._speed)
+
+    def _count(self, advances: int) -> None:
+        """Count advances, and emit a digest after each so many."""
+        before, self._advances = self._advances, self._advances + advances
+        if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
+            self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
+
+    def _remember(self) -> None:
+        if self.stamp_ns is not None:
+            self.history.add_snapshot(self.stamp_ns, self.snapshot().data)
+
+    def _forget(self) -> None:
+        """Forget all before the present state."""
+        self.history.clear()
+        if not self.held:
+            self._remember()
+
+    def _restart(self, wear_depth: NDArray[np.float64]) -> None:
+        """Put the motion back to its initial state."""
+        self._resume_wear()
+        for travel in self._travels:
+            self._set_speed(travel)
+        self.wear_depth = wear_depth.copy()
+        self.twin.reset(0.0, wear_depth=wear_depth)
         self.outputs.restart()
+        self.history.clear()
+        self._travels = []
         self.origin_ns = self.stamp_ns = None
 
     def _restore(self, data: bytes) -> None:
-        known, origin_ns, stamp_ns, advances = _HEADER.unpack_from(data)
-        split = _HEADER.size + self.outputs.state_size()
+        known, origin_ns, stamp_ns, advances, held, speed, travels = _HEADER.unpack_from(data)
+        end = _HEADER.size + travels * _TRAVEL.size
+        split = end + _WEAR_SIZE + self.outputs.state_size()
         self.twin.restore(data[split:])
-        self.outputs.set_state(data[_HEADER.size : split])
+        self.outputs.set_state(data[end + _WEAR_SIZE : split])
+        self.wear_depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end).copy()
+        self._travels = [Travel(*found) for found in _TRAVEL.iter_unpack(data[_HEADER.size : end])]
         self.origin_ns = origin_ns if known else self.origin_ns
         self.stamp_ns = stamp_ns if known else None
-        self._advances = advances
+        self._advances, self.held, self._speed = advances, held, speed

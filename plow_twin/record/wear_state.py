@@ -1,0 +1,123 @@
+"""The wear of a head's pads on disk: it outlives the process, and belongs to one head in one slide."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Scene
+
+#: The file in the folder that the user names.
+FILE_NAME: Final = "wear.json"
+VERSION: Final = 1
+
+
+class WearStateError(PlowTwinError, ValueError):
+    """A file of wear cannot be used; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class WearState:
+    """Wear depth [m] of the eight pads of the head `head`, which runs in the slide of a scene."""
+
+    head: str
+    scene: str
+    depth_m: tuple[float, ...]
+
+
+def scene_identity(scene: Scene) -> str:
+    """Return a hash of what makes a pad's depth comparable: frame, clearance, head, and the initial depths.
+
+    Loads, contact numbers and the wear coefficient may change: the pads stay the same.
+    """
+    numbers = (
+        *(scene.frame.width_m, scene.frame.height_m),
+        *(scene.clearance.horizontal_m, scene.clearance.vertical_m),
+        *(scene.head.mass_kg, scene.head.inertia_kg_m2),
+        *(() if scene.wear is None else (scene.wear.pad_area_m2, *scene.wear.initial_depth_m)),
+    )
+    return hashlib.sha256(" ".join(float(number).hex() for number in numbers).encode()).hexdigest()[:16]
+
+
+def load_wear(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None:
+    """Return the saved depths [m], or None when none have been saved.
+
+    Raises
+    ------
+    WearStateError
+        The file cannot be read, is damaged, or is that of another head or scene.
+    """
+    path = folder / FILE_NAME
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+    except (OSError, UnicodeDecodeError) as error:
+        raise WearStateError(f"{path}: cannot be read: {error}") from error
+    state = _parse(text, path)
+    for name, got, expected in (("head", state.head, head), ("scene", state.scene, scene_identity(scene))):
+        if got != expected:
+            raise WearStateError(
+                f"{path}: {name}: got {got!r}, expected {expected!r}: the wear of another {name} is not used; "
+                "give another folder or move the file away"
+            )
+    return state.depth_m
+
+
+def save_wear(folder: Path, state: WearState) -> None:
+    """Write the depths so that after a crash at any time the file is the old one or the new one, whole.
+
+    Raises
+    ------
+    OSError
+        The disk does not take it; the old file is as it was.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / FILE_NAME
+    beside = folder / f".{FILE_NAME}.{os.getpid()}"
+    record = {
+        "version": VERSION,
+        "head": state.head,
+        "scene": state.scene,
+        "saved": datetime.now(UTC).isoformat(timespec="seconds"),
+        "depth_m": dict(zip(PAIR_NAMES, state.depth_m, strict=True)),
+    }
+    try:
+        with beside.open("w", encoding="utf-8") as stream:
+            stream.write(json.dumps(record, indent=1) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
+        beside.replace(path)
+    except OSError:
+        beside.unlink(missing_ok=True)
+        raise
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _parse(text: str, path: Path) -> WearState:
+    try:
+        record: dict[str, Any] = json.loads(text)
+        version = record["version"]
+        if version != VERSION:
+            raise WearStateError(f"{path}: version: got {version!r}, expected {VERSION}")
+        depth = tuple(float(record["depth_m"][name]) for name in PAIR_NAMES)
+        head, scene = str(record["head"]), str(record["scene"])
+    except (ValueError, KeyError, TypeError) as error:
+        if isinstance(error, WearStateError):
+            raise
+        raise WearStateError(f"{path}: damaged, expected the wear of {len(PAIR_NAMES)} pads ({error!r})") from error
+    if not all(0.0 <= value < math.inf for value in depth):
+        raise WearStateError(f"{path}: depth_m: got {depth}, expected finite depths >= 0 in m")
+    return WearState(head, scene, depth)

@@ -1,0 +1,56 @@
+"""What a measured value can be at most, and how fast it can change: anything beyond is a fault of the measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from plow_twin.model.geometry import half_diagonal
+from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import Scene
+
+#: A measured load may be so many times the largest that the scene's own loads and the head's weight come to.
+_MARGIN: Final = 10.0
+#: A load may change by its largest value within this time [s]: a millisecond's impact passes.
+_SHORTEST_S: Final = 1e-3
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Largest magnitude of each value, and of its change per second."""
+
+    largest: tuple[float, ...]
+    fastest: tuple[float, ...]
+
+    def exceeded(self, values: Sequence[float]) -> bool:
+        """Tell whether a value is larger than it can be."""
+        return any(abs(value) > largest for value, largest in zip(values, self.largest, strict=True))
+
+    def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
+        """Tell whether a value has changed faster than it can."""
+        return any(
+            abs(value - earlier) > fastest * duration_s
+            for value, earlier, fastest in zip(values, before, self.fastest, strict=True)
+        )
+
+
+def excitation_limits(
+    scene: Scene, force: float = 0.0, moment: float = 0.0, force_rate: float = 0.0, moment_rate: float = 0.0
+) -> Limits:
+    """Return the limits of Fx, Fy [N] and M [N m] and of their rates; 0: derived from the scene.
+
+    Derived are ten times the sum of all loads of the scene and the head's weight, at the arm of half the frame's
+    diagonal for the moment, and that much within a millisecond.
+    """
+    loads = compile_loads(scene.loads)
+    amplitude = np.abs(loads.constant) + np.hypot(loads.sine, loads.cosine).sum(axis=0)
+    if loads.pieces is not None:
+        amplitude = amplitude + np.abs(loads.pieces.start).max(axis=0)
+    total = float(amplitude[:2].sum()) + scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2)
+    force = force or _MARGIN * total
+    moment = moment or _MARGIN * (float(amplitude[2]) + total * half_diagonal(scene))
+    force_rate, moment_rate = force_rate or force / _SHORTEST_S, moment_rate or moment / _SHORTEST_S
+    return Limits((force, force, moment), (force_rate, force_rate, moment_rate))

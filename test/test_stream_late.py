@@ -1,0 +1,218 @@
+"""Late, reordered and batched samples are worked in; wear outlives everything but its own service."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from plow_twin.model.scene import Wear
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.driver import Arrival, Driver, Policy, StreamState, counters
+from plow_twin.stream.intake import NS_PER_S, Intake
+from plow_twin.stream.journal import Digest, Entry, SetWear, Snapshot
+from plow_twin.stream.limits import excitation_limits
+from plow_twin.stream.outputs import Publication
+from plow_twin.stream.session import Session
+
+WEAR = Wear(coefficient_m2_n=1e-12, pad_area_m2=0.015, travel_speed_m_s=2.0)
+SCENE = replace(load_scene(scene_path("paper")), wear=WEAR)
+T0 = 1_795_000_000_000_000_000
+MS = NS_PER_S // 1000
+SPAN_S = 2.0
+
+
+def _arrival(index: int) -> Arrival:
+    share = math.sin(0.02 * index)
+    return T0 + index * MS, (32e3 * share, 0.0, -45e3 * share)
+
+
+class Live:
+    """A driver on a real twin that remembers `SPAN_S`, its journal and what it publishes."""
+
+    def __init__(self, *, every_sample: bool = True, policy: Policy | None = None) -> None:
+        self.journal: list[Entry] = []
+        self.frames: list[Publication] = []
+        session = Session(Twin(SCENE, excitation="sampled"), on_entry=self.journal.append, rollback_span_s=SPAN_S)
+        intake = Intake(limits=excitation_limits(SCENE))
+        self.driver = Driver(session, intake, policy or Policy(), every_sample=every_sample)
+
+    def send(self, *arrived: Arrival, now_ns: int = 0) -> None:
+        self.frames += self.driver.samples(arrived, now_ns)
+
+    def silence(self, now_ns: int) -> None:
+        frame = self.driver.silence(now_ns)
+        if frame is not None:
+            self.frames.append(frame)
+
+    @property
+    def wear(self) -> np.ndarray:
+        return self.driver.session.wear_depth
+
+    @property
+    def motion(self) -> tuple[int | None, str]:
+        return self.driver.session.stamp_ns, self.driver.session.twin.digest()
+
+
+def _replayed(journal: list[Entry]) -> Session:
+    """Run a journal again, entry by entry, and compare its digests."""
+    session = Session(Twin(SCENE, excitation="sampled"), rollback_span_s=SPAN_S)
+    for entry in journal:
+        if isinstance(entry, Digest):
+            assert session.twin.digest() == entry.digest
+        elif not isinstance(entry, Snapshot):
+            session.apply(entry)
+    return session
+
+
+@settings(max_examples=12, phases=(Phase.explicit, Phase.generate))
+@given(
+    st.lists(st.integers(0, 60), min_size=160, max_size=160),
+    st.lists(st.integers(1, 40), min_size=1, max_size=20),
+    st.booleans(),
+)
+def test_any_order_and_any_batches_end_in_the_bits_of_the_samples_in_order(
+    delays: list[int], sizes: list[int], every_sample: bool
+) -> None:
+    ordered, live = Live(), Live(every_sample=every_sample)
+    ordered.send(*(_arrival(index) for index in range(160)))
+    arriving = [0, *sorted(range(1, 160), key=lambda index: (index + delays[index], index))]
+    travels = {20: 1.0, 90: 3.0}
+    for index, speed in travels.items():
+        ordered.driver.travel(T0 + index * MS, speed)
+    begin, number = 0, 0
+    while begin < 160:
+        size = sizes[number % len(sizes)]
+        live.send(*(_arrival(index) for index in arriving[begin : begin + size]), now_ns=begin * MS)
+        live.silence(begin * MS + 900 * MS * (number % 3 == 0))  # each third time the model runs ahead
+        if number == 0:
+            for index, speed in travels.items():
+                live.driver.travel(T0 + index * MS, speed)
+        begin, number = begin + size, number + 1
+    live.send(_arrival(160))
+    ordered.send(_arrival(160))
+    assert live.motion == ordered.motion
+    counted = counters(live.driver)
+    assert (counted["samples_used"], counted["samples_in"]) == (161, 161)
+    assert (live.wear > 0.0).any() or not (ordered.wear > 0.0).any()
+    frame, ours = live.driver.due() or live.frames[-1], ordered.frames[-1]
+    assert (frame.makes == ours.makes).all() and (frame.force == ours.force).all()
+    again = _replayed(live.journal)
+    assert (again.stamp_ns, again.twin.digest()) == live.motion
+    assert again.snapshot().data[: 8 * 5] == live.driver.session.snapshot().data[: 8 * 5]
+
+
+def test_a_lasting_rise_of_the_delay_does_not_stop_the_twin() -> None:
+    live, ordered = Live(policy=Policy(excitation_timeout_s=0.1)), Live()
+    ordered.send(*(_arrival(index) for index in range(1500)))
+    for index in range(500):
+        live.send(_arrival(index), now_ns=index * MS)
+    for now in range(500, 1300, 10):  # nothing arrives for 0.8 s
+        live.silence(now * MS)
+    assert live.frames[-1].held and live.frames[-1].stamp_ns > T0 + 1100 * MS
+    held = len(live.frames)
+    for index in range(500, 1500):  # and from then on everything is 0.8 s late
+        live.send(_arrival(index), now_ns=(index + 800) * MS)
+        live.silence((index + 800) * MS)
+    assert live.motion == ordered.motion
+    assert counters(live.driver)["samples_used"] == 1500
+    assert counters(live.driver)["rolled_back"] == 1
+    first, second, third = live.frames[held : held + 3]
+    assert (first.corrected, first.held, first.marked) == (True, False, True)
+    assert (second.corrected, second.held, second.marked) == (False, False, True)
+    assert not third.marked
+
+
+def test_what_is_older_than_the_memory_is_counted() -> None:
+    live = Live()
+    live.driver.intake.jump_back_s = 60.0
+    live.send(*(_arrival(index) for index in range(0, 5000, 2)))
+    digest = live.driver.session.twin.digest()
+    live.send(_arrival(1001))
+    assert counters(live.driver)["dropped_out_of_order"] == 1
+    assert live.driver.session.twin.digest() == digest
+    live.send(_arrival(4001), _arrival(4001))
+    assert (counters(live.driver)["rolled_back"], counters(live.driver)["dropped_duplicate"]) == (1, 1)
+
+
+def test_wear_outlives_resets_failures_and_clock_steps_and_a_held_load_wears_nothing() -> None:
+    live = Live(policy=Policy(excitation_timeout_s=0.1, failure_limit=2))
+    live.driver.intake.limits = None
+    live.send(*(_arrival(index) for index in range(1000)), now_ns=1000 * MS)
+    worn = live.wear.copy()
+    assert worn.max() > 0.0
+    for now in range(1100, 13_000, 100):
+        live.silence(now * MS)
+    assert live.frames[-1].held and live.frames[-1].stamp_ns > T0 + 12_000 * MS
+    assert (live.wear == worn).all()
+    live.driver.reset(T0, "service")
+    live.send((T0 + 5, (0.0, 0.0, 0.0)), (T0 + MS, (1e200, 0.0, 0.0)), (T0 + 2 * MS, (1e200, 0.0, 0.0)))
+    assert live.driver.resets == 2
+    live.send((T0 + 3 * MS, (0.0, 0.0, 0.0)), (T0 - 3000 * MS, (0.0, 0.0, 0.0)), (T0 + 60_000 * MS, (0.0, 0.0, 0.0)))
+    assert live.driver.resets == 4
+    assert (live.wear >= worn).all() and (live.wear - worn).max() < 1e-3 * worn.max()
+    pads = tuple(1e-4 * index for index in range(8))
+    live.driver.set_wear(T0, pads, "other pads")
+    assert isinstance(live.journal[-1], SetWear)
+    assert live.wear.tolist() == list(pads)
+    live.send((T0, (0.0, 0.0, 0.0)))
+    slow = live.frames[-1].slow
+    assert slow is not None and slow.clearance[2:10].tolist() == list(pads)
+    for bad in ((0.0,) * 7, (math.nan,) * 8, (-1e-9,) * 8):
+        with pytest.raises(ValueError, match="wear depth"):
+            live.driver.set_wear(T0, bad, "nonsense")
+    assert _replayed(live.journal).wear_depth.tolist() == list(pads)
+
+
+def test_a_hold_without_end_ends() -> None:
+    live = Live(policy=Policy(excitation_timeout_s=0.1, hold_limit_s=2.0))
+    live.send(_arrival(0))
+    for now in range(0, 9000, 100):
+        live.silence(now * MS)
+    assert live.driver.session.stamp_ns == T0 + 2000 * MS
+    assert live.driver.state is StreamState.ENDED
+    live.send(_arrival(9000), now_ns=9000 * MS)
+    assert live.driver.state is StreamState.RUNNING
+
+
+def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None:
+    live = Live()
+    for index in range(200):
+        live.send(_arrival(2000 + index), _arrival(index), now_ns=index * MS)
+    assert live.driver.resets == 5
+    assert live.driver.unsteady(200 * MS)
+    counted = counters(live.driver)
+    dropped = sum(count for key, count in counted.items() if key.startswith("dropped_"))
+    assert counted["samples_used"] + dropped == 400
+    assert counted["dropped_unsteady"] > 150
+    # once it is steady again, a step is a step
+    live.send(_arrival(60_000), now_ns=20_000 * MS)
+    assert live.driver.resets == 6 and not live.driver.unsteady(20_000 * MS)
+
+
+@pytest.mark.parametrize("absurd", [(1e8, 0.0, 0.0), (0.0, -1e8, 0.0), (0.0, 0.0, 1e8)])
+def test_the_loads_line_never_passes_through_a_refused_sample(absurd: tuple[float, float, float]) -> None:
+    live, without = Live(), Live()
+    good = [_arrival(index) for index in range(100)]
+    without.send(*good[:50], *good[51:])
+    live.send(*good[:50], (good[50][0], absurd), *good[51:])
+    assert live.motion == without.motion
+    assert counters(live.driver)["dropped_implausible"] == 1
+    largest = max(float(frame.force.max()) for frame in live.frames)
+    assert largest < 1e6
+
+
+def test_a_change_faster_than_possible_is_refused() -> None:
+    live = Live()
+    limit = excitation_limits(SCENE, force=1e6, force_rate=1e6)
+    live.driver.intake.limits = limit
+    live.send((T0, (0.0, 0.0, 0.0)), (T0 + MS, (900.0, 0.0, 0.0)), (T0 + 2 * MS, (2000.0, 0.0, 0.0)))
+    assert counters(live.driver)["dropped_implausible"] == 1
+    live.send((T0 + 3 * MS, (2000.0, 0.0, 0.0)))
+    assert counters(live.driver)["samples_used"] == 3
