@@ -20,10 +20,13 @@ EXTRAS = {
     "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1"],
     "dask": ["distributed>=2024.1"],
     "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9"],
-    "test": ["pytest>=8", "pytest-timeout", "pytest-xdist", "hypothesis"],
+    "docs": ["mkdocs>=1.6,<2", "mkdocstrings[python]>=0.26"],
+    "test": ["pytest>=8", "pytest-cov", "pytest-timeout", "pytest-xdist", "hypothesis"],
 }
 EXTRAS["dev"] = [
+    *EXTRAS["docs"],
     *EXTRAS["test"],
+    "codespell",
     "ruff",
     "mypy",
     "types-PyYAML",

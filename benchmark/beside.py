@@ -3,7 +3,7 @@
     python benchmark/beside.py COMMIT [--rounds 5]
 
 Each round starts one process in a worktree of the commit and one in this checkout; a process warms up, repeats each
-case and reports its fastest time. The table (medians over the rounds, and their ratio) goes to docs/benchmark.md.
+case and reports its fastest time. The table (medians over the rounds, and their ratio) goes to docs/benchmark_log.md.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs" / "benchmark.md"
+PAGE = ROOT / "docs" / "benchmark_log.md"
 BEGIN, END = "<!-- beside: begin -->", "<!-- beside: end -->"
 #: Only what both commits offer: runs as in README.
 _WORK = """

@@ -27,7 +27,7 @@ from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColum
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PICTURE = ROOT / "docs" / "images" / "work_precision.png"
-PAGE = ROOT / "docs" / "benchmark.md"
+PAGE = ROOT / "docs" / "benchmark_log.md"
 PEERS: dict[str, Callable[[str], Iterator[Case]]] = {
     "own": work_precision.own_cases,
     "lean": work_precision.lean_cases,

@@ -1,4 +1,4 @@
-"""From the table's rows to the figures in `docs/benchmark.md`."""
+"""From the table's rows to the figures in `docs/benchmark_log.md`."""
 
 from __future__ import annotations
 

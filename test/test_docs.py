@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +19,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.scene_file import loads_scene
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -30,8 +32,65 @@ def test_links_and_named_files_exist(page: Path) -> None:
     assert not re.search(r"PLACEHOLDER|TODO|TBD", text)
     for target in re.findall(r"\]\(([^)#]+)\)", text):
         assert "://" in target or (page.parent / target).exists(), target
-    for name in re.findall(r"`((?:plow_twin|config|test|docs|tools|benchmark|launch)/[\w/.]+)`", text):
+    for name in re.findall(r"`((?:plow_twin|config|test|docs|tools|benchmark|launch|examples)/[\w/.]+)`", text):
         assert (ROOT / name).exists(), name
+
+
+def public_names() -> set[str]:
+    """Return the names that `plow_twin/__init__.py` imports `as` themselves, lazily too."""
+    nodes = ast.walk(ast.parse((ROOT / "plow_twin" / "__init__.py").read_text()))
+    aliases = [alias for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
+    return {alias.name for alias in aliases if alias.asname == alias.name}
+
+
+def test_every_public_name_is_on_the_reference_page_and_there_is_no_other() -> None:
+    listed = re.findall(r"^::: plow_twin\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    assert len(listed) == len({*listed}) > 30
+    assert {*listed} == public_names()
+    assert all(hasattr(plow_twin, name) for name in listed)
+
+
+def test_every_page_is_in_the_site_s_contents() -> None:
+    contents = (ROOT / "mkdocs.yml").read_text().partition("nav:")[2]
+    made = {"index.md", "examples.md"}
+    assert {*re.findall(r": (\w+\.md)$", contents, re.MULTILINE)} == made | {
+        page.name for page in (ROOT / "docs").glob("*.md")
+    }
+
+
+def test_the_figures_of_the_short_pages_are_those_measured() -> None:
+    """`make bench` rewrites the log; what README and the short page quote must stand there."""
+    log = (ROOT / "docs" / "benchmark_log.md").read_text()
+    start = log.index("**KV, 20 s, output each 0.1 s**")
+    measured = [line.split(" | ") for line in log[start:].split("\n\n")[1].splitlines()[2:]]
+    rows = {float(row[0].removeprefix("| ")): row for row in measured}
+    for page, sign in ((ROOT / "README.md", " x"), (ROOT / "docs" / "benchmark.md", "x")):
+        quoted = re.findall(r"^\| (\S+) \| ([\d.]+) ms \| (.*) \|$", page.read_text(), re.MULTILINE)
+        assert len(quoted) == 3, page
+        for error, wall, peers in quoted:
+            row = rows[float(error)]
+            assert row[1] == f"{wall} ms"
+            for cell, peer in zip((row[4], row[5], row[6], row[8]), peers.split(" | "), strict=True):
+                assert peer == cell == "not reached" or f"**{peer.removesuffix(sign)}x**" in cell, (page, error, peer)
+    for text in ("1447 times real time", "0.24 of a core", "1.88 s at", "0.18 of a core", "not reached"):
+        assert text in log
+
+
+def test_the_picture_of_the_rooms_is_the_script_s() -> None:
+    made = runpy.run_path(str(ROOT / "tools" / "architecture.py"))
+    assert made["OUT"].read_text() == made["drawing"]()
+    rooms = {name for row in made["ROOMS"] for name, _ in row}
+    folders = {path.parent.name for path in (ROOT / "plow_twin").glob("*/__init__.py")}
+    assert folders <= rooms
+    for name in re.findall(
+        r"`((?:ros|stream|run|solve|record|model)/\w+(?:\.py|/))`", (ROOT / "docs" / "architecture.md").read_text()
+    ):
+        assert (ROOT / "plow_twin" / name).exists(), name
+
+
+def test_the_tutorial_s_scene_is_the_example_s() -> None:
+    (scene,) = blocks(ROOT / "docs" / "tutorial.md", "yaml")
+    assert scene == (ROOT / "examples" / "first_scene" / "scene.yaml").read_text()
 
 
 def test_the_readme_s_example_runs() -> None:

@@ -1,0 +1,43 @@
+"""Every example runs as its README says, in bounded time, and says what it promises."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from scenes import ROOT
+
+SAID = {
+    "first_scene": r"top_left_top +largest +[1-9][\d.]* kN, +\d+ touches",
+    "live_twin": r"restored and advanced by 1000 samples in one call: [0-9a-f]{16}, the same bits",
+    "own_contact_law": r"0\.50 +0\.\d+ +0\.5000",
+    "sweep": r"20\.0 mm( +\d+\.\d){5}",
+    "calibration": r"stiffness 3\.1e\+07 N/m",
+    "reading_a_recording": r"result +the same\b",
+}
+FOLDERS = sorted(path for path in (ROOT / "examples").iterdir() if path.is_dir())
+
+
+def test_every_example_is_listed_and_has_a_short_readme() -> None:
+    assert {folder.name for folder in FOLDERS} == SAID.keys()
+    listed = (ROOT / "examples" / "README.md").read_text()
+    for folder in FOLDERS:
+        assert f"({folder.name}/README.md)" in listed
+        readme = (folder / "README.md").read_text()
+        assert len(readme.splitlines()) <= 12 and f"python examples/{folder.name}/run.py" in readme
+        for target in re.findall(r"\]\(([^)#]+)\)", readme):
+            assert (folder / target).exists(), target
+
+
+@pytest.mark.timeout(150)
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_the_example_runs(folder: Path, tmp_path: Path) -> None:
+    command = [sys.executable, str(folder / "run.py"), str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=140)
+    assert done.returncode == 0, done.stderr
+    assert re.search(SAID[folder.name], done.stdout), done.stdout
+    if folder.name == "first_scene":
+        assert (tmp_path / "motion.png").read_bytes().startswith(b"\x89PNG")

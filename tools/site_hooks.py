@@ -1,0 +1,43 @@
+"""What the site has beside `docs/`: the README as its home, and a page for each example with its README and sources."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parent.parent
+LANGUAGES = {".py": "python", ".yaml": "yaml"}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are made of files elsewhere in the repository."""
+    files.append(File.generated(config, "index.md", content=_for_the_site((ROOT / "README.md").read_text())))
+    files.append(File.generated(config, "examples.md", content=_gallery()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Lead links to an example to its place in the gallery."""
+    return re.sub(r"\]\((?:\.\./)*examples/(\w+)/README\.md\)", r"](examples.md#\1)", markdown)
+
+
+def _for_the_site(text: str) -> str:
+    """Let links of the repository's front page start in `docs/`; files that are no page lose their link."""
+    text = text.replace("](docs/", "](").replace("](examples/README.md)", "](examples.md)")
+    return re.sub(r"\[([^\]]+)\]\((?!\w+://)(?![\w/]+\.(?:md|png|svg))[^)#]+\)", r"`\1`", text)
+
+
+def _gallery() -> str:
+    parts = [(ROOT / "examples" / "README.md").read_text()]
+    for folder in sorted(path for path in (ROOT / "examples").iterdir() if path.is_dir()):
+        title, _, text = (folder / "README.md").read_text().partition("\n")
+        parts.append(f"#{title} {{#{folder.name}}}\n{text}".replace("](../../docs/", "]("))
+        for source in sorted(folder.iterdir()):
+            if source.suffix in LANGUAGES:
+                parts.append(f"`{source.relative_to(ROOT)}`\n\n```{LANGUAGES[source.suffix]}\n{source.read_text()}```")
+    # the list at the top leads to the parts below
+    return re.sub(r"\]\((\w+)/README\.md\)", r"](#\1)", "\n\n".join(parts))
