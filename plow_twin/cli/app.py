@@ -10,6 +10,7 @@ from typing import Final, NoReturn
 import click
 
 from plow_twin.build import package_version
+from plow_twin.cli.analyse import analyse
 from plow_twin.cli.console import FAILED, WRONG_INPUT
 from plow_twin.cli.demo import demo
 from plow_twin.cli.estimate import estimate
@@ -36,6 +37,7 @@ EXTRA_OF_MODULE: Final = {
     "mcap": "record",
     "rosbags": "record",
     "rerun": "view",
+    "rainflow": "study",
     "matplotlib": "study",
     "pyarrow": "study",
     "jinja2": "study",
@@ -52,7 +54,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, estimate, replay, view, info, study):
+for _verb in (simulate, demo, estimate, replay, analyse, view, info, study):
     commands.add_command(_verb)
 
 

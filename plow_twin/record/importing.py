@@ -1,0 +1,225 @@
+"""A load from anybody's recording through the twin: the same intake and late-data policy as live, a journal as live.
+
+In a replay time is that of the stamps: nothing is held for want of samples, a load runs straight from one to the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.mapping import Role
+from plow_twin.record.sources import Arrived
+from plow_twin.run.advance import AdvanceSeries
+from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.journal import Digest, Entry, Reset, Travel
+from plow_twin.stream.outputs import Publications
+from plow_twin.stream.session import DIGEST_INTERVAL, Session
+
+if TYPE_CHECKING:
+    from plow_twin.record.writer import RunWriter
+
+#: Samples advanced together.
+_BATCH: Final = 4096
+#: Failed advances in a row after which the model is reset.
+_FAILURE_LIMIT: Final = 10
+
+
+@dataclass(frozen=True)
+class Walked:
+    """Some advances: stamps (n,) [ns], wrench (n, 3), the rows of the model, and what would be published after each."""
+
+    stamp_ns: NDArray[np.int64]
+    wrench: NDArray[np.float64]
+    rows: AdvanceSeries
+    publications: Publications
+    #: signed speed along the face [m/s]
+    speed_m_s: float
+
+
+class Walker:
+    """Advance a session by many samples at a time, write its journal and outputs, and hand the rows on.
+
+    Parameters
+    ----------
+    session
+        The session; nobody else may apply entries.
+    on_walked
+        Receives the rows of each batch.
+    writer
+        Where journal and outputs are written, or None.
+    """
+
+    def __init__(
+        self, session: Session, on_walked: Callable[[Walked], object], writer: RunWriter | None = None
+    ) -> None:
+        self.session = session
+        self._on_walked = on_walked
+        self._writer = writer
+        self._sequence = -1
+        self._advances = 0
+        self._log_time_ns = 0
+        #: advances that the solver could not make
+        self.failures = 0
+        #: called after each reset
+        self.on_reset: Callable[[], object] = lambda: None
+        self.speed_m_s = 0.0
+        if writer is not None:
+            self._entry(session.snapshot())
+
+    def _entry(self, entry: Entry) -> None:
+        self._sequence += 1
+        if self._writer is not None:
+            self._writer.write_entry(self._sequence, self._log_time_ns, entry)
+
+    def apply(self, entry: Entry, log_time_ns: int = 0) -> None:
+        """Apply an entry that is no sample."""
+        self._log_time_ns = log_time_ns or self._log_time_ns
+        self._entry(entry)
+        self.session.apply(entry)
+        if isinstance(entry, Reset):
+            self.on_reset()
+
+    def samples(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_time_ns: NDArray[np.int64]) -> None:
+        """Apply samples of stamps that do not fall."""
+        for begin in range(0, len(stamp_ns), _BATCH):
+            part = slice(begin, begin + _BATCH)
+            self._walk(stamp_ns[part], wrench[part], log_time_ns[part])
+
+    def _walk(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_ns: NDArray[np.int64]) -> None:
+        count = len(stamp_ns)
+        numbers = self._advances + 1 + np.arange(count)
+        marks = 1 + np.flatnonzero(numbers % DIGEST_INTERVAL == 0)
+        done = self.session.advance_marked(stamp_ns, wrench, marks)
+        assert done.rows is not None
+        self._advances += count
+        good = np.flatnonzero(done.status == 0)
+        self.failures += count - len(good)
+        publications = self.session.outputs.take_rows(stamp_ns, done.rows, np.arange(count))
+        if self._writer is not None:
+            self._write(stamp_ns, wrench, log_ns, marks, done.digests, publications, good)
+        self._on_walked(Walked(stamp_ns, wrench, done.rows, publications, self.speed_m_s))
+        if count >= _FAILURE_LIMIT and done.status[-_FAILURE_LIMIT:].all():
+            self.apply(Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
+
+    def _write(
+        self,
+        stamp_ns: NDArray[np.int64],
+        wrench: NDArray[np.float64],
+        log_ns: NDArray[np.int64],
+        marks: NDArray[np.int64],
+        digests: list[str],
+        publications: Publications,
+        good: NDArray[np.int64],
+    ) -> None:
+        assert self._writer is not None
+        sequence = (
+            self._sequence + 1 + np.arange(len(stamp_ns)) + np.searchsorted(marks, np.arange(len(stamp_ns)), "right")
+        )
+        begin = 0
+        for mark, digest in zip((*marks.tolist(), len(stamp_ns)), (*digests, ""), strict=True):
+            part = slice(begin, mark)
+            if mark > begin:
+                self._writer.write_samples(sequence[part], log_ns[part], stamp_ns[part], wrench[part])
+            if digest:
+                place = int(sequence[mark - 1]) + 1
+                self._writer.write_entry(place, int(log_ns[mark - 1]), Digest(int(stamp_ns[mark - 1]), digest))
+            begin = mark
+        self._sequence += len(stamp_ns) + len(marks)
+        self._log_time_ns = int(log_ns[-1])
+        if len(good) == len(stamp_ns):
+            self._writer.write_publications(sequence, log_ns, publications)
+
+    def close(self) -> None:
+        """End the journal."""
+        if self.session.stamp_ns is not None:
+            self._entry(Digest(self.session.stamp_ns, self.session.twin.digest()))
+
+
+@dataclass
+class Feed:
+    """Messages in order of arrival to a walker: what is no sample is passed on, what is one is judged.
+
+    `measured` receives role, stamp [ns] and numbers of everything that is neither load nor speed.
+    """
+
+    walkers: list[Walker]
+    roles: dict[str, Role]
+    measured: Callable[[str, int, dict[str, float]], object]
+    intake: Intake = field(default_factory=Intake)
+    unfit: int = 0
+    _stamps: list[int] = field(default_factory=list)
+    _wrench: list[tuple[float, float, float]] = field(default_factory=list)
+    _log_times: list[int] = field(default_factory=list)
+    _reached_ns: int | None = None
+
+    def run(self, messages: Iterable[Arrived]) -> None:
+        """Take in all messages.
+
+        Raises
+        ------
+        RecordingError
+            No sample could be used.
+        """
+        by_topic: dict[str, list[tuple[str, Role]]] = {}
+        for name, role in self.roles.items():
+            by_topic.setdefault(role.topic, []).append((name, role))
+        for arrived in messages:
+            for name, role in by_topic.get(arrived.topic, ()):
+                found = role.read(arrived)
+                if found is None:
+                    self.unfit += 1
+                    if name == "excitation":
+                        self.intake.refuse(Verdict.MALFORMED)
+                else:
+                    self._take(name, *found, arrived.log_time_ns)
+        self.flush()
+        if not self.intake.used:
+            topic = self.roles["excitation"].topic if "excitation" in self.roles else "none"
+            raise RecordingError(f"excitation: got no sample that can be used (topic {topic}), expected some")
+        for walker in self.walkers:
+            walker.close()
+
+    def _take(self, name: str, stamp_ns: int, values: dict[str, float], log_time_ns: int) -> None:
+        if name == "travel":
+            speed = values["speed"]
+            if math.isfinite(speed) and speed != self.walkers[0].speed_m_s:
+                self.flush()
+                for walker in self.walkers:
+                    walker.speed_m_s = speed
+                    walker.apply(Travel(stamp_ns, abs(speed)), max(0, log_time_ns))
+        elif name == "excitation":
+            self._sample(stamp_ns, (values["fx"], values["fy"], values["m"]), log_time_ns)
+        else:
+            self.measured(name, stamp_ns, values)
+
+    def _sample(self, stamp_ns: int, wrench: tuple[float, float, float], log_time_ns: int) -> None:
+        verdict = self.intake.judge(stamp_ns, wrench, self._reached_ns)
+        if not verdict.used:
+            return
+        if verdict.resets:
+            self.flush()
+            for walker in self.walkers:
+                walker.apply(Reset(stamp_ns, verdict.value), max(0, log_time_ns))
+        self._reached_ns = stamp_ns
+        self._stamps.append(stamp_ns)
+        self._wrench.append(wrench)
+        self._log_times.append(max(0, log_time_ns))
+        if len(self._stamps) >= _BATCH:
+            self.flush()
+
+    def flush(self) -> None:
+        """Advance by what waits."""
+        if not self._stamps:
+            return
+        stamps, wrench = np.array(self._stamps, np.int64), np.array(self._wrench)
+        times = np.array(self._log_times, np.int64)
+        self._stamps, self._wrench, self._log_times = [], [], []
+        for walker in self.walkers:
+            walker.samples(stamps, wrench, times)

@@ -1,0 +1,273 @@
+"""Anybody's recording as a stream of messages: MCAP and rosbag2's sqlite3, files or folders of parts, and CSV.
+
+Messages come in the order in which they were written. What cannot be read is counted, not raised: a file is read as far
+as it goes. Only some chunks are in memory at a time.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.chunks import MAGIC, ChunkReader
+from plow_twin.record.reader import run_parts
+
+_SQLITE_MAGIC: Final = b"SQLite format 3\0"
+#: CSV has no clock; a stamp of 0 would count as missing: it starts there [ns].
+CSV_ORIGIN_NS: Final = 1_000_000_000
+_ROWS: Final = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """A message: topic, type, when it was received [ns], and its fields by path (`wrench.force.x`)."""
+
+    topic: str
+    message_type: str
+    log_time_ns: int
+    content: Any
+
+
+@dataclass
+class Losses:
+    """What of a recording could not be used, by reason, and the topics whose type is unknown."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    unknown_types: dict[str, str] = field(default_factory=dict)
+
+
+class Source(Protocol):
+    """A recording: `wanted` is asked for each topic whether its messages shall be decoded."""
+
+    losses: Losses
+
+    def topics(self) -> dict[str, str]:
+        """Return types by topic."""
+
+    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
+        """Yield the messages on wanted topics."""
+
+
+def open_source(path: Path) -> Source:
+    """Open a recording.
+
+    Raises
+    ------
+    RecordingError
+        There is none that can be read.
+    """
+    if path.is_dir():
+        for pattern, kind in (("*.mcap", McapSource), ("*.db3", SqliteSource), ("*.csv", CsvSource)):
+            files = sorted(path.glob(pattern))
+            if files:
+                return kind(run_parts(path) if kind is McapSource else files)
+        raise RecordingError(f"{path}: got a folder without .mcap, .db3 or .csv, expected a recording")
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such recording")
+    with path.open("rb") as stream:
+        head = stream.read(len(_SQLITE_MAGIC))
+    if head.startswith(MAGIC):
+        return McapSource([path])
+    if head == _SQLITE_MAGIC:
+        return SqliteSource([path])
+    if path.suffix.lower() == ".csv":
+        return CsvSource([path])
+    raise RecordingError(f"{path}: got neither MCAP nor sqlite3 nor .csv, expected a recording")
+
+
+class Decoder:
+    """CDR to messages: the types of ROS 2 Jazzy, and those whose schema the recording brings."""
+
+    def __init__(self, losses: Losses) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self._losses = losses
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+
+    def knows(self, topic: str, message_type: str, schema: str = "") -> bool:
+        """Tell whether a type can be decoded; one that cannot is noted."""
+        from rosbags.typesys import get_types_from_msg
+
+        if message_type not in self._store.types and schema:
+            try:
+                types = get_types_from_msg(schema, message_type)
+                self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
+            except Exception:  # a schema in another language, or a damaged one
+                self._losses.unknown_types[topic] = message_type
+        if message_type in self._store.types:
+            return True
+        self._losses.unknown_types[topic] = message_type
+        return False
+
+    def decode(self, data: bytes, message_type: str) -> Any | None:
+        """Return a message, or None (counted) when the bytes do not hold one."""
+        for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes behind a last empty float64[]
+            try:
+                return self._store.deserialize_cdr(data[:end], message_type)
+            except Exception:  # rosbags lets index, struct, unicode and assertion errors through
+                continue
+        self._losses.counts["undecodable"] += 1
+        return None
+
+
+class McapSource:
+    """MCAP files."""
+
+    def __init__(self, parts: list[Path]) -> None:
+        self.parts = parts
+        self.losses = Losses()
+
+    def topics(self) -> dict[str, str]:
+        """Return types by topic, from the first chunks of each part."""
+        found: dict[str, str] = {}
+        for part in self.parts:
+            reader = ChunkReader(part)
+            for number, _ in enumerate(reader):
+                if number >= 8:
+                    break
+            found |= {channel.topic: channel.message_type for channel in reader.channels.values()}
+        return found
+
+    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
+        """Yield the messages on wanted topics."""
+        decoder = Decoder(self.losses)
+        for part in self.parts:
+            reader = ChunkReader(part)
+            known: dict[int, bool] = {}
+            for messages in reader:
+                for index, number in enumerate(messages.channel.tolist()):
+                    channel = reader.channels.get(number)
+                    if channel is None:
+                        self.losses.counts["undeclared"] += 1
+                        continue
+                    if number not in known:
+                        known[number] = (
+                            wanted(channel.topic)
+                            and channel.encoding == "cdr"
+                            and decoder.knows(
+                                channel.topic, channel.message_type, channel.schema.decode(errors="replace")
+                            )
+                        )
+                    if not known[number]:
+                        continue
+                    content = decoder.decode(messages.data(index), channel.message_type)
+                    if content is not None:
+                        log_time = int(messages.log_time_ns[index])
+                        yield Arrived(channel.topic, channel.message_type, log_time, content)
+            if not reader.finished:
+                self.losses.counts["truncated_files"] += 1
+            if reader.damaged:
+                self.losses.counts["damaged_chunks"] += reader.damaged
+
+
+class SqliteSource:
+    """Files of rosbag2's sqlite3 storage."""
+
+    def __init__(self, parts: list[Path]) -> None:
+        self.parts = sorted(parts, key=lambda path: (len(path.name), path.name))
+        self.losses = Losses()
+
+    def _open(self, path: Path) -> sqlite3.Connection:
+        connection = sqlite3.connect(f"file:{path.resolve().as_posix()}?mode=ro&immutable=1", uri=True)
+        connection.text_factory = lambda data: data.decode(errors="replace")
+        return connection
+
+    def topics(self) -> dict[str, str]:
+        """Return types by topic."""
+        found: dict[str, str] = {}
+        for part in self.parts:
+            try:
+                connection = self._open(part)
+                try:
+                    found |= dict(connection.execute("SELECT name, type FROM topics"))
+                finally:
+                    connection.close()
+            except sqlite3.Error as error:
+                raise RecordingError(f"{part}: not a recording of rosbag2: {error}") from error
+        return found
+
+    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
+        """Yield the messages on wanted topics."""
+        decoder = Decoder(self.losses)
+        for part in self.parts:
+            try:
+                connection = self._open(part)
+            except sqlite3.Error as error:
+                raise RecordingError(f"{part}: cannot be opened: {error}") from error
+            try:
+                rows = connection.execute("SELECT id, name, type FROM topics").fetchall()
+                named = {
+                    number: (name, kind)
+                    for number, name, kind in rows
+                    if isinstance(name, str) and isinstance(kind, str) and wanted(name) and decoder.knows(name, kind)
+                }
+                cursor = connection.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id")
+                while rows := cursor.fetchmany(_ROWS):
+                    for number, time_ns, data in rows:
+                        if number not in named:
+                            continue
+                        name, kind = named[number]
+                        if not isinstance(data, bytes) or not isinstance(time_ns, int):
+                            self.losses.counts["undecodable"] += 1
+                            continue
+                        content = decoder.decode(data, kind)
+                        if content is not None:
+                            yield Arrived(name, kind, time_ns, content)
+            except (sqlite3.Error, OverflowError):
+                self.losses.counts["truncated_files"] += 1
+            finally:
+                connection.close()
+
+
+class CsvSource:
+    """CSV files with a header line, each a topic under its name without `.csv`; times in s."""
+
+    def __init__(self, parts: list[Path]) -> None:
+        self.parts = parts
+        self.losses = Losses()
+        #: added to all times [ns]
+        self.origin_ns = CSV_ORIGIN_NS
+
+    def topics(self) -> dict[str, str]:
+        """Return `csv` with its columns, by topic."""
+        found = {}
+        for part in self.parts:
+            with part.open(newline="", encoding="utf-8", errors="replace") as stream:
+                found[part.stem] = "csv:" + ",".join(name.strip() for name in next(csv.reader(stream), []))
+        return found
+
+    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
+        """Yield the rows of all files in order of time; a row without a time is counted."""
+        import heapq
+
+        streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
+        # each file in its own order: a row that is out of order stays so
+        yield from heapq.merge(*streams, key=lambda arrived: arrived.log_time_ns)
+
+    def _rows(self, part: Path) -> Iterator[Arrived]:
+        try:
+            with part.open(newline="", encoding="utf-8", errors="replace") as stream:
+                for row in csv.DictReader(stream):
+                    content = {str(key).strip(): _number(value) for key, value in row.items() if key is not None}
+                    time = next(iter(content.values()), math.nan)
+                    time = content.get("t", content.get("time", time))
+                    if not math.isfinite(time) or abs(time) > 4e9:
+                        self.losses.counts["without_time"] += 1
+                        continue
+                    yield Arrived(part.stem, "csv", round(time * 1e9) + self.origin_ns, content)
+        except csv.Error:
+            self.losses.counts["truncated_files"] += 1
+
+
+def _number(text: Any) -> float:
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        return math.nan

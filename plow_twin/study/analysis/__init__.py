@@ -1,0 +1,1 @@
+"""Recordings analysed: predicted against measured, what the contacts bore, other scenes beside it."""

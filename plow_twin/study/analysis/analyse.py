@@ -1,0 +1,417 @@
+"""One recording analysed: a run of ours by its journal, any other through the intake; measured signals beside."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import PlowTwinError, RecordingError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Scene
+from plow_twin.record.importing import Feed, Walked, Walker
+from plow_twin.record.mapping import Role, read_map
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.sources import Source, open_source
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import dump_scene, load_scene, loads_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.journal import Hold, Loss, Reset, Snapshot, Travel
+from plow_twin.stream.session import Session
+from plow_twin.study.analysis.loads import LoadTotals
+from plow_twin.study.analysis.signals import Comparison, compare
+
+Array = NDArray[np.float64]
+
+#: Columns of the prediction that are kept for the comparison.
+_POSE: Final = ("x", "y", "theta")
+#: Tolerance of a run that is made of another recording.
+_TOLERANCE: Final = 1e-9
+#: Folder beside a run's files where other topics of the same run lie.
+BESIDE: Final = "beside"
+
+#: Receives the share of the work done, 0..1.
+OnProgress = Callable[[float], object]
+
+
+@dataclass
+class Prediction:
+    """What one scene predicts: rows by stretch without a reset, and the sums of its contacts."""
+
+    name: str
+    scene: Scene
+    loads: LoadTotals
+    stretches: list[list[Walked]] = field(default_factory=lambda: [[]])
+
+    def walked(self, part: Walked) -> None:
+        """Take in a batch."""
+        self.loads.add(part)
+        self.stretches[-1].append(part)
+
+    def restart(self) -> None:
+        """Begin a new stretch: the stamps may go back."""
+        self.loads.restart()
+        if self.stretches[-1]:
+            self.stretches.append([])
+
+    def series(self) -> tuple[NDArray[np.int64], dict[str, Array]]:
+        """Return stamps and columns of the longest stretch."""
+        longest = max(self.stretches, key=lambda parts: sum(len(part.stamp_ns) for part in parts))
+        if not longest:
+            return np.zeros(0, np.int64), {}
+        stamps = np.concatenate([part.stamp_ns for part in longest])
+        pose = np.concatenate([part.rows.q for part in longest])
+        force = np.concatenate([part.rows.force for part in longest])
+        penetration = np.concatenate([part.rows.penetration for part in longest])
+        columns = {name: pose[:, index] for index, name in enumerate(_POSE)}
+        columns |= {f"force_{name}": force[:, pair] for pair, name in enumerate(PAIR_NAMES)}
+        columns |= {f"gap_{name}": penetration[:, pair] for pair, name in enumerate(PAIR_NAMES)}
+        return stamps, columns
+
+
+@dataclass
+class Measured:
+    """Measured values by signal, as they came."""
+
+    stamps: dict[str, list[int]] = field(default_factory=dict)
+    values: dict[str, list[float]] = field(default_factory=dict)
+
+    def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float]) -> None:
+        """Take in the numbers of one message; what is not finite was not measured."""
+        prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
+        for name, value in numbers.items():
+            if math.isfinite(value) and stamp_ns > 0:
+                self.stamps.setdefault(prefix + name, []).append(stamp_ns)
+                self.values.setdefault(prefix + name, []).append(value)
+
+
+@dataclass
+class Analysis:
+    """What was found in one recording."""
+
+    path: Path
+    kind: str
+    predictions: list[Prediction]
+    measured: Measured
+    input: dict[str, int]
+    losses: dict[str, int]
+    unknown_types: dict[str, str]
+    wall_s: float = 0.0
+
+    @property
+    def lossy(self) -> bool:
+        """Whether something could not be read or used."""
+        return bool(self.losses)
+
+    def comparisons(self, prediction: Prediction) -> dict[str, Comparison]:
+        """Return the signals that were measured, compared with what one scene predicts."""
+        stamps, columns = prediction.series()
+        if not len(stamps):
+            return {}
+        found = {}
+        times = (stamps - stamps[0]) * 1e-9
+        rising = np.concatenate(([True], np.diff(times) > 0.0))
+        for name, column in columns.items():
+            if name not in self.measured.stamps:
+                continue
+            t_measured = (np.array(self.measured.stamps[name], np.int64) - stamps[0]) * 1e-9
+            one = compare(times[rising], column[rising], t_measured, np.array(self.measured.values[name]))
+            if one is not None:
+                found[name] = one
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """Return everything for JSON: what the scene predicts at the top, other scenes under `with`."""
+        first, *others = self.predictions
+        return {
+            "run": str(self.path),
+            "kind": self.kind,
+            "scene": first.name,
+            **self._prediction(first),
+            "with": [{"scene": other.name, **self._prediction(other)} for other in others],
+            "input": self.input,
+            "lost": self.losses,
+            "skipped_topics": self.unknown_types,
+            "wall_s": self.wall_s,
+        }
+
+    def _prediction(self, prediction: Prediction) -> dict[str, Any]:
+        signals = {name: found.facts() for name, found in self.comparisons(prediction).items()}
+        facts: dict[str, Any] = {"signals": signals, "loads": prediction.loads.facts()}
+        confusion = self._confusion(prediction)
+        return facts if confusion is None else facts | {"contact_set_confusion": confusion}
+
+    def _confusion(self, prediction: Prediction) -> dict[str, dict[str, int]] | None:
+        """Return, by pair, how often contact was predicted and measured, where forces were measured."""
+        stamps, columns = prediction.series()
+        found = {}
+        for name in PAIR_NAMES:
+            key = f"force_{name}"
+            if key not in self.measured.stamps or not len(stamps):
+                continue
+            at = np.array(self.measured.stamps[key], np.int64)
+            inside = (at >= stamps[0]) & (at <= stamps[-1])
+            place = np.minimum(np.searchsorted(stamps, at[inside]), len(stamps) - 1)
+            predicted = columns[key][place] > 0.0
+            largest = max(1.0, float(np.max(np.abs(self.measured.values[key]))))
+            measured = np.array(self.measured.values[key])[inside] > 0.01 * largest
+            found[name] = {
+                "both": int((predicted & measured).sum()),
+                "predicted_only": int((predicted & ~measured).sum()),
+                "measured_only": int((~predicted & measured).sum()),
+                "neither": int((~predicted & ~measured).sum()),
+            }
+        return found or None
+
+
+def analyse(
+    path: Path,
+    *,
+    scene: Path | None = None,
+    mapping: Path | None = None,
+    others: Sequence[Path] = (),
+    out: Path | None = None,
+    on_progress: OnProgress | None = None,
+) -> Analysis:
+    """Analyse a recording.
+
+    Parameters
+    ----------
+    path
+        A run of ours, another recording (MCAP, rosbag2's sqlite3, CSV), or a folder of its parts.
+    scene
+        Scene file or preset; needed for other recordings (or `scene.yaml` beside them), else that of the run.
+    mapping
+        YAML that says which topic is what.
+    others
+        Further scenes to predict with.
+    out
+        Folder in which another recording becomes a run like any other (`run`).
+
+    Raises
+    ------
+    RecordingError, SceneError
+        The recording, the mapping or a scene cannot be used.
+    """
+    begin = time.perf_counter()
+    reader = _own(path)
+    if reader is not None:
+        own = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
+        chosen, name = (own, "of the run") if scene is None else (load_scene(scene_path(str(scene))), str(scene))
+    else:
+        file = scene or (path / "scene.yaml" if path.is_dir() else path.with_name("scene.yaml"))
+        if scene is None and not file.is_file():
+            raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
+        chosen, name = load_scene(scene_path(str(file))), str(file)
+    predictions = [Prediction(name, chosen, LoadTotals(chosen))]
+    for other in others:
+        with_scene = load_scene(scene_path(str(other)))
+        predictions.append(Prediction(str(other), with_scene, LoadTotals(with_scene)))
+    measured = Measured()
+    if reader is not None:
+        found = _walk_own(reader, path, mapping, predictions, measured, on_progress)
+    else:
+        found = _walk_other(path, mapping, predictions, measured, out)
+    found.wall_s = time.perf_counter() - begin
+    return found
+
+
+def _own(path: Path) -> RunReader | None:
+    """Return the reader of a run of ours, or None for another recording."""
+    if not path.exists():
+        raise RecordingError(f"{path}: no such recording")
+    if path.is_dir() and not any(path.glob("*.mcap")):
+        return None
+    try:
+        return RunReader(path)
+    except RecordingError as error:
+        if "is missing: not a recording" in str(error) or "not an MCAP file" in str(error):
+            return None
+        raise
+
+
+def _session(scene: Scene, tol: float, origin_ns: int | None = None) -> Session:
+    return Session(Twin(scene, tol=tol, excitation="sampled"), origin_ns)
+
+
+def _walk_own(
+    reader: RunReader,
+    path: Path,
+    mapping: Path | None,
+    predictions: list[Prediction],
+    measured: Measured,
+    on_progress: OnProgress | None,
+) -> Analysis:
+    header = reader.header
+    if header.excitation_source == "scene":
+        raise RecordingError(f"{reader.path}: excitation_source: got scene, expected a run under sampled loads")
+    walkers = [
+        Walker(_session(prediction.scene, header.tol, header.origin_ns), prediction.walked)
+        for prediction in predictions
+    ]
+    used = 0
+    for stamps, wrench, other in _journal(reader):
+        if on_progress is not None:
+            on_progress(reader.position)
+        if len(stamps):
+            used += len(stamps)
+            for walker in walkers:
+                walker.samples(stamps, wrench, stamps)
+        if isinstance(other, Travel):
+            for walker in walkers:
+                walker.speed_m_s = other.speed_m_s
+                walker.apply(other)
+        elif isinstance(other, Reset | Loss):
+            for walker, prediction in zip(walkers, predictions, strict=True):
+                walker.apply(Reset(0, "loss") if isinstance(other, Loss) else other)
+                prediction.restart()
+        elif isinstance(other, Snapshot):
+            walkers[0].apply(other)  # the state after a loss; other scenes go on from their own
+    losses = {topic: count for topic, count in reader.lost.items() if count}
+    if reader.status is not FileStatus.COMPLETE:
+        losses[reader.status.value] = 1
+    unknown: dict[str, str] = {}
+    for place in dict.fromkeys((path if path.is_dir() else path.parent, path.parent / BESIDE, path / BESIDE)):
+        if place.is_dir() and any(place.glob("*.mcap")):
+            unknown |= _measure(place, mapping, header.node, measured)
+    return Analysis(reader.path, "run", predictions, measured, {"samples_used": used}, losses, unknown)
+
+
+def _journal(reader: RunReader) -> Iterator[tuple[NDArray[np.int64], Array, Any]]:
+    """Yield runs of samples, and the entry that ends each; a hold is a sample of the load before."""
+    empty, last = (np.zeros(0, np.int64), np.zeros((0, 3))), np.zeros(3)
+    lost = False
+    for batch in reader.batches(outputs=False):
+        entries, begin = batch.entries, 0
+        for place in (*sorted(entries.others), len(entries)):
+            chosen = slice(begin, place)
+            if place > begin:
+                last = entries.wrench[place - 1]
+                yield entries.stamp_ns[chosen], entries.wrench[chosen], None
+            if place < len(entries):
+                entry = entries.others[place]
+                if isinstance(entry, Hold):
+                    yield np.array([entry.stamp_ns]), last[None].copy(), None
+                elif isinstance(entry, Travel | Reset | Loss) or (isinstance(entry, Snapshot) and lost):
+                    last = np.zeros(3) if isinstance(entry, Reset) else last
+                    yield (*empty, entry)
+                lost = isinstance(entry, Loss)
+            begin = place + 1
+
+
+def _measure(place: Path, mapping: Path | None, node: str, measured: Measured) -> dict[str, str]:
+    """Read what was measured beside a run; the loads are those of the journal."""
+    source = open_source(place)
+    topics = {topic: kind for topic, kind in source.topics().items() if not topic.startswith(f"{node}/")}
+    roles = {name: role for name, role in read_map(mapping, topics).items() if name not in ("excitation", "travel")}
+    _collect(source, roles, measured)
+    return source.losses.unknown_types
+
+
+def _collect(source: Source, roles: Mapping[str, Role], measured: Measured) -> None:
+    names = {role.topic: name for name, role in roles.items()}
+    if not names:
+        return
+    for arrived in source.messages(names.__contains__):
+        found = roles[names[arrived.topic]].read(arrived)
+        if found is not None:
+            measured.add(names[arrived.topic], *found)
+
+
+def _walk_other(
+    path: Path, mapping: Path | None, predictions: list[Prediction], measured: Measured, out: Path | None
+) -> Analysis:
+    source = open_source(path)
+    roles = read_map(mapping, source.topics())
+    if "excitation" not in roles:
+        found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(source.topics().items())) or "no topic"
+        raise RecordingError(
+            f"{path}: excitation: got {found}, expected a topic with the load, or a mapping that says it"
+        )
+    writer = _writer(out, predictions[0].scene, roles) if out is not None else None
+    walkers = [
+        Walker(_session(prediction.scene, _TOLERANCE), prediction.walked, writer if number == 0 else None)
+        for number, prediction in enumerate(predictions)
+    ]
+    for walker, prediction in zip(walkers, predictions, strict=True):
+        walker.on_reset = prediction.restart
+    feed = Feed(walkers, roles, measured.add, Intake())
+    feed.run(source.messages({role.topic for role in roles.values()}.__contains__))
+    intake = feed.intake
+    dropped = {
+        f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count
+    }
+    losses = {**source.losses.counts, **dropped}
+    if feed.unfit and not intake.counts[Verdict.MALFORMED]:
+        losses["unfit_messages"] = feed.unfit
+    if walkers[0].failures:
+        losses["solver_failures"] = walkers[0].failures
+    if writer is not None:
+        writer.close({})
+    counted = {"samples_in": intake.arrived, "samples_used": intake.used, **dropped}
+    return Analysis(path, "other", predictions, measured, counted, losses, dict(source.losses.unknown_types))
+
+
+def _writer(out: Path, scene: Scene, roles: Mapping[str, Role]) -> Any:
+    from plow_twin.record.header import RunHeader
+    from plow_twin.record.writer import RunWriter
+
+    parameters = {f"map_{name}": role.topic for name, role in roles.items()}
+    header = RunHeader(dump_scene(scene), tol=_TOLERANCE, parameters=parameters)
+    return RunWriter(out / "run", header, chunk_size=2**20, min_free_bytes=64 * 1024 * 1024)
+
+
+def expand(paths: Sequence[Path]) -> list[Path]:
+    """Return the recordings in some places: a folder that is none itself stands for those in it.
+
+    Raises
+    ------
+    RecordingError
+        A folder holds none.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if not path.is_dir() or any(any(path.glob(pattern)) for pattern in ("*.mcap", "*.db3", "*.csv")):
+            found.append(path)
+            continue
+        inside = [
+            item
+            for item in sorted(path.iterdir())
+            if item.suffix in (".mcap", ".db3")
+            or (item.is_dir() and any(any(item.glob(pattern)) for pattern in ("*.mcap", "*.db3", "*.csv")))
+        ]
+        if not inside:
+            raise RecordingError(f"{path}: got a folder without recordings, expected some")
+        found += inside
+    return found
+
+
+@dataclass(frozen=True)
+class Task:
+    """One analysis, for a process of its own."""
+
+    path: Path
+    scene: Path | None
+    mapping: Path | None
+    others: tuple[Path, ...]
+    out: Path | None
+
+
+def analyse_task(task: Task) -> dict[str, Any]:
+    """Return the facts of one analysis; `error` when it failed. Its results are written to `out`."""
+    from plow_twin.study.analysis.report import write_report
+
+    try:
+        found = analyse(task.path, scene=task.scene, mapping=task.mapping, others=task.others, out=task.out)
+        if task.out is not None:
+            write_report(found, task.out)
+        return {**found.facts(), "lossy": found.lossy}
+    except PlowTwinError as error:
+        return {"run": str(task.path), "error": str(error)}

@@ -1,0 +1,177 @@
+"""What the contacts bore: impacts, forces, duty, cycles, energy and forces along the face, summed batch by batch."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.scene import Scene
+from plow_twin.record.importing import Walked
+
+Array = NDArray[np.float64]
+
+#: Bins of the rainflow count.
+CYCLE_BINS: Final = 16
+#: Length of a piece of the face [m].
+FACE_BIN_M: Final = 1.0
+#: Reversals of the force kept before they are counted.
+_MOST_REVERSALS: Final = 2_000_000
+
+
+@dataclass
+class Pass:
+    """One pass along the face: from one reversal of the travel to the next.
+
+    Times in s since the first stamp, positions along the face in m, energy in J.
+    """
+
+    start_s: float
+    end_s: float
+    start_m: float
+    end_m: float
+    impacts: int
+    largest_force_n: float
+    contact_loss_j: float
+
+
+@dataclass
+class LoadTotals:
+    """Sums over a run; `add` takes in batch after batch."""
+
+    scene: Scene
+    duration_s: float = 0.0
+    impacts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(PAIR_COUNT, np.int64))
+    impulse: Array = field(default_factory=lambda: np.zeros(PAIR_COUNT))
+    largest: Array = field(default_factory=lambda: np.zeros(PAIR_COUNT))
+    contact_s: Array = field(default_factory=lambda: np.zeros(PAIR_COUNT))
+    contact_loss_j: float = 0.0
+    sets: Counter[int] = field(default_factory=Counter)
+    passes: list[Pass] = field(default_factory=list)
+    #: largest force in each piece of the face, by pass and piece
+    face: dict[tuple[int, int], float] = field(default_factory=dict)
+    _first_ns: int | None = None
+    _last: tuple[int, Array, Array, Array] | None = None
+    _place_m: float = 0.0
+    _direction: float = 0.0
+    _reversals: list[list[Array]] = field(default_factory=lambda: [[] for _ in range(PAIR_COUNT)])
+
+    def restart(self) -> None:
+        """Go on after a reset: what happened between two stamps across it counts for nothing."""
+        self._last = None
+
+    def add(self, walked: Walked) -> None:
+        """Take in some advances."""
+        rows, stamps = walked.rows, walked.stamp_ns
+        self._first_ns = int(stamps[0]) if self._first_ns is None else self._first_ns
+        steps = np.zeros(len(stamps))
+        steps[1:] = np.diff(stamps) * 1e-9
+        if self._last is not None:
+            steps[0] = max(0.0, (int(stamps[0]) - self._last[0]) * 1e-9)
+        self.duration_s += float(steps.sum())
+        self.impacts += rows.makes.sum(axis=0)
+        self.impulse += rows.impulse.sum(axis=0)
+        np.maximum(self.largest, rows.peak.max(axis=0), out=self.largest)
+        self.contact_s += ((rows.impulse > 0.0) * steps[:, None]).sum(axis=0)
+        masks = ((rows.force > 0.0) << np.arange(PAIR_COUNT)).sum(axis=1)
+        for mask, count in zip(*np.unique(masks, return_counts=True), strict=True):
+            self.sets[int(mask)] += int(count)
+        for pair, kept in enumerate(self._reversals):
+            turning = reversals(rows.peak[:, pair])
+            if turning.size > 1 or turning.any():
+                kept.append(turning)
+        loss = self._contact_loss(walked, steps)
+        self.contact_loss_j += float(loss.sum())
+        self._face(walked, steps, loss)
+        self._last = (int(stamps[-1]), walked.wrench[-1].copy(), rows.q[-1].copy(), rows.v[-1].copy())
+
+    def _contact_loss(self, walked: Walked, steps: Array) -> Array:
+        """Return the energy that the contacts took between two rows [J]: work of load and gravity less kinetic gain.
+
+        The work is the mean load times the way; what is stored in contacts is counted as taken until it comes back.
+        """
+        q, v, wrench = walked.rows.q, walked.rows.v, walked.wrench
+        if self._last is not None:
+            _, wrench_0, q_0, v_0 = self._last
+        else:
+            wrench_0, q_0, v_0 = wrench[0], q[0], v[0]
+        q_before, v_before = np.concatenate((q_0[None], q[:-1])), np.concatenate((v_0[None], v[:-1]))
+        wrench_before = np.concatenate((wrench_0[None], wrench[:-1]))
+        head, gravity = self.scene.head, self.scene.gravity
+        moment = -head.mass_kg * gravity.acceleration_m_s2 * gravity.arm_m
+        work = (0.5 * (wrench + wrench_before) * (q - q_before)).sum(axis=1) + moment * (q - q_before)[:, 2]
+        inertia = np.array([head.mass_kg, head.mass_kg, head.inertia_kg_m2])
+        gain: Array = 0.5 * ((v**2 - v_before**2) * inertia).sum(axis=1)
+        return np.where(steps > 0.0, work - gain, 0.0)
+
+    def _face(self, walked: Walked, steps: Array, loss: Array) -> None:
+        """Assign impacts, energy and forces to the pass and the piece of the face."""
+        speed = walked.speed_m_s
+        direction = math.copysign(1.0, speed) if speed else 0.0
+        now_s = (int(walked.stamp_ns[0]) - (self._first_ns or 0)) * 1e-9
+        if not self.passes or (direction and self._direction and direction != self._direction):
+            self.passes.append(Pass(now_s, now_s, self._place_m, self._place_m, 0, 0.0, 0.0))
+        self._direction = direction or self._direction
+        place = self._place_m + speed * np.cumsum(steps)
+        self._place_m = float(place[-1])
+        largest = walked.rows.peak.max(axis=1)
+        here = self.passes[-1]
+        here.end_s = (int(walked.stamp_ns[-1]) - (self._first_ns or 0)) * 1e-9
+        here.end_m = self._place_m
+        here.impacts += int(walked.rows.makes.sum())
+        here.largest_force_n = max(here.largest_force_n, float(largest.max()))
+        here.contact_loss_j += float(loss.sum())
+        if speed:
+            pieces = np.floor(place / FACE_BIN_M).astype(np.int64)
+            for piece in np.unique(pieces).tolist():
+                key = (len(self.passes) - 1, piece)
+                self.face[key] = max(self.face.get(key, 0.0), float(largest[pieces == piece].max()))
+
+    def cycles(self) -> dict[str, list[dict[str, float]]]:
+        """Return rainflow counts of the contact force by pair (ASTM E1049): upper end of a range [N] and its count."""
+        import rainflow
+
+        found = {}
+        for pair, kept in enumerate(self._reversals):
+            if not kept or self.largest[pair] <= 0.0:
+                continue
+            series = reversals(np.concatenate(kept))[:_MOST_REVERSALS]
+            counted = rainflow.count_cycles(series, nbins=CYCLE_BINS)
+            found[PAIR_NAMES[pair]] = [{"range_n": float(size), "count": float(count)} for size, count in counted]
+        return found
+
+    def facts(self) -> dict[str, Any]:
+        """Return the sums for JSON."""
+        total = max(1, self.sets.total())
+        return {
+            "duration_s": self.duration_s,
+            "impacts": dict(zip(PAIR_NAMES, self.impacts.tolist(), strict=True)),
+            "largest_force_n": dict(zip(PAIR_NAMES, self.largest.tolist(), strict=True)),
+            "impulse_n_s": dict(zip(PAIR_NAMES, self.impulse.tolist(), strict=True)),
+            "duty": dict(zip(PAIR_NAMES, (self.contact_s / max(self.duration_s, 1e-300)).tolist(), strict=True)),
+            "contact_loss_j": self.contact_loss_j,
+            "passes": [vars(item) for item in self.passes],
+            "cycles": self.cycles(),
+            "contact_sets": {
+                "+".join(PAIR_NAMES[pair] for pair in range(PAIR_COUNT) if mask >> pair & 1) or "none": count / total
+                for mask, count in self.sets.most_common()
+            },
+        }
+
+
+def reversals(values: Array) -> Array:
+    """Return the turning points of a series, its ends included."""
+    if len(values) < 3:
+        return values
+    changes = np.flatnonzero(np.diff(values) != 0.0)
+    if not changes.size:
+        return values[:1]
+    kept = np.concatenate((values[changes], values[-1:]))
+    rising = np.diff(kept) > 0.0
+    turns = np.flatnonzero(rising[1:] != rising[:-1]) + 1
+    return np.concatenate((kept[:1], kept[turns], kept[-1:]))

@@ -1,0 +1,174 @@
+"""The result of an analysis as files: `report.html`, `analysis.json` and Parquet tables."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from plow_twin.model.pairs import PAIR_NAMES
+
+if TYPE_CHECKING:
+    from plow_twin.study.analysis.analyse import Analysis, Prediction
+
+_MOST_POINTS: Final = 4000
+
+_PAGE: Final = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{{ facts.run }}</title>
+<style>body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:70em;padding:0 1em;color:#222}
+table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
+th:first-child,td:first-child{text-align:left}img{max-width:100%}</style></head><body>
+<h1>{{ facts.run }}</h1>
+<p>{{ facts.kind }}; {{ facts.input.samples_used }} samples used, {{ "%.1f" | format(facts.loads.duration_s) }} s.
+{% if facts.lost %}Lost: {{ facts.lost }}.{% endif %}
+{% if facts.skipped_topics %}Topics passed over: {{ facts.skipped_topics }}.{% endif %}</p>
+{% for part in parts %}
+<h2>Scene {{ part.scene }}</h2>
+{% if part.signals %}<h3>Predicted minus measured</h3>
+<table><tr><th>signal</th><th>n</th><th>bias</th><th>RMS</th><th>correlation</th><th>lag [s]</th><th>RMS aligned</th>
+<th>coherence</th></tr>{% for name, s in part.signals.items() %}
+<tr><td>{{ name }}</td><td>{{ s.n }}</td><td>{{ number(s.bias) }}</td><td>{{ number(s.rms) }}</td>
+<td>{{ number(s.correlation) }}</td><td>{{ number(s.lag_s) }}</td><td>{{ number(s.rms_aligned) }}</td>
+<td>{{ number(s.coherence) }}</td></tr>{% endfor %}</table>
+{% else %}<p>Nothing was measured.</p>{% endif %}
+<h3>Contacts</h3>
+<table><tr><th>pair</th><th>impacts</th><th>largest force [kN]</th><th>impulse [kN s]</th><th>duty [%]</th></tr>
+{% for name in pairs %}<tr><td>{{ name }}</td><td>{{ part.loads.impacts[name] }}</td>
+<td>{{ "%.2f" | format(part.loads.largest_force_n[name] / 1e3) }}</td>
+<td>{{ "%.3f" | format(part.loads.impulse_n_s[name] / 1e3) }}</td>
+<td>{{ "%.2f" | format(100 * part.loads.duty[name]) }}</td></tr>{% endfor %}</table>
+<h3>Passes of the face</h3>
+<table><tr><th>pass</th><th>from [s]</th><th>to [s]</th><th>from [m]</th><th>to [m]</th><th>impacts</th>
+<th>largest force [kN]</th><th>taken by contacts [kJ]</th></tr>{% for p in part.loads.passes %}
+<tr><td>{{ loop.index }}</td><td>{{ "%.1f" | format(p.start_s) }}</td><td>{{ "%.1f" | format(p.end_s) }}</td>
+<td>{{ "%.1f" | format(p.start_m) }}</td><td>{{ "%.1f" | format(p.end_m) }}</td><td>{{ p.impacts }}</td>
+<td>{{ "%.2f" | format(p.largest_force_n / 1e3) }}</td><td>{{ "%.3f" | format(p.contact_loss_j / 1e3) }}</td>
+</tr>{% endfor %}</table>
+<h3>Rainflow counts of the contact force</h3>
+<table><tr><th>pair</th><th>range up to [kN]: cycles</th></tr>{% for name, bins in part.loads.cycles.items() %}
+<tr><td>{{ name }}</td><td>{% for b in bins %}{% if b.count %}{{ "%.1f" | format(b.range_n / 1e3) }}: {{ b.count }};
+{% endif %}{% endfor %}</td></tr>{% endfor %}</table>
+{% endfor %}
+<h2>Course</h2><img alt="Pose and forces in time" src="data:image/png;base64,{{ picture }}">
+</body></html>
+"""
+
+
+def write_report(found: Analysis, out: Path) -> None:
+    """Write all files of an analysis into the folder `out`."""
+    from jinja2 import Environment
+
+    out.mkdir(parents=True, exist_ok=True)
+    facts = found.facts()
+    (out / "analysis.json").write_text(json.dumps(facts, indent=2, allow_nan=False), encoding="utf-8")
+    environment = Environment(autoescape=True)
+    page = environment.from_string(_PAGE).render(
+        facts=facts,
+        parts=[facts, *facts["with"]],
+        pairs=PAIR_NAMES,
+        number=lambda value: "" if value is None else f"{value:.4g}",
+        picture=_picture(found),
+    )
+    (out / "report.html").write_text(page, encoding="utf-8")
+    for number, prediction in enumerate(found.predictions):
+        _write_tables(prediction, out, f"_{number}" if number else "")
+    _write_measured(found, out)
+
+
+def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    stamps, columns = prediction.series()
+    if len(stamps):
+        parquet.write_table(pa.table({"stamp_ns": stamps, **columns}), out / f"predicted{suffix}.parquet")
+    clearance = [
+        (part.publications.stamp_ns[part.publications.slow_index], part.publications.clearance)
+        for parts in prediction.stretches
+        for part in parts
+    ]
+    if clearance:
+        from plow_twin.stream.outputs import CLEARANCE_NAMES
+
+        times, values = (np.concatenate(column) for column in zip(*clearance, strict=True))
+        table = {"stamp_ns": times} | {name: values[:, index] for index, name in enumerate(CLEARANCE_NAMES)}
+        parquet.write_table(pa.table(table), out / f"clearance{suffix}.parquet")
+    if prediction.loads.face:
+        rows = [(number, piece, force) for (number, piece), force in sorted(prediction.loads.face.items())]
+        keys = ("pass", "position_m", "largest_force_n")
+        face = {key: list(column) for key, column in zip(keys, zip(*rows, strict=True), strict=True)}
+        parquet.write_table(pa.table(face), out / f"face{suffix}.parquet")
+
+
+def _write_measured(found: Analysis, out: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    measured = found.measured
+    if not measured.stamps:
+        return
+    names = [name for name, stamps in measured.stamps.items() for _ in stamps]
+    table = {
+        "signal": pa.array(names).dictionary_encode(),
+        "stamp_ns": np.concatenate([np.array(stamps, np.int64) for stamps in measured.stamps.values()]),
+        "value": np.concatenate([np.array(values) for values in measured.values.values()]),
+    }
+    parquet.write_table(pa.table(table), out / "measured.parquet")
+
+
+def _picture(found: Analysis) -> str:
+    """Return a PNG in base64: measured and predicted pose, largest force."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 9), layout="constrained")
+    axes = figure.subplots(4, 1, sharex=True)
+    start = None
+    for number, prediction in enumerate(found.predictions):
+        stamps, columns = prediction.series()
+        if not len(stamps):
+            continue
+        start = int(stamps[0]) if start is None else start
+        thin = max(1, len(stamps) // _MOST_POINTS)
+        times = (stamps - start) * 1e-9
+        label = "predicted" if not number else f"with {Path(prediction.name).name}"
+        for axis, name in zip(axes, ("x", "y", "theta"), strict=False):
+            axis.plot(times[::thin], columns[name][::thin], lw=0.9, label=label)
+        count = len(stamps) // thin * thin
+        force = np.max([columns[f"force_{pair}"][:count] for pair in PAIR_NAMES], axis=0).reshape(-1, thin).max(axis=1)
+        axes[3].plot(times[:count:thin], force / 1e3, lw=0.7, label=label)
+    for axis, name in zip(axes, ("x", "y", "theta"), strict=False):
+        if name in found.measured.stamps and start is not None:
+            at = (np.array(found.measured.stamps[name], np.int64) - start) * 1e-9
+            thin = max(1, len(at) // _MOST_POINTS)
+            axis.plot(at[::thin], found.measured.values[name][::thin], ".", ms=1.5, color="0.3", label="measured")
+    for axis, text in zip(axes, ("x [m]", "y [m]", "theta [rad]", "largest force [kN]"), strict=True):
+        axis.set_ylabel(text)
+        axis.legend(loc="upper right", fontsize=8)
+    axes[3].set_xlabel("time since the first stamp [s]")
+    stream = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
+    return base64.b64encode(stream.getvalue()).decode()
+
+
+def write_table_of_runs(rows: list[dict[str, Any]], out: Path) -> None:
+    """Write one row a recording to `runs.parquet`."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    flat = []
+    for facts in rows:
+        row: dict[str, Any] = {"run": facts["run"], "error": facts.get("error")}
+        for name, signal in facts.get("signals", {}).items():
+            row |= {f"{name}_{key}": value for key, value in signal.items()}
+        loads = facts.get("loads", {})
+        row |= {"impacts": sum(loads.get("impacts", {}).values()), "duration_s": loads.get("duration_s")}
+        row["largest_force_n"] = max(loads.get("largest_force_n", {}).values(), default=None)
+        flat.append(row)
+    out.mkdir(parents=True, exist_ok=True)
+    keys = list(dict.fromkeys(key for row in flat for key in row))
+    parquet.write_table(pa.table({key: [row.get(key) for row in flat] for key in keys}), out / "runs.parquet")

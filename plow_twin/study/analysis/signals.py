@@ -1,0 +1,136 @@
+"""Predicted against measured: bias, RMS, correlation, lag and coherence of one signal."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Largest lag that is looked for [s]; longer ones cannot be told from a period of the load.
+LARGEST_LAG_S: Final = 1.0
+#: Fewest measured values for a comparison.
+_FEWEST: Final = 8
+_MOST_POINTS: Final = 400_000
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A signal compared: predicted minus measured.
+
+    Attributes
+    ----------
+    n : int
+        Measured values within the time of the prediction.
+    bias, rms : float
+        Mean and root mean square of predicted minus measured, at equal stamps.
+    correlation : float or None
+        Pearson's, at equal stamps; None where a signal does not change.
+    lag_s : float or None
+        Lag of the measurement in s, positive where it is late: the one at which the correlation is largest.
+    rms_aligned : float or None
+        Standard deviation of what is left at that lag.
+    coherence : float or None
+        Magnitude-squared coherence at the strongest frequency of the prediction.
+    """
+
+    n: int
+    bias: float
+    rms: float
+    correlation: float | None
+    lag_s: float | None
+    rms_aligned: float | None
+    coherence: float | None
+
+    def facts(self) -> dict[str, Any]:
+        """Return the fields for JSON."""
+        return dict(vars(self))
+
+
+def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> Comparison | None:
+    """Compare a prediction (n,) at times t (rising) with measured values (m,) at their own times; None for too few."""
+    inside = (t_measured >= t[0]) & (t_measured <= t[-1]) & np.isfinite(measured) if len(t) else np.zeros(0, bool)
+    if inside.sum() < _FEWEST:
+        return None
+    order = np.argsort(t_measured[inside], kind="stable")
+    times, values = t_measured[inside][order], measured[inside][order]
+    here = np.interp(times, t, predicted)
+    difference = here - values
+    correlation = _correlation(here, values)
+    lag_s = None if correlation is None else _lag(t, predicted, times, values)
+    aligned = None
+    if lag_s is not None:
+        rest = _shifted(t, predicted, times, lag_s) - values
+        aligned = float(np.nanstd(rest))
+    bias, rms = float(difference.mean()), math.sqrt(float((difference**2).mean()))
+    return Comparison(len(values), bias, rms, correlation, lag_s, aligned, _coherence(times, here, values))
+
+
+def _correlation(one: Array, other: Array) -> float | None:
+    known = np.isfinite(one) & np.isfinite(other)
+    one, other = one[known], other[known]
+    if len(one) < _FEWEST:
+        return None
+    one, other = one - one.mean(), other - other.mean()
+    size = math.sqrt(float(one @ one) * float(other @ other))
+    return float(one @ other) / size if size > 1e-300 else None
+
+
+def _shifted(t: Array, predicted: Array, times: Array, lag_s: float) -> Array:
+    """Return the prediction as a measurement that is late by `lag_s` shows it; NaN outside its time."""
+    return np.interp(times - lag_s, t, predicted, left=math.nan, right=math.nan)
+
+
+def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | None:
+    """Return the lag with the largest correlation: first on a grid, then between its points."""
+    from scipy.optimize import minimize_scalar
+    from scipy.signal import correlate
+
+    span = float(times[-1] - times[0])
+    if span <= 0.0:
+        return None
+    step = max(float(np.median(np.diff(times))), span / _MOST_POINTS, 1e-6)
+    grid = np.arange(times[0], times[-1], step)
+    reach = int(min(LARGEST_LAG_S, span / 4.0) / step)
+    if len(grid) < _FEWEST or reach < 1:
+        return 0.0
+    one, other = np.interp(grid, t, predicted), np.interp(grid, times, values)
+    one, other = one - one.mean(), other - other.mean()
+    products = correlate(other, one, mode="full", method="fft")
+    middle = len(grid) - 1
+    shifts = np.arange(-reach, reach + 1)
+    # the sum over an overlap, per point of it
+    scores = products[middle - reach : middle + reach + 1] / (len(grid) - np.abs(shifts))
+    best = float(shifts[int(np.argmax(scores))]) * step
+    thin = max(1, len(times) // 50_000)
+
+    def badness(lag_s: float) -> float:
+        found = _correlation(_shifted(t, predicted, times[::thin], lag_s), values[::thin])
+        return 1.0 if found is None else -found
+
+    near = minimize_scalar(badness, bounds=(best - 1.5 * step, best + 1.5 * step), method="bounded")
+    return float(near.x) if near.fun <= badness(best) else best
+
+
+def _coherence(times: Array, predicted: Array, measured: Array) -> float | None:
+    from scipy.signal import coherence, periodogram
+
+    if len(times) < 64:
+        return None
+    step = max(float(np.median(np.diff(times))), float(times[-1] - times[0]) / _MOST_POINTS)
+    if step <= 0.0:
+        return None
+    grid = np.arange(times[0], times[-1], step)
+    one, other = np.interp(grid, times, predicted), np.interp(grid, times, measured)
+    if len(grid) < 64 or not np.ptp(one) or not np.ptp(other):
+        return None
+    length = min(len(grid) // 4, 4096)
+    frequencies, shares = coherence(one, other, fs=1.0 / step, nperseg=length)
+    spectrum_at, spectrum = periodogram(one - one.mean(), fs=1.0 / step)
+    strongest = spectrum_at[int(np.argmax(spectrum[1:])) + 1]
+    found = float(shares[int(np.argmin(np.abs(frequencies - strongest)))])
+    return found if math.isfinite(found) else None

@@ -1,0 +1,242 @@
+"""Other people's recordings through the twin: what a sensor's bias and delay look like, files of every kind, damage."""
+
+from __future__ import annotations
+
+import csv
+import json
+import random
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from record_support import BASE_NS, STEP_NS, paper_sample, record_run
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.replay import replay
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.study.analysis.analyse import Analysis, analyse
+from plow_twin.study.analysis.loads import reversals
+
+COUNT = 8000
+LAG_S = 0.037
+BIAS = (0.002, -0.003, 0.004)
+STORE = get_typestore(Stores.ROS2_JAZZY)
+PAPER = scene_path("paper")
+BEST_FIT = PAPER.with_name("paper_best_fit.yaml")
+MAP = """
+excitation: {topic: /load, type: geometry_msgs/msg/WrenchStamped, stamp: header, scale: {fx: 1000, fy: 1000, m: 1000},
+  fields: {fx: wrench.force.x, fy: wrench.force.y, m: wrench.torque.z}}
+head_pose: {topic: /pose}
+"""
+
+
+@pytest.fixture(scope="module")
+def motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, loads and poses of 8 s of the paper's head."""
+    twin = Twin(load_scene(PAPER), excitation="sampled")
+    times = np.arange(COUNT) * 1e-3
+    wrench = np.array([paper_sample(index).wrench for index in range(COUNT)])
+    return times, wrench, twin.advance_samples(times, wrench).q
+
+
+def measured(motion: tuple[np.ndarray, ...]) -> Iterable[tuple[float, np.ndarray]]:
+    """Poses at 100 Hz: late, biased, with noise."""
+    times, _, q = motion
+    rng = np.random.default_rng(4)
+    for t in np.arange(0.1, times[-1], 0.01):
+        late = np.array([np.interp(t - LAG_S, times, q[:, k]) for k in range(3)])
+        yield t, late - BIAS + rng.normal(0.0, [1e-4, 1e-4, 2e-4])
+
+
+def wrench_message(stamp_ns: int, wrench: Any) -> bytes:
+    types = STORE.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    header = types["std_msgs/msg/Header"](stamp, "f")
+    body = types["geometry_msgs/msg/Wrench"](vector(wrench[0], wrench[1], 0.0), vector(0.0, 0.0, wrench[2]))
+    message = types["geometry_msgs/msg/WrenchStamped"](header, body)
+    return bytes(STORE.serialize_cdr(message, "geometry_msgs/msg/WrenchStamped"))
+
+
+def pose_message(stamp_ns: int, q: Any) -> bytes:
+    types = STORE.types
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, np.sin(q[2] / 2), np.cos(q[2] / 2))
+    pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](q[0], q[1], 0.0), turn)
+    message = types["geometry_msgs/msg/PoseStamped"](types["std_msgs/msg/Header"](stamp, "f"), pose)
+    return bytes(STORE.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
+
+
+def write_bag(folder: Path, motion: tuple[np.ndarray, ...], plugin: StoragePlugin) -> Path:
+    messages = [
+        (BASE_NS + i * STEP_NS, "/load", wrench_message(BASE_NS + i * STEP_NS, wrench / 1000.0))
+        for i, wrench in enumerate(motion[1])
+    ]
+    messages += [
+        (BASE_NS + round(t * 1e9), "/pose", pose_message(BASE_NS + round(t * 1e9), q)) for t, q in measured(motion)
+    ]
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        kinds = {"/load": "geometry_msgs/msg/WrenchStamped", "/pose": "geometry_msgs/msg/PoseStamped"}
+        connections = {topic: writer.add_connection(topic, kind, typestore=STORE) for topic, kind in kinds.items()}
+        for time_ns, topic, data in sorted(messages):
+            writer.write(connections[topic], time_ns + 1_000_000, data)
+    (folder.parent / "map.yaml").write_text(MAP)
+    return folder
+
+
+def check(found: Analysis, bias: tuple[float, ...] = BIAS) -> None:
+    signals = found.comparisons(found.predictions[0])
+    assert set(signals) == {"x", "y", "theta"}
+    for name, expected in zip(signals, bias, strict=True):
+        signal = signals[name]
+        assert signal.lag_s == pytest.approx(LAG_S, abs=0.004), name
+        assert signal.bias == pytest.approx(expected, abs=4e-4), name
+        assert signal.rms >= abs(signal.bias) and signal.correlation is not None and signal.correlation > 0.5
+
+
+@pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_a_bag_shows_bias_and_lag_of_the_sensor_and_becomes_a_run(
+    plugin: StoragePlugin, motion: tuple[np.ndarray, ...], tmp_path: Path
+) -> None:
+    bag = write_bag(tmp_path / "bag", motion, plugin)
+    found = analyse(bag, scene=PAPER, mapping=tmp_path / "map.yaml", out=tmp_path / "out")
+    check(found)
+    assert found.input == {"samples_in": COUNT, "samples_used": COUNT} and not found.lossy
+    report = replay(tmp_path / "out" / "run")
+    assert (report.exit_code, report.samples, report.digests_compared) == (0, COUNT, COUNT // 100 + 1)
+    assert report.compared["contact_forces"] == COUNT
+
+
+def test_csv_files_are_read_by_their_columns(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+    with (tmp_path / "load.csv").open("w", newline="") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(["t", "fx", "fy", "m"])
+        rows.writerows([t, *wrench] for t, wrench in zip(motion[0], motion[1], strict=True))
+    with (tmp_path / "pose.csv").open("w", newline="") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(["t", "x", "y", "theta"])
+        rows.writerows([t, q[0], "", q[2]] for t, q in measured(motion))
+    found = analyse(tmp_path, scene=PAPER)
+    signals = found.comparisons(found.predictions[0])
+    assert set(signals) == {"x", "theta"}  # a cell left empty was not measured
+    assert signals["x"].lag_s == pytest.approx(LAG_S, abs=0.004)
+
+
+def test_other_scenes_are_predicted_beside_it_in_one_pass(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", motion, StoragePlugin.MCAP)
+    command = [sys.executable, "-m", "plow_twin", "analyse", str(bag), "--scene", "paper", "--with", str(BEST_FIT)]
+    command += ["--map", str(tmp_path / "map.yaml"), "--out", str(tmp_path / "out"), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert set(facts["signals"]["x"]) >= {"n", "bias", "rms", "correlation", "lag_s"}
+    assert facts["with"][0]["scene"] == str(BEST_FIT)
+    assert facts["with"][0]["signals"]["x"]["rms"] != facts["signals"]["x"]["rms"]
+    loads = facts["loads"]
+    assert sum(loads["impacts"].values()) > 5 and loads["cycles"] and loads["contact_loss_j"] > 0.0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names >= {"report.html", "analysis.json", "predicted.parquet", "predicted_1.parquet", "measured.parquet"}
+
+
+def test_a_run_of_ours_is_analysed_by_its_journal(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(1000)), frame_every=10**9)
+    found = analyse(run.folder)
+    assert found.input == {"samples_used": 1000} and not found.lossy and not found.comparisons(found.predictions[0])
+    assert found.predictions[0].loads.duration_s == pytest.approx(0.999)
+
+
+def test_late_repeated_and_non_finite_samples_are_counted_as_live(
+    motion: tuple[np.ndarray, ...], tmp_path: Path
+) -> None:
+    stamps = [BASE_NS + i * STEP_NS for i in range(200)]
+    arrivals = [(stamp, motion[1][i]) for i, stamp in enumerate(stamps)]
+    arrivals[50], arrivals[51] = arrivals[51], arrivals[50]
+    arrivals.insert(100, arrivals[99])
+    arrivals[150] = (arrivals[150][0], np.array([np.nan, 0.0, 0.0]))
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/excitation", "geometry_msgs/msg/WrenchStamped", typestore=STORE)
+        for index, (stamp, wrench) in enumerate(arrivals):
+            writer.write(connection, BASE_NS + index * STEP_NS, wrench_message(stamp, wrench))
+    found = analyse(tmp_path / "bag", scene=PAPER)
+    assert found.input == {
+        "samples_in": 201,
+        "samples_used": 198,
+        "dropped_non_finite": 1,
+        "dropped_duplicate": 1,
+        "dropped_out_of_order": 1,
+    }
+    assert found.lossy
+
+
+def mutate(data: bytes, rng: random.Random) -> bytes:
+    """Flip, cut, repeat, drop or overwrite some bytes."""
+    changed = bytearray(data)
+    for _ in range(rng.choice((1, 1, 3, 20))):
+        place = rng.randrange(len(changed))
+        size = rng.choice((1, 1, 4, 8, 64, 1000))
+        kind = rng.randrange(6)
+        if kind == 0:
+            changed[place] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            changed[place : place + size] = rng.randbytes(size)
+        elif kind == 2:
+            changed[place : place + size] = b"\xff" * size
+        elif kind == 3 and len(changed) > 2 * size:
+            del changed[place : place + size]
+        elif kind == 4:
+            changed[place:place] = changed[place : place + size]
+        else:
+            del changed[max(1, place) :]
+    return bytes(changed)
+
+
+def read_everything(path: Path, read: Callable[[Path], object]) -> None:
+    try:
+        read(path)
+    except RecordingError as error:
+        assert str(error)
+
+
+def mutate_many(tmp_path: Path, motion: tuple[np.ndarray, ...], seeds: Iterable[int]) -> None:
+    short = (motion[0][:600], motion[1][:600], motion[2][:600])
+    files = [
+        record_run(tmp_path / "run", map(paper_sample, range(300))).file,
+        next(write_bag(tmp_path / "sqlite", short, StoragePlugin.SQLITE3).glob("*.db3")),
+        next(write_bag(tmp_path / "mcap", short, StoragePlugin.MCAP).glob("*.mcap")),
+    ]
+    contents = [file.read_bytes() for file in files]
+    mapping = tmp_path / "map.yaml"
+    readers: list[Callable[[Path], object]] = [
+        replay,
+        lambda path: analyse(path, scene=PAPER, mapping=mapping),
+        lambda path: analyse(path, scene=PAPER, mapping=mapping),
+    ]
+    for seed in seeds:
+        rng = random.Random(seed)
+        kind = seed % 3
+        target = tmp_path / f"mutated{files[kind].suffix}"
+        target.write_bytes(mutate(contents[kind], rng))
+        read_everything(target, readers[kind])
+
+
+def test_mutated_files_give_an_error_or_counted_loss(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+    mutate_many(tmp_path, motion, range(150))
+
+
+@pytest.mark.stress
+@pytest.mark.timeout(3600)
+def test_mutated_files_many_times(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+    mutate_many(tmp_path, motion, range(1000, 11_000))
+
+
+def test_turning_points_keep_peaks_and_ends() -> None:
+    np.testing.assert_array_equal(reversals(np.array([0.0, 0, 1, 3, 3, 2, 5, 0, 0])), [0, 3, 2, 5, 0])
+    np.testing.assert_array_equal(reversals(np.zeros(5)), [0.0])
