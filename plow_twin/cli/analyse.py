@@ -46,7 +46,8 @@ def analyse(
     quiet: bool,
 ) -> int:
     """Analyse recordings: runs of ours, MCAP, rosbag2's sqlite3, CSV, or folders of them."""
-    from plow_twin.study.analysis.analyse import Task, expand
+    from plow_twin.study.analysis.analyse import expand
+    from plow_twin.study.analysis.task import Task
 
     found = expand(recordings)
     many = len(found) > 1 or found != list(recordings)
@@ -91,7 +92,7 @@ def _run(tasks: list[Any], workers: int, quiet: bool) -> list[dict[str, Any]]:
     from concurrent.futures import ProcessPoolExecutor, as_completed
     from multiprocessing import get_context
 
-    from plow_twin.study.analysis.analyse import analyse_task
+    from plow_twin.study.analysis.task import analyse_task
 
     results: dict[int, dict[str, Any]] = {}
     for number, task in enumerate(tasks):

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import PlowTwinError, RecordingError
+from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.importing import Feed, Walked, Walker
@@ -391,27 +391,3 @@ def expand(paths: Sequence[Path]) -> list[Path]:
             raise RecordingError(f"{path}: got a folder without recordings, expected some")
         found += inside
     return found
-
-
-@dataclass(frozen=True)
-class Task:
-    """One analysis, for a process of its own."""
-
-    path: Path
-    scene: Path | None
-    mapping: Path | None
-    others: tuple[Path, ...]
-    out: Path | None
-
-
-def analyse_task(task: Task) -> dict[str, Any]:
-    """Return the facts of one analysis; `error` when it failed. Its results are written to `out`."""
-    from plow_twin.study.analysis.report import write_report
-
-    try:
-        found = analyse(task.path, scene=task.scene, mapping=task.mapping, others=task.others, out=task.out)
-        if task.out is not None:
-            write_report(found, task.out)
-        return {**found.facts(), "lossy": found.lossy}
-    except PlowTwinError as error:
-        return {"run": str(task.path), "error": str(error)}
