@@ -14,6 +14,12 @@ from plow_twin.solve.state import COS, OMEGA, ON, SIN, VX, VY, X, Y
 
 
 @kernel(inline=True)
+def time_along(alpha, beta, sigma):
+    """Return the time that the series' variable stands for:  t = alpha sigma + beta sigma^2 / 2."""
+    return alpha * sigma + 0.5 * beta * sigma * sigma
+
+
+@kernel(inline=True)
 def sigma_at(state, used):
     """Return sigma at `used` seconds into the step."""
     if used >= state.step_size:

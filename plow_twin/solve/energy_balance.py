@@ -15,7 +15,7 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
 from plow_twin.model.geometry import STATE_SIZE
-from plow_twin.solve.dense_output import evaluate, pair_outputs, wear_depth_at
+from plow_twin.solve.dense_output import evaluate, pair_outputs, time_along, wear_depth_at
 from plow_twin.solve.dynamics import about_mass, push
 from plow_twin.solve.kinematics import to_world_axes
 from plow_twin.solve.loads import load_at
@@ -152,7 +152,7 @@ def balance_step(p, parts, wear, flight, state, w, balance) -> None:
             evaluate(p, parts, state, w, sigma, y)
             if wear is not None:
                 wear_depth_at(state, w, sigma, wear_depth)
-            t = state.step_start + state.alpha * sigma + 0.5 * state.beta * sigma * sigma
+            t = state.step_start + time_along(state.alpha, state.beta, sigma)
             _powers(p, parts, state, wear_depth, y, t, balance, balance.now)
             _add(balance, balance.now, balance.weights[i] * width * (state.alpha + state.beta * sigma))
     evaluate(p, parts, state, w, end, y)

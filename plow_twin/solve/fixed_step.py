@@ -15,6 +15,7 @@ from plow_twin.solve.energy_balance import balance_fixed_step, start_balance
 from plow_twin.solve.kinematics import pose_of, to_body, to_world
 from plow_twin.solve.modes import mode_inside, touch, within_range
 from plow_twin.solve.state import OFF, ON, Status
+from plow_twin.solve.totals import add_set_times, log_event
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _LOG_FULL = int(Status.LOG_FULL)
@@ -32,10 +33,7 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:
             touch(p, state, pair)
             totals.makes[pair] += 1
         if log is not None:
-            i = log.length[0]
-            log.time[i], log.pair[i], log.rate[i] = time, pair, rate[pair]
-            log.mode_from[i], log.mode_to[i] = state.mode[pair], mode
-            log.length[0] = i + 1
+            log_event(log, time, pair, state.mode[pair], mode, rate[pair])
         state.mode[pair] = mode
         state.events += 1
 
@@ -43,17 +41,14 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:
 @kernel()
 def _add_to_totals(state, force_before, force, dt, totals) -> None:
     """Add one step to the totals by the trapezoidal rule."""
-    sets = np.zeros(2, np.int64)
+    carrying = 0
     for pair in range(8):
         totals.peak[pair] = max(totals.peak[pair], force[pair])
         totals.impulse[pair] += 0.5 * dt * (force_before[pair] + force[pair])
         if force[pair] > 0.0:
             totals.time_in_contact[pair] += dt
-            corner = pair // 2
-            sets[(pair + corner) % 2] |= 1 << corner
-    for sense in range(2):
-        if sets[sense] != 0:
-            totals.set_time[sense, sets[sense]] += dt
+            carrying |= 1 << pair
+    add_set_times(totals, carrying, dt)
 
 
 @kernel()

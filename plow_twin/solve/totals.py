@@ -1,10 +1,12 @@
-"""What is summed over the motion, from the force polynomials: peaks, impulses, times, sets of corners."""
+"""What is kept of a motion: peaks, impulses, times and sets of corners from the force polynomials, and its events."""
 
 from __future__ import annotations
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import maximum, shift_column
 from plow_twin.kernel.simd import magnitude, row, set_row, splat
+from plow_twin.model.pairs import STOPS_COUNTER_CLOCKWISE
+from plow_twin.solve.dense_output import time_along
 from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 
@@ -39,32 +41,49 @@ def add_to_totals(state, w, low, high, totals) -> None:
     order = state.order - 1
     alpha, beta = state.alpha + state.beta * low, state.beta
     h = high - low
-    elapsed = alpha * h + 0.5 * beta * h * h
+    elapsed = time_along(alpha, beta, h)
     if low > 0.0:
         for pair in range(8):
             shift_column(w.force, pair, order, low, w.bernstein)
         _swap_rows(w.force, w.bernstein, order)
     _sums(w, order, h)
-    ccw = cw = 0
+    carrying = 0
     for pair in range(8):
         if mode[pair] != ON:
             continue
+        carrying |= 1 << pair
         totals.impulse[pair] += max(0.0, (alpha * w.per_pair[FIRST, pair] + beta * h * w.per_pair[SECOND, pair]) * h)
         if w.per_pair[SUM, pair] > totals.peak[pair]:
             for k in range(order + 1):
                 w.column[0, k] = w.force[k, pair]
             totals.peak[pair] = maximum(w.column[0], order, h, totals.peak[pair], w)
         totals.time_in_contact[pair] += elapsed
-        # pairs 0, 3, 4, 7 stop a counter-clockwise swing, the others a clockwise one
-        corner = pair // 2
-        if (pair + corner) % 2 == 0:
-            ccw |= 1 << corner
-        else:
-            cw |= 1 << corner
     if low > 0.0:
         _swap_rows(w.force, w.bernstein, order)
+    add_set_times(totals, carrying, elapsed)
+
+
+@kernel()
+def add_set_times(totals, carrying, elapsed) -> None:
+    """Add a time to the sets of corners that carry force together, one for each sense; `carrying` has a bit a pair."""
+    ccw = cw = 0
+    for pair in range(8):
+        if carrying >> pair & 1 == 1:
+            if STOPS_COUNTER_CLOCKWISE[pair]:
+                ccw |= 1 << pair // 2
+            else:
+                cw |= 1 << pair // 2
     totals.set_time[0, ccw] += elapsed if ccw != 0 else 0.0
     totals.set_time[1, cw] += elapsed if cw != 0 else 0.0
+
+
+@kernel()
+def log_event(log, time, pair, mode_from, mode_to, rate) -> None:
+    """Write one change of contact to the event log, which has room for it."""
+    i = log.length[0]
+    log.time[i], log.pair[i], log.rate[i] = time, pair, rate
+    log.mode_from[i], log.mode_to[i] = mode_from, mode_to
+    log.length[0] = i + 1
 
 
 @kernel()

@@ -21,6 +21,8 @@ from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_te
 from plow_twin.solve.kinematics import row_values
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
 
+#: A term has vanished where it is below this share of what the last order may have.
+_VANISHED = 0.4
 #: Factors of omega (S1 in lanes 4 and 7) in the rates of the state's components, and of the rates that are components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
@@ -296,7 +298,7 @@ def expand(
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
     here, before, closing, penetration = row(state.y, 0), splat(0.0), splat(0.0), splat(0.0)
     c1 = s1 = c2 = s2 = 0.0
-    small, quiet, reach, order = 0.4 * p.threshold[p.order], 0, 1.0, limit
+    small, quiet, reach, order = _VANISHED * p.threshold[p.order], 0, 1.0, limit
     for k in range(order + 1):
         set_row(w.series, k, here)
         x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
