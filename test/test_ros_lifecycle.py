@@ -111,11 +111,16 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
 def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"excitation_timeout": 2, "hold_polcy": "zero"}}}))
-    with bench(tmp_path, arguments=("--params-file", str(path))) as running:
-        request = GetParameters.Request(names=["excitation_timeout"])
+    # YAML takes 1e-8 for a text
+    with bench(tmp_path, arguments=("--params-file", str(path)), tolerance="1e-8") as running:
+        request = GetParameters.Request(names=["excitation_timeout", "tolerance"])
         service = f"{running.namespace}/plow_twin/get_parameters"
-        found = running.probe.call(GetParameters, service, request).values[0]
-        assert (found.type, found.double_value) == (ParameterType.PARAMETER_DOUBLE, 2.0)
+        found = running.probe.call(GetParameters, service, request).values
+        assert [item.type for item in found] == [ParameterType.PARAMETER_DOUBLE] * 2
+        assert [item.double_value for item in found] == [2.0, 1e-8]
+        # all that it holds, given back to it while active, changes nothing and is taken
+        assert _set(running, "tolerance", 1e-8).successful and _set(running, "scene", "paper").successful
+        assert not _set(running, "tolerance", 1e-7).successful
         assert "unknown parameter hold_polcy: 'zero' is not used; did you mean hold_policy?" in running.twin.output()
 
 

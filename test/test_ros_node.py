@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rclpy.qos import ReliabilityPolicy
 from ros_processes import ROOT, bench, value
@@ -363,6 +363,13 @@ def test_a_stop_while_the_solver_is_compiled_is_clean(tmp_path: Path, monkeypatc
     with bench(tmp_path, "unconfigured") as running:
         running.probe.until(lambda: "preparing the solver" in running.twin.output(), "the start of compiling")
         running.probe.pause(1.0)
+        assert "solver ready" not in running.twin.output()
+        # meanwhile the node answers
+        count = len(running.probe.reports)
+        service = f"{running.namespace}/plow_twin/get_state"
+        assert running.probe.call(GetState, service, GetState.Request()).current_state.label == "unconfigured"
+        running.probe.until(lambda: len(running.probe.reports) >= count + 2, "reports while compiling")
+        assert "preparing the solver" in running.probe.status[-1].message
         assert "solver ready" not in running.twin.output()
         assert running.twin.stop(signal.SIGTERM) == 0
         assert "Traceback" not in running.twin.output()

@@ -83,6 +83,8 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "latency_max_ms": "the same, largest [ms]",
         "age_p50_ms": "system time minus stamp when published, median [ms]; empty under use_sim_time",
         "age_p99_ms": "the same, 99 % [ms]",
+        "recent_latency_p99_ms": "reception to publication since the last report, 99 % [ms]; empty: none",
+        "recent_age_p99_ms": "system time minus stamp when published since the last report, 99 % [ms]",
     },
     "recorder": {
         "recording": "file being written; empty: none",
@@ -98,6 +100,7 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "lifecycle": "unconfigured, inactive, active or finalized",
     "stream": "waiting, running, stale, ended or failed",
     "stale_inputs": "inputs that have gone silent, separated by commas",
+    "recorder": "off, recording, or trouble: something was lost or it has stopped",
     "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated or not_observable",
     "vertical": "the same of the vertical clearance",
     "pads": "the same of the pads' wear",
@@ -131,25 +134,40 @@ def status(
     return DiagnosticStatus(level=level, name=name, message=message, hardware_id=hardware_id, values=pairs)
 
 
-def summary(lifecycle: str, reason: str, runtime: Runtime | None) -> tuple[bytes, str, dict[str, str]]:
+def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: bool = False) -> Part:
     """Return level, message and values of `status`."""
     values = dict.fromkeys(STATUS_KEYS, "")
     values["lifecycle"] = lifecycle
     if runtime is None:
-        return (ERROR if reason else OK), reason or lifecycle, values
+        return (
+            (ERROR if reason else OK),
+            reason or (f"{lifecycle}, preparing the solver" if preparing else lifecycle),
+            values,
+        )
     state = runtime.driver.state
     values["stream"] = state.name.lower()
-    values["stale_inputs"] = "excitation" if state in (StreamState.STALE, StreamState.ENDED) else ""
+    stale = ["excitation"] if state in (StreamState.STALE, StreamState.ENDED) else []
+    stale += runtime.inputs.silent()
+    values["stale_inputs"] = ",".join(stale)
+    values["recorder"] = runtime.recorder_state
     values |= dict.fromkeys(("horizontal", "vertical", "pads"), "prior")
     values |= {f"publishers_{topic}": str(count) for topic, count in runtime.inputs.publishers.items()}
     if lifecycle != "active":
         return OK, lifecycle, values
-    message = f"{state.value}: {runtime.driver.failure}" if state is StreamState.FAILED else state.value
-    if runtime.unsteady:
-        return ERROR, f"{message}; the stamps jump again and again: too many resets, samples are dropped", values
-    if runtime.inputs.other_sender:
-        return max(_LEVELS[state], WARN), f"{message}; another publisher sends too and is not followed", values
-    return _LEVELS[state], message, values
+    level = _LEVELS[state]
+    said = [f"{state.value}: {runtime.driver.failure}" if state is StreamState.FAILED else state.value]
+    troubles = [
+        (ERROR, runtime.unsteady, "the stamps jump again and again: too many resets, samples are dropped"),
+        (ERROR, values["recorder"] == "trouble", "the recording has lost something or has stopped"),
+        (ERROR, bool(runtime.wear_error), runtime.wear_error),
+        (WARN, runtime.inputs.other_sender, "another publisher sends too and is not followed"),
+        (WARN, bool(runtime.inputs.silent()), f"silent: {', '.join(runtime.inputs.silent())}"),
+    ]
+    for trouble_level, there, text in troubles:
+        if there:
+            level = max(level, trouble_level)
+            said.append(text)
+    return level, "; ".join(said), values
 
 
 class Health:
@@ -234,6 +252,8 @@ class Health:
             "latency_max_ms": _ms(latency.largest_s) if latency.count else "",
             "age_p50_ms": _ms(age.quantile(0.5)),
             "age_p99_ms": _ms(age.quantile(0.99)),
+            "recent_latency_p99_ms": _ms(latency.recent(0.99)),
+            "recent_age_p99_ms": _ms(age.recent(0.99)),
         }
         grown = self._grown({"withheld": runtime.withheld}, ("withheld",))
         return (ERROR if grown else OK), "; ".join(grown) or "publishing", values

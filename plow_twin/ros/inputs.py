@@ -30,6 +30,8 @@ _SLOW_DEPTH = 200
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose")
 #: Another sender counts as there for so long after its last sample [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
+#: An optional input that has been heard counts as silent after so long [ns].
+_SILENT_NS: Final = 10_000_000_000
 
 
 class Inputs:
@@ -79,6 +81,7 @@ class Inputs:
         self.depth = depth
         #: most messages that waited in the queue, and their longest wait [s], since `take_queue_peak`
         self._queue_peak = (0, 0.0)
+        self._heard_ns: dict[str, int] = {}
         self._other_heard_ns = -_OTHER_SENDER_NS
         #: messages that the middleware reports as lost before they could be read
         self.lost = 0
@@ -114,6 +117,11 @@ class Inputs:
     def other_sender(self) -> bool:
         """Whether another publisher than the one followed sends on the selected source."""
         return time.monotonic_ns() - self._other_heard_ns < _OTHER_SENDER_NS
+
+    def silent(self) -> list[str]:
+        """Return the optional inputs that have been heard and are silent now."""
+        now_ns = time.monotonic_ns()
+        return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
 
     def take_queue_peak(self) -> tuple[int, float]:
         """Return the most messages that waited in the queue, and their longest wait [s], since the last call."""
@@ -228,6 +236,7 @@ class Inputs:
         if not self.active:
             self.travel.refuse(Verdict.INACTIVE)
         elif self.travel.judge(stamp, (speed,)).used:
+            self._heard_ns["travel"] = time.monotonic_ns()
             self._on_travel(stamp, speed)
 
     def _measured_pose(self, message: PoseStamped) -> None:
@@ -237,4 +246,5 @@ class Inputs:
         if not self.active:
             self.head_pose.refuse(Verdict.INACTIVE)
         elif self.head_pose.judge(stamp_ns(message.header), values).used:
+            self._heard_ns["head_pose"] = time.monotonic_ns()
             self.measured = values

@@ -71,9 +71,14 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
         stop.interrupt = False
         executor = make_executor()
         executor.add_node(node)
-        if node.autostart:
-            node.start()
+        starting = node.autostart
+        if starting:
+            node.prepare()
         while not stop.stopped and rclpy.utilities.ok():
+            if starting and node.prepared:
+                starting = False
+                if node.lifecycle == "unconfigured":  # a manager may have been quicker
+                    node.start()
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)
     except ParameterError as error:

@@ -20,6 +20,7 @@ from plow_twin.ros import diagnostics
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
 from plow_twin.ros.runtime import Runtime
+from plow_twin.ros.solver_start import Preparation, key
 
 
 class TwinNode(LifecycleNode):
@@ -46,6 +47,7 @@ class TwinNode(LifecycleNode):
         self.reason = ""
         #: wear depths of the scenes that have been configured: cleanup does not lose them
         self._kept_wear: dict[str, tuple[float, ...]] = {}
+        self._preparation: Preparation | None = None
         self._health = diagnostics.Health()
         self._published_status: tuple[Any, ...] = ()
         self._table = ParameterServer(self, lambda: self.runtime is None, self._parameter_changed)
@@ -61,6 +63,23 @@ class TwinNode(LifecycleNode):
         """Whether the program shall configure and activate the node."""
         return self._table.settings.autostart
 
+    def prepare(self) -> None:
+        """Begin to compile the solver for the present parameters in a thread, unless that has been done already."""
+        settings = self._table.settings
+        if self.runtime is None and (self._preparation is None or self._preparation.key != key(settings)):
+            self.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
+            self._preparation = Preparation(settings)
+
+    @property
+    def prepared(self) -> bool:
+        """Whether configuring does not have to wait for the compiler."""
+        return self._preparation is None or self._preparation.done
+
+    def _take_preparation(self) -> Preparation:
+        preparation, self._preparation = self._preparation, None
+        assert preparation is not None
+        return preparation
+
     def start(self) -> bool:
         """Configure and activate; False when one of them failed (the reason is in log, status and diagnostics)."""
         done = TransitionCallbackReturn.SUCCESS
@@ -70,7 +89,9 @@ class TwinNode(LifecycleNode):
         """Load the scene, compile the solver, open the recording, make all topics; fails with a reason."""
         settings = self._table.settings
         try:
-            self.runtime = Runtime(self, settings, self._publish_status, self._stop_asked, self._kept_wear)
+            self.prepare()
+            prepared = self._take_preparation().result(self._stop_asked)
+            self.runtime = Runtime(self, settings, self._publish_status, prepared, self._kept_wear)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
         except Exception:  # rclpy would swallow it
@@ -156,7 +177,8 @@ class TwinNode(LifecycleNode):
         service.callback = answer
 
     def _publish_status(self) -> None:
-        report = diagnostics.summary(self.lifecycle, self.reason, self.runtime)
+        preparing = self.runtime is None and not self.prepared
+        report = diagnostics.summary(self.lifecycle, self.reason, self.runtime, preparing)
         if report == self._published_status:
             return
         self._published_status = report
@@ -170,6 +192,9 @@ class TwinNode(LifecycleNode):
         runtime = self.runtime
         if runtime is not None:
             runtime.inputs.look_for_senders()
+        elif self.lifecycle == "unconfigured" and not self.reason:
+            # a manager that configures later, perhaps another scene, need not wait for the compiler then
+            self.prepare()
         parts = {"state": self._health.state(self.lifecycle, self.reason, runtime, time.monotonic_ns())}
         if runtime is not None:
             parts["input"] = self._health.input(runtime)

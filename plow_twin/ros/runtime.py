@@ -23,10 +23,9 @@ from plow_twin.record.wear_state import scene_identity
 from plow_twin.ros.inputs import Inputs
 from plow_twin.ros.parameters import Settings
 from plow_twin.ros.publishers import QUALITY, TOPICS, OutputPublishers
-from plow_twin.ros.solver_start import warm_up
+from plow_twin.ros.solver_start import Prepared
 from plow_twin.ros.wear_keeper import WearKeeper
 from plow_twin.run.twin import Twin
-from plow_twin.scene_file import load_scene
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
@@ -52,17 +51,15 @@ class Runtime:
         Its parameters.
     changed
         Called when the state of the stream may have changed.
-    stop_asked
-        Whether the process shall end; looked at while the solver is compiled.
+    prepared
+        Scene and twin, the solver compiled; nobody else may use the twin.
     kept_wear
         Wear depths [m] of earlier runtimes of this process, by the scene's identity.
 
     Raises
     ------
-    SceneError, RecordingError, WearStateError, OSError
-        The scene, the recording or the saved wear cannot be used.
-    StartAbandoned
-        A stop was asked for before the solver was ready.
+    RecordingError, WearStateError, OSError
+        The recording or the saved wear cannot be used.
     """
 
     def __init__(
@@ -70,19 +67,16 @@ class Runtime:
         node: Node,
         settings: Settings,
         changed: Callable[[], None],
-        stop_asked: Callable[[], bool],
+        prepared: Prepared,
         kept_wear: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
     ) -> None:
         self._node = node
         self._settings = settings
         self._changed = changed
         self.sim_time: bool = node.get_parameter("use_sim_time").value
-        self.scene: Scene = load_scene(settings.scene)
-        sampled = settings.excitation_source != "scene"
-        node.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
-        twin = Twin(self.scene, tol=settings.tolerance, excitation="sampled" if sampled else "scene")
+        self.scene = prepared.scene
         #: seconds that compiling or loading the solver took
-        self.compile_s = warm_up(twin, stop_asked)
+        self.compile_s = prepared.compile_s
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
         #: publications that were not published because a number was not finite
@@ -100,7 +94,7 @@ class Runtime:
             self.wear_keeper = WearKeeper(Path(settings.wear_state_path), settings.hardware_id, self.scene)
             depth = self.wear_keeper.load() or depth
         with ExitStack() as made:
-            self._make(twin, depth, made)
+            self._make(prepared.twin, depth, made)
             made.pop_all()
 
     def _make(self, twin: Twin, wear_depth: tuple[float, ...] | None, made: ExitStack) -> None:
@@ -155,6 +149,19 @@ class Runtime:
     def unsteady(self) -> bool:
         """Whether the stamps jump so often that resets are refused."""
         return self.driver.unsteady(time.monotonic_ns())
+
+    @property
+    def wear_error(self) -> str:
+        """Why the wear could not be saved; empty: it could, or it is not kept."""
+        return self.wear_keeper.error if self.wear_keeper else ""
+
+    @property
+    def recorder_state(self) -> str:
+        """`off`, `recording`, or `trouble`: something was lost or it has stopped."""
+        if self.recording is None:
+            return "off"
+        found = self.recording.counters
+        return "trouble" if found.error or found.lost else "recording"
 
     @property
     def scene_name(self) -> str:

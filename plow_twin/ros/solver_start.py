@@ -1,4 +1,4 @@
-"""The solver compiled beside the main thread: a request to stop is seen while the compiler works."""
+"""Scene and solver made ready beside the executor: the node answers while the compiler works."""
 
 from __future__ import annotations
 
@@ -6,41 +6,85 @@ import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from typing import Final
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.model.scene import Scene
+from plow_twin.ros.parameters import Settings
 from plow_twin.run.twin import Twin
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
 
 #: Longest time for which a request to stop is not seen [s].
 _LOOK_S: Final = 0.05
-_unfinished: list[Future[float]] = []
+_started: list[Future[Prepared]] = []
 
 
 class StartAbandoned(PlowTwinError):
     """A stop was asked for while the solver was compiled."""
 
 
-def warm_up(twin: Twin, stop_asked: Callable[[], bool]) -> float:
-    """Compile or load every kernel of a twin; return the seconds it took.
+@dataclass(frozen=True)
+class Prepared:
+    """A scene, its twin with every kernel compiled or loaded, and the seconds that took."""
 
-    Raises
-    ------
-    StartAbandoned
-        A stop was asked for; the compiler cannot be interrupted and still works.
-    """
-    compiler = ThreadPoolExecutor(1, thread_name_prefix="compiler")
-    future = compiler.submit(twin.warm_up)
-    compiler.shutdown(wait=False)
-    while not wait((future,), _LOOK_S).done:
-        if stop_asked():
-            _unfinished.append(future)
-            raise StartAbandoned("a stop was asked for while the solver was compiled")
-    return future.result()
+    scene: Scene
+    twin: Twin
+    compile_s: float
+
+
+class Preparation:
+    """A twin being made ready in a thread of its own."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.key = key(settings)
+        compiler = ThreadPoolExecutor(1, thread_name_prefix="compiler")
+        self._future = compiler.submit(_prepare, settings)
+        compiler.shutdown(wait=False)
+        _started[:] = [future for future in _started if not future.done()]
+        _started.append(self._future)
+
+    @property
+    def done(self) -> bool:
+        """Whether `result` returns at once."""
+        return self._future.done()
+
+    def result(self, stop_asked: Callable[[], bool]) -> Prepared:
+        """Wait for the twin.
+
+        Raises
+        ------
+        SceneError, OSError
+            The scene cannot be used.
+        StartAbandoned
+            A stop was asked for; the compiler cannot be interrupted and still works.
+        """
+        while not wait((self._future,), _LOOK_S).done:
+            if stop_asked():
+                raise StartAbandoned("a stop was asked for while the solver was compiled")
+        return self._future.result()
+
+
+def key(settings: Settings) -> tuple[object, ...]:
+    """Return what a prepared twin depends on; a scene file that has been written to is another one."""
+    try:
+        found = os.stat(scene_path(settings.scene))
+    except (OSError, PlowTwinError):
+        return settings.scene, settings.tolerance, settings.excitation_source
+    return settings.scene, settings.tolerance, settings.excitation_source, found.st_mtime_ns, found.st_size
+
+
+def _prepare(settings: Settings) -> Prepared:
+    scene = load_scene(scene_path(settings.scene))
+    own = settings.excitation_source == "scene"
+    twin = Twin(scene, tol=settings.tolerance, excitation="scene" if own else "sampled")
+    return Prepared(scene, twin, twin.warm_up())
 
 
 def leave(code: int) -> int:
     """Return the exit code; end the process here when an abandoned compiler would hold it up."""
-    if all(future.done() for future in _unfinished):
+    if all(future.done() for future in _started):
         return code
     sys.stdout.flush()
     sys.stderr.flush()

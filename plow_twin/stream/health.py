@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 _BINS_PER_DECADE: Final = 50
 _LOWEST_S: Final = 1e-6
@@ -17,6 +18,7 @@ class DurationHistogram:
 
     def __init__(self) -> None:
         self._counts = np.zeros(_BINS_PER_DECADE * _DECADES, np.int64)
+        self._counted = np.zeros_like(self._counts)
         self.largest_s = 0.0
 
     @property
@@ -37,11 +39,20 @@ class DurationHistogram:
 
     def quantile(self, share: float) -> float:
         """Return the duration [s] that the given share of all does not exceed; NaN when there is none."""
-        total = self.count
+        return self._quantile(self._counts, share)
+
+    def recent(self, share: float) -> float:
+        """Return the same of those since the last call of this method."""
+        counts = self._counts - self._counted
+        self._counted = self._counts.copy()
+        return self._quantile(counts, share)
+
+    def _quantile(self, counts: NDArray[np.int64], share: float) -> float:
+        total = int(counts.sum())
         if total == 0:
             return math.nan
         rank = max(1, math.ceil(share * total))
-        index = int(np.searchsorted(np.cumsum(self._counts), rank))
+        index = int(np.searchsorted(np.cumsum(counts), rank))
         return min(self.largest_s, float(_LOWEST_S * 10.0 ** ((index + 0.5) / _BINS_PER_DECADE)))
 
 
