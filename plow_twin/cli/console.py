@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
 
@@ -89,6 +89,25 @@ def table(title: str, *columns: str) -> Table:
     for index, name in enumerate(columns):
         result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
     return result
+
+
+def show_facts(console: Console, facts: Mapping[str, Any], indent: int = 0) -> None:
+    """Print one fact a line, those of a mapping indented below its name; long texts stay in one piece."""
+    for key, value in facts.items():
+        name = " " * indent + key
+        if isinstance(value, Mapping) and value:
+            console.print(name, highlight=False)
+            show_facts(console, value, indent + 2)
+        else:
+            console.print(f"{name:24} {_plain(value)}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _plain(value: Any) -> str:
+    if value is None or (isinstance(value, Mapping | Sequence) and len(value) == 0):
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
 def kilonewton(force_n: float) -> str:

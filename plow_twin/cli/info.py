@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, table
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts, table
 from plow_twin.scene_file.presets import PRESETS
 
 
@@ -28,9 +32,7 @@ def _show(facts: dict[str, Any], as_json: bool) -> int:
     if as_json:
         click.echo(json.dumps(facts, indent=2))
         return DONE
-    console = output_console()
-    for key, value in facts.items():
-        console.print(f"{key:24} {value}", highlight=False, soft_wrap=True)
+    show_facts(output_console(), facts)
     return DONE
 
 
@@ -61,16 +63,30 @@ def _scene(target: str, as_json: bool) -> int:
         click.echo(json.dumps({"numbers": rows, "derived": facts}, indent=2))
         return DONE
     console = output_console()
-    marks = table(f"{target}: what is stated", "number", "value", "unit", "mark")
-    marks.add_column("source")
-    for row in rows:
-        marks.add_row(row["key"], f"{row['value']:g}", row["unit"], row["mark"], row["source"])
-    console.print(marks)
+    _print_numbers(console, target, rows)
     follows = table("what follows", "quantity", "value", "unit")
     for fact in facts:
         follows.add_row(fact["quantity"], f"{fact['value']:.6g}", fact["unit"])
     console.print(follows)
     return DONE
+
+
+def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]) -> None:
+    """Print the numbers by section; sources, which are long and stand behind many, are numbered and follow."""
+    sources = list(dict.fromkeys(row["source"] for row in rows if row["source"]))
+    stated = table(f"{target}: what is stated", "number", "value", "unit", "mark, source")
+    section = ""
+    for row in rows:
+        name, _, key = row["key"].partition(".")
+        if name != section:
+            stated.add_section()
+            stated.add_row(f"[bold]{escape(name)}[/bold]")
+            section = name
+        mark = f"{row['mark']} {1 + sources.index(row['source']):2}" if row["source"] else row["mark"]
+        stated.add_row(f"  {escape(key)}", f"{row['value']:g}", row["unit"], mark)
+    console.print(stated)
+    for index, source in enumerate(sources, 1):
+        console.print(Padding(f"{index:2}: {escape(source)}", (0, 0, 0, 2)), highlight=False)
 
 
 def _recording(path: Path, as_json: bool) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import json_option, output_console, progress, quiet_option
+from plow_twin.cli.console import json_option, output_console, progress, quiet_option, show_facts
 
 if TYPE_CHECKING:
     from plow_twin.record.replay import ReplayReport
@@ -36,9 +36,7 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:
-        console = output_console()
-        for key, value in facts.items():
-            console.print(f"{key:24} {value}", highlight=False, soft_wrap=True)
+        show_facts(output_console(), facts)
     if report.build_differences:
         other = ", ".join(f"{key} {there} (here {here})" for key, (there, here) in report.build_differences.items())
         click.echo(f"plow-twin: warning: recorded by another build, which may round differently: {other}", err=True)

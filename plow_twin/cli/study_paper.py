@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.padding import Padding
+from rich.text import Text
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option
 
 if TYPE_CHECKING:
+    from plow_twin.study.paper.rows import Row
     from plow_twin.study.paper.study import PaperStudy
 
 _STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
@@ -64,27 +67,33 @@ def _print(study: PaperStudy, out: Path) -> None:
     from plow_twin.study.report import percent
 
     console = output_console()
-    title = f"scene {study.name} beside the paper, {study.runs.t_end:g} s"
-    table = Table(title=title, title_justify="left", expand=True)
-    for name, ratio in (("statement", 5), ("published", 3), ("reconstructed", 5)):
-        table.add_column(name, ratio=ratio)
-    table.add_column("difference", justify="right", width=10)
-    table.add_column("agrees?", width=8)
+    console.print(f"scene {study.name} beside the paper, {study.runs.t_end:g} s", style="italic", highlight=False)
     group = ""
     for row in study.rows:
         if row.group != group:
-            table.add_section()
-            table.add_row(f"[bold]{escape(row.group)}[/bold]")
+            console.print(f"\n[bold]{escape(row.group)}[/bold]", highlight=False)
             group = row.group
-        unit = f" {row.unit}" if row.published_value is not None else ""
-        verdict = row.verdict.value
-        table.add_row(
-            escape(row.what), escape(row.published) + unit, escape(row.computed) + unit, percent(row.difference),
-            f"[{_STYLES[verdict]}]{verdict}[/]",
-        )  # fmt: skip
-    console.print(table)
+        _print_row(console, row, percent(row.difference))
+    console.print()
     counts = ", ".join(f"{verdict}: {number}" for verdict, number in study.verdicts.items() if number)
     console.print(f"agrees? {counts}; took {study.wall_s:.1f} s", highlight=False)
     console.print(f"report: {out / 'report.html'}", highlight=False, soft_wrap=True)
     if study.recording is not None:
         console.print(f"look at the run with: rerun {study.recording.rrd}", highlight=False, soft_wrap=True)
+
+
+def _print_row(console: Console, row: Row, difference: str) -> None:
+    """Print verdict and statement in a line; figures behind them, texts below."""
+    verdict = Text(f"{row.verdict.value:13}", _STYLES[row.verdict.value])
+    if row.published_value is not None:
+        figures = f"{row.published:>6} {row.computed:>8} {row.unit:2} {difference:>8}"
+        room = max(20, min(console.width, 120) - len(verdict) - len(figures) - 2)
+        if len(row.what) <= room:
+            console.print(verdict + Text(f"{row.what:{room}}  {figures}"), soft_wrap=True)
+            return
+        rest = [f"paper {row.published} {row.unit}, here {row.computed} {row.unit}, {difference}"]
+    else:
+        rest = [f"paper: {row.published}", f"here:  {row.computed}"]
+    console.print(verdict + Text(row.what), soft_wrap=len(row.what) + len(verdict) <= console.width)
+    for text in rest:
+        console.print(Padding(Text(text, "dim"), (0, 0, 0, len(verdict) + 2)))

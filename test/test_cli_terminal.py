@@ -1,0 +1,81 @@
+"""What verbs print fits a terminal of 80 columns, whole: no cell is cut, no Python is shown."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from record_support import paper_sample, record_run
+from rich.console import Console
+
+from plow_twin.cli import info as info_verb
+from plow_twin.cli import replay as replay_verb
+from plow_twin.cli import simulate as simulate_verb
+from plow_twin.cli import study_paper as paper_verb
+from plow_twin.cli.app import run
+from plow_twin.study.paper.rows import Row, Verdict
+
+WIDTH = 80
+
+
+@pytest.fixture
+def printed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
+    text = io.StringIO()
+    for module in (info_verb, replay_verb, simulate_verb, paper_verb):
+        monkeypatch.setattr(module, "output_console", lambda: Console(file=text, width=WIDTH))
+
+    def lines(*arguments: object, code: int = 0) -> list[str]:
+        if arguments:
+            assert run([*map(str, arguments)]) == code
+        return text.getvalue().splitlines()
+
+    return lines
+
+
+def test_a_scene_s_numbers_stand_in_one_line_each(printed: Callable[..., list[str]]) -> None:
+    lines = printed("info", "paper")
+    assert max(map(len, lines)) <= WIDTH and not any("…" in line for line in lines)
+    assert any(re.fullmatch(r"│ +impact_speed_floor_m_s │ +0\.001 │ +m/s │ +assumed +\d+ │", line) for line in lines)
+    assert any(
+        re.fullmatch(r"│ +stiffness +│ +9\.6975e\+06 │ N/m\^exponent │ +reconstructed +\d+ │", line) for line in lines
+    )
+    # a row is never continued: each one has its value or is a heading
+    numbers, _ = "\n".join(lines).split("what follows")
+    rows = [line for line in numbers.splitlines() if line.startswith("│")]
+    assert all(re.match(r"│ (\w+(\[\d\])? +│ +│|  \w+(\[\d\])? +│ +\S)", line) for line in rows)
+    assert any("paper, parameters of the model" in line for line in lines)
+
+
+def test_the_statistics_of_a_run_stand_in_one_line_each(printed: Callable[..., list[str]]) -> None:
+    lines = printed("simulate", "paper", "--t-end", "1")
+    assert max(map(len, lines[:-1])) <= WIDTH and not any("…" in line for line in lines)
+    assert sum(bool(re.match(r"│ (top|bottom)_\w+ +│", line)) for line in lines) == 8
+
+
+def test_a_recording_and_its_replay_are_shown_as_words(printed: Callable[..., list[str]], tmp_path: Path) -> None:
+    made = record_run(tmp_path / "run", map(paper_sample, range(50)))
+    lines = printed("info", made.folder) + printed("replay", made.folder)
+    text = "\n".join(lines)
+    assert not re.search(r"[{}\[\]']", text.replace(str(tmp_path), "")) and "None" not in text
+    for line in ("messages", "build", "messages_compared", "  contact_forces         50", "lost                     -"):
+        assert line in lines
+    long = [line for line in lines if len(line) > WIDTH]
+    assert all(str(tmp_path) in line for line in long)  # what is copied stays in one piece
+
+
+def test_the_paper_s_statements_fit(printed: Callable[..., list[str]]) -> None:
+    def row(what: str, published: str, computed: str, **numbers: object) -> Row:
+        return Row("Fig. 7", "section 4", what, published, computed, Verdict.DISAGREES, "5 %", "", **numbers)
+
+    number = row("clockwise, mean force at b", "82", "90.24", unit="kN", published_value=82.0, value=90.24)
+    words = row("sets that occur, " * 6, "{b}, {a,d}, {a,b,d}", "{b}, {a,d}; " * 12)
+    console = paper_verb.output_console()
+    for entry, difference in ((number, "+10.1 %"), (words, "")):
+        paper_verb._print_row(console, entry, difference)
+    lines = printed()
+    assert re.fullmatch(r"no +clockwise, mean force at b +82 +90\.24 kN +\+10\.1 %", lines[0])
+    assert max(map(len, lines)) <= WIDTH and any(line.strip().startswith("paper: {b}, {a,d}") for line in lines)
+    assert " ".join(" ".join(lines).split()).count("{b}, {a,d};") == 12
