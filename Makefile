@@ -1,6 +1,6 @@
 # Needs Python 3.11 or 3.12, make and nothing else; everything goes into $(VENV).
 .DELETE_ON_ERROR:
-.PHONY: demo test stress lint docs lowest bench clean
+.PHONY: demo test stress lint coverage docs lowest bench clean
 
 SUPPORTED := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
@@ -18,8 +18,10 @@ PARALLEL ?= -n 2 --dist loadfile
 BENCH_ARGS ?=
 SITE ?= out/site
 LOWEST ?= .venv-lowest
-LOWEST_TESTS ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_solve_*.py test/test_run_*.py \
-	test/test_stream_*.py test/test_record_*.py test/test_ros_*.py)
+# core, record and node, without random searches; rerun wants a newer numpy than ROS 2 Jazzy has
+LOWEST_TESTS ?= -k "not rerun" $(filter-out %_stress.py %_extremes.py %_properties.py %_convergence.py %_ros_demo.py, \
+	$(wildcard test/test_model_*.py test/test_scene_*.py test/test_solve_*.py test/test_run_*.py \
+	test/test_stream_*.py test/test_record_*.py test/test_ros_*.py))
 
 demo: $(INSTALLED)
 	"$(VENV)/bin/plow-twin" demo --speed $(SPEED) --out "$(OUT)"
@@ -36,6 +38,10 @@ lint: $(INSTALLED)
 	"$(VENV)/bin/ruff" check .
 	"$(VENV)/bin/mypy"
 	"$(VENV)/bin/codespell"
+
+# what a run of the tests with PYTEST_ARGS="--cov --cov-report=" left: Python's lines, for compiled ones are not seen
+coverage: $(INSTALLED)
+	"$(VENV)/bin/coverage" report
 
 # the pages as one site, the API reference from the docstrings; warnings and broken links are errors
 docs: $(INSTALLED)
