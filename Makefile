@@ -45,7 +45,7 @@ coverage: $(INSTALLED)
 
 # the pages as one site, the API reference from the docstrings; warnings and broken links are errors
 docs: $(INSTALLED)
-	"$(VENV)/bin/mkdocs" build --strict --quiet --site-dir "$(abspath $(SITE))"
+	"$(VENV)/bin/mkdocs" build --strict --site-dir "$(abspath $(SITE))"
 
 # core, record and node with the lowest versions that setup.py names
 lowest: $(LOWEST)/.installed

@@ -12,7 +12,17 @@ class PlowTwinError(Exception):
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing wrong with an input: where, what was got, what was expected."""
+    """One thing wrong with an input.
+
+    Attributes
+    ----------
+    key : str
+        Where: the path of a number, a file, a row.
+    got : object
+        What stood there.
+    expected : str
+        What could have stood there, in words.
+    """
 
     key: str
     got: object
@@ -23,7 +33,15 @@ class Problem:
 
 
 class SceneError(PlowTwinError, ValueError):
-    """A scene cannot be used; the message lists every problem found, not the first one."""
+    """A scene cannot be used; the message lists every problem found, not the first one.
+
+    Attributes
+    ----------
+    problems : tuple of Problem
+        All that is wrong.
+    source : str
+        Name of the file, or `scene`.
+    """
 
     def __init__(self, problems: Sequence[Problem], source: str = "scene") -> None:
         self.problems = tuple(problems)

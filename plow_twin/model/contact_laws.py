@@ -46,18 +46,30 @@ def exact_damping_number(restitution: float) -> float:
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """One law: what it takes, and how the restitution becomes damping."""
+    """One law: what it takes, and how the restitution becomes damping.
+
+    Attributes
+    ----------
+    title, source : str
+        What people call it; its equation and where it was published.
+    number_of : callable, optional
+        D(e) of the law: the damping number lambda v0 [1] for a restitution e; None where it has no restitution form.
+    takes_damping : bool
+        Whether a scene can give the damping itself.
+    exponent : float, optional
+        The only exponent that the law admits.
+    additive : bool
+        The damping is C d' beside K d^n (Kelvin-Voigt), not a factor of K d^n.
+    ramped : bool
+        C grows from nothing over the penetration `ramp_m`.
+    """
 
     title: str
     source: str
-    #: D(e) of the law, or None where the law has no restitution form
     number_of: Callable[[float], float] | None = None
     takes_damping: bool = True
-    #: the only exponent the law admits, or None
     exponent: float | None = None
-    #: the damping is C d' beside K d^n (Kelvin-Voigt), not a factor of K d^n
     additive: bool = False
-    #: C grows from nothing over the penetration `ramp_m`
     ramped: bool = False
 
     @property
@@ -66,7 +78,23 @@ class ContactLaw:
         return self.number_of is not None
 
     def damping_number(self, restitution: float) -> float:
-        """Return D = lambda v0 of the law for the restitution asked of it."""
+        """Return D = lambda v0 of the law for the restitution asked of it.
+
+        Parameters
+        ----------
+        restitution : float
+            0 to 1 [1].
+
+        Returns
+        -------
+        float
+            D [1], at most `DAMPING_NUMBER_CAP`.
+
+        Raises
+        ------
+        ValueError
+            The law has no restitution form.
+        """
         if self.number_of is None:
             raise ValueError(f"{self.title} has no restitution form")
         try:
@@ -124,6 +152,13 @@ LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
 
 def add_law(name: str, law: ContactLaw) -> None:
     """Add a law of your own: from now on scenes can name it, and every solver and study takes it at full speed.
+
+    Parameters
+    ----------
+    name : str
+        What scenes call it: letters, digits and _.
+    law : ContactLaw
+        What it takes, and how the restitution becomes damping.
 
     Raises
     ------

@@ -25,7 +25,19 @@ DOF_NAMES: Final = ("x", "y", "theta")
 
 
 class Mark(Enum):
-    """Where a number comes from."""
+    """Where a number comes from.
+
+    Attributes
+    ----------
+    GIVEN
+        Published, or stated by who made the machine.
+    RECONSTRUCTED
+        Fitted to something published or measured.
+    ASSUMED
+        Chosen.
+    MEASURED
+        Measured at the machine.
+    """
 
     GIVEN = "given"
     RECONSTRUCTED = "reconstructed"
@@ -35,7 +47,15 @@ class Mark(Enum):
 
 @dataclass(frozen=True)
 class Provenance:
-    """The mark of one number of a scene and the source that stands behind it."""
+    """The mark of one number of a scene and the source that stands behind it.
+
+    Attributes
+    ----------
+    mark : Mark
+        Where the number comes from.
+    source : str
+        The source, in words.
+    """
 
     mark: Mark
     source: str = ""
@@ -71,7 +91,13 @@ class Head:
 
 @dataclass(frozen=True)
 class Frame:
-    """The slide: a fixed rectangle inside the head's cavity."""
+    """The slide: a fixed rectangle inside the head's cavity.
+
+    Attributes
+    ----------
+    labels : mapping of str to str
+        Letters for corners, e.g. a: bottom_right; none unless given.
+    """
 
     width_m: float = _quantity("m", "horizontal side", gt=0.0)
     height_m: float = _quantity("m", "vertical side", gt=0.0)
@@ -115,7 +141,12 @@ class Contact:
 
 @dataclass(frozen=True)
 class Friction:
-    """Tangential friction of every pair, regularised Coulomb: T = mu N tanh(slip rate / regularisation speed)."""
+    """Tangential friction of every pair, regularised Coulomb: T = mu N tanh(slip rate / regularisation speed).
+
+    References
+    ----------
+    Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5.
+    """
 
     coefficient: float = _quantity("1", "mu", ge=0.0)
     regularisation_speed_m_s: float = _quantity("m/s", "below it friction is viscous", 0.01, gt=0.0)
@@ -131,7 +162,13 @@ class Gravity:
 
 @dataclass(frozen=True)
 class Harmonic:
-    """A load `amplitude * sin(omega t + phase)` with a constant point of action: M = x Fy - y Fx + moment."""
+    """A load `amplitude * sin(omega t + phase)` with a constant point of action: M = x Fy - y Fx + moment.
+
+    Attributes
+    ----------
+    name : str
+        What the load is called; no two of a scene alike.
+    """
 
     name: str
     force_n: tuple[float, float] = _quantity("N", "amplitude (Fx, Fy)", (0.0, 0.0))
@@ -143,7 +180,13 @@ class Harmonic:
 
 @dataclass(frozen=True)
 class Constant:
-    """A load that does not change."""
+    """A load that does not change.
+
+    Attributes
+    ----------
+    name : str
+        What the load is called; no two of a scene alike.
+    """
 
     name: str
     force_n: tuple[float, float] = _quantity("N", "(Fx, Fy)", (0.0, 0.0))
@@ -155,8 +198,16 @@ class Constant:
 class Table:
     """A load given by samples; before the first and after the last one the end value holds.
 
-    `t` has shape (n,) in s, strictly increasing; `wrench` has shape (n, 3): Fx, Fy in N and M in N m.
-    `hold` is `linear` (interpolated) or `zero` (each sample holds until the next).
+    With `hold` `linear` it is interpolated, with `zero` each sample holds until the next.
+
+    Attributes
+    ----------
+    name : str
+        What the load is called; no two of a scene alike.
+    t : ndarray, shape (n,)
+        Times in s, strictly increasing.
+    wrench : ndarray, shape (n, 3)
+        Fx, Fy in N and M in N m at each time.
     """
 
     name: str
@@ -179,7 +230,12 @@ class Initial:
 
 @dataclass(frozen=True)
 class Wear:
-    """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A."""
+    """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A.
+
+    References
+    ----------
+    Archard, J. Appl. Phys. 24 (1953) 981.
+    """
 
     coefficient_m2_n: float = _quantity("m^2/N", "k_s = k/H", ge=0.0)
     pad_area_m2: float = _quantity("m^2", "area A of one pad", gt=0.0)
@@ -192,7 +248,33 @@ class Wear:
 
 @dataclass(frozen=True)
 class Scene:
-    """One complete scene; raises `SceneError` listing every problem when it is not usable."""
+    """One complete scene.
+
+    Attributes
+    ----------
+    head : Head
+    frame : Frame
+    clearance : Clearance
+    contact : Contact
+    gravity : Gravity
+    loads : tuple of Harmonic, Constant or Table
+        All that acts on the head but gravity and contact.
+    initial : Initial
+        State at t = 0.
+    locked : tuple of str
+        Degrees of freedom held: any of x, y, theta.
+    pairs : tuple of str
+        The pairs that can touch; all unless given.
+    wear : Wear or None
+    friction : Friction or None
+    marks : mapping of str to Provenance
+        Where numbers come from, by their path; no part of equality.
+
+    Raises
+    ------
+    SceneError
+        When it cannot be used; lists every problem.
+    """
 
     head: Head
     frame: Frame

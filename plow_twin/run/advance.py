@@ -76,7 +76,15 @@ class AdvanceSeries(_Rows):
 
     @staticmethod
     def of(times: NDArray[np.float64], rows: NDArray[np.void]) -> AdvanceSeries:
-        """Return the fields of the rows, shape (n,), that the kernels fill; they share memory."""
+        """Return the fields of the rows that the kernels fill; they share memory.
+
+        Parameters
+        ----------
+        times : ndarray, shape (n,)
+            Model times in s.
+        rows : ndarray of `ROW`, shape (n,)
+            What the kernels filled.
+        """
         return AdvanceSeries(times, *_fields(rows))
 
     def __len__(self) -> int:
@@ -99,7 +107,15 @@ class AdvanceBatch(_Rows):
 
     @staticmethod
     def of(times: NDArray[np.float64], rows: NDArray[np.void]) -> AdvanceBatch:
-        """Return the fields of the rows, shape (m, n), that the kernels fill; they share memory."""
+        """Return the fields of the rows that the kernels fill; they share memory.
+
+        Parameters
+        ----------
+        times : ndarray, shape (n,)
+            Model times in s.
+        rows : ndarray of `ROW`, shape (m, n)
+            What the kernels filled.
+        """
         return AdvanceBatch(times, *_fields(rows))
 
     def __len__(self) -> int:

@@ -44,7 +44,7 @@ class TwinBatch:
 
     Raises
     ------
-    ValueError
+    ArgumentError
         Without scenes, or where their laws differ in terms.
 
     Notes
@@ -87,6 +87,16 @@ class TwinBatch:
             Model time in s, not before the present one.
         wrench : array_like, shape (m, 3) or (3,), optional
             Fx, Fy [N] and M [N m] about the cavity's centre at `t`, of each twin or of all.
+
+        Returns
+        -------
+        AdvanceBatch
+            One row of each twin.
+
+        Raises
+        ------
+        ArgumentError
+            As `advance_samples`.
         """
         sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
         if sample.shape not in ((3,), (len(self), 3)):
@@ -103,9 +113,14 @@ class TwinBatch:
         wrench : array_like, shape (m, n, 3) or (n, 3)
             Fx, Fy [N] and M [N m] about the cavity's centre at each time, of each twin or of all.
 
+        Returns
+        -------
+        AdvanceBatch
+            One row of each twin for each sample.
+
         Raises
         ------
-        ValueError
+        ArgumentError
             For a time before the present one, or anything that is not finite; nothing has changed then.
         """
         times, samples = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
@@ -121,7 +136,18 @@ class TwinBatch:
         return AdvanceBatch.of(times, rows)
 
     def reset(self, t: float) -> None:
-        """Go back to the scenes' initial states, at model time `t`."""
+        """Go back to the scenes' initial states, at model time `t`.
+
+        Parameters
+        ----------
+        t : float
+            Model time in s.
+
+        Raises
+        ------
+        ArgumentError
+            For a time that is not finite.
+        """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
         for index, compiled in enumerate(self._compiled):
@@ -129,7 +155,18 @@ class TwinBatch:
         self._wrench = np.zeros((len(self), 3))
 
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
-        """Set the speed along the face from here on, of each twin (m,) or of all; only wear depends on it."""
+        """Set the speed along the face from here on; only wear depends on it.
+
+        Parameters
+        ----------
+        speed_m_s : array_like, shape (m,) or ()
+            In m/s, of each twin or of all; wear takes the magnitude.
+
+        Raises
+        ------
+        ArgumentError
+            For a speed that is not finite.
+        """
         speeds = np.broadcast_to(np.abs(np.asarray(speed_m_s, dtype=np.float64)), len(self))
         if not np.isfinite(speeds).all():
             raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected finite speeds in m/s")
@@ -144,9 +181,14 @@ class TwinBatch:
     def restore(self, data: bytes) -> None:
         """Take over a state saved by `snapshot`.
 
+        Parameters
+        ----------
+        data : bytes
+            Of twins of the same scenes and tolerance.
+
         Raises
         ------
-        ValueError
+        ArgumentError
             When the data has not the size of a snapshot.
         """
         wear = self._params["wear_per_impulse"]

@@ -78,9 +78,14 @@ def simulate_many(
     on_progress : callable, optional
         Called with the number of members done, from one thread at a time.
 
+    Returns
+    -------
+    Ensemble
+        Rows and statistics of each member, and its status: one that fails does not stop the others.
+
     Raises
     ------
-    ValueError
+    ArgumentError
         For an argument that cannot be used.
     """
     check_times(t_end, output_dt)

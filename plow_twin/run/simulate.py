@@ -42,7 +42,7 @@ class Result:
         Pose x, y [m], theta [rad] of the cavity's centre, and its rate.
     force, penetration : ndarray, shape (n, 8)
         Normal force [N] and signed penetration [m] of each pair.
-    events : ndarray of `EVENT_DTYPE`
+    events : ndarray of `EVENT_DTYPE`, shape (k,)
         Every change of contact in order of time.
     statistics : mapping
         By pair name: max, mean_in_contact, mean_over_time [N], impulse [N s], time_in_contact [s], makes; over the
@@ -103,9 +103,14 @@ def simulate(
     energy_balance : bool
         Balance energy and momentum (`Result.energy_balance`); off, its code does not run.
 
+    Returns
+    -------
+    Result
+        Rows, events, statistics.
+
     Raises
     ------
-    ValueError
+    ArgumentError
         For an argument that cannot be used.
     SolverError
         When the motion could not be continued; says when and why.

@@ -118,9 +118,14 @@ class Twin:
             Fx, Fy [N] and M [N m] about the cavity's centre at `t` (`excitation="sampled"` only), reached on a straight
             line from the sample before. Without it the last sample is held.
 
+        Returns
+        -------
+        Advance
+            State at `t`, and what happened since the advance before. With a `status` other than `OK` nothing moved.
+
         Raises
         ------
-        ValueError
+        ArgumentError
             For a time before the present one, or anything that is not finite; nothing has changed then.
         """
         if self.excitation == "scene":
@@ -140,9 +145,14 @@ class Twin:
         wrench : array_like, shape (n, 3)
             Fx, Fy [N] and M [N m] about the cavity's centre at each time.
 
+        Returns
+        -------
+        AdvanceSeries
+            One row for each sample.
+
         Raises
         ------
-        ValueError
+        ArgumentError
             As `advance`; nothing has changed then.
         """
         if self.excitation != "sampled":
@@ -176,16 +186,21 @@ class Twin:
         rows : bool
             Whether the rows are wanted; without them the motion is the same and takes half the time.
 
+        Returns
+        -------
+        MarkedAdvance
+            Rows or None, status of each sample, shape (n,), and the m digests.
+
         Raises
         ------
-        ValueError
+        ArgumentError
             As `advance_samples`; nothing has changed then.
         """
         if self.excitation != "sampled" or self._bound is not None:
-            raise ValueError("advance_marked: expected excitation='sampled' without max_evaluations")
+            raise ArgumentError("advance_marked: expected excitation='sampled' without max_evaluations")
         check_times(self.time, t)
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
-            raise ValueError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
+            raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
         out = np.zeros(len(t), ROW) if rows else None
         status = np.zeros(len(t), np.int64)
         snapshots = np.zeros(len(marks), STATE)
@@ -233,7 +248,18 @@ class Twin:
         self._wrench = np.zeros(3)
 
     def set_travel_speed(self, speed_m_s: float) -> None:
-        """Set the speed along the face from here on; only wear depends on it."""
+        """Set the speed along the face from here on; only wear depends on it.
+
+        Parameters
+        ----------
+        speed_m_s : float
+            In m/s; the sign is the direction, and wear takes its magnitude.
+
+        Raises
+        ------
+        ArgumentError
+            For a speed that is not finite.
+        """
         if not np.isfinite(speed_m_s):
             raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
         if self._parts.terms.wear is not None:
@@ -247,9 +273,14 @@ class Twin:
     def restore(self, data: bytes) -> None:
         """Take over a state saved by `snapshot`.
 
+        Parameters
+        ----------
+        data : bytes
+            Of a twin of the same scene, tolerance and excitation.
+
         Raises
         ------
-        ValueError
+        ArgumentError
             When the data has not the size of a snapshot.
         """
         if len(data) != STATE.itemsize + 32:

@@ -47,6 +47,11 @@ def load_scene(path: str | Path) -> Scene:
     path : str or Path
         The YAML file, or the name of a preset: paper, bench_kv, bench_hc. Load tables are looked up beside it.
 
+    Returns
+    -------
+    Scene
+        The scene, with the marks of its numbers.
+
     Raises
     ------
     SceneError

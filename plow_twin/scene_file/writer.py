@@ -31,7 +31,18 @@ _ORDER: Final = (
 
 
 def dump_scene(scene: Scene) -> str:
-    """Write a scene as YAML text that needs no other file; reading it back gives an equal scene, bit for bit."""
+    """Write a scene as YAML text that needs no other file; reading it back gives an equal scene, bit for bit.
+
+    Parameters
+    ----------
+    scene : Scene
+        The scene; its tables are written in place.
+
+    Returns
+    -------
+    str
+        The text, marks included.
+    """
     raw: dict[str, Any] = {"version": SCENE_VERSION}
     for key in SECTIONS:
         raw[key] = _plain(getattr(scene, key), key, scene.marks)

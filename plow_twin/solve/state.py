@@ -40,7 +40,21 @@ X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
 
 
 class Status(IntEnum):
-    """How an advance ended."""
+    """How an advance ended.
+
+    Attributes
+    ----------
+    OK
+        The time asked for was reached.
+    OUT_OF_RANGE
+        abs(theta) above 45 degrees, or half the cavity penetrated: the pairs would no longer be the right ones.
+    NON_FINITE
+        A number became infinite or NaN.
+    BUDGET
+        The steps that an advance may take were used up.
+    LOG_FULL
+        Internal; never the status of an advance.
+    """
 
     OK = 0
     OUT_OF_RANGE = 1

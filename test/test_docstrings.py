@@ -1,0 +1,92 @@
+"""The reference is complete: every parameter, field and result of a public name is described, arrays with shape."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import griffe
+import pytest
+from scenes import ROOT
+
+#: Declared with unit and meaning in the source; the site shows both.
+DECLARED = re.compile(r"_(quantity|choice)\(")
+ARRAYS = re.compile(r"NDArray|ArrayLike|\bArray\b")
+
+
+@pytest.fixture(scope="module")
+def package() -> griffe.Module:
+    return griffe.load("plow_twin", docstring_parser="numpy", search_paths=[str(ROOT)])
+
+
+def public(package: griffe.Module) -> Iterator[tuple[str, Any]]:
+    """Yield public functions and classes, and the public methods and properties of these."""
+    for name in re.findall(r"^::: plow_twin\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE):
+        found = package[name]
+        found = found.final_target if found.is_alias else found
+        if found.is_class or found.is_function:
+            yield name, found
+        if found.is_class:
+            members = ((key, member) for key, member in found.members.items() if not key.startswith("_"))
+            yield from ((f"{name}.{key}", member) for key, member in members if member.is_function)
+
+
+def described(item: Any) -> dict[str, str]:
+    """Return what a docstring says of each parameter and attribute: its type with shape, and its text."""
+    said = {}
+    for section in item.docstring.parsed:
+        if section.kind.value in ("parameters", "attributes"):
+            for entry in section.value:
+                said |= {name.strip(): f"{entry.annotation} {entry.description}" for name in entry.name.split(",")}
+    return said
+
+
+def test_every_public_name_has_a_docstring(package: griffe.Module) -> None:
+    names = [name for name, _ in public(package)]
+    assert len(names) > 45
+    assert [name for name, item in public(package) if item.docstring is None] == []
+
+
+def test_every_parameter_is_described_and_every_result(package: griffe.Module) -> None:
+    lacking = []
+    for name, function in public(package):
+        if not function.is_function:
+            continue
+        said, text = described(function), function.docstring.value
+        parameters = [p for p in function.parameters if p.name not in ("self", "cls")]
+        lacking += [f"{name}({p.name})" for p in parameters if p.name not in said]
+        lacking += [
+            f"{name}({p.name}): no shape"
+            for p in parameters
+            if ARRAYS.search(str(p.annotation)) and "shape" not in said.get(p.name, "")
+        ]
+        summary = text.partition("\n\n")[0].lower()
+        if str(function.returns) != "None" and "Returns\n" not in text and "return" not in summary:
+            lacking.append(f"{name}: what it returns")
+    assert lacking == []
+
+
+def test_every_field_is_described(package: griffe.Module) -> None:
+    lacking = []
+    for name, item in public(package):
+        if not item.is_class:
+            continue
+        said = described(item)
+        for key, field in item.members.items():
+            if not field.is_attribute or key.startswith("_") or DECLARED.search(str(field.value)):
+                continue
+            if key not in said and field.docstring is None:
+                lacking.append(f"{name}.{key}")
+            elif ARRAYS.search(str(field.annotation)) and "property" not in field.labels and "shape" not in said[key]:
+                lacking.append(f"{name}.{key}: no shape")
+    assert lacking == []
+
+
+def test_what_a_function_raises_by_name_is_said(package: griffe.Module) -> None:
+    lacking = []
+    for name, function in public(package):
+        if function.is_function:
+            raised = {*re.findall(r"^ +raise (\w+)\(", function.source, re.MULTILINE)}
+            lacking += [f"{name}: {error}" for error in raised if error not in function.docstring.value]
+    assert lacking == []
