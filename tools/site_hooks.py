@@ -28,7 +28,13 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 def _for_the_site(text: str) -> str:
     """Let links of the repository's front page start in `docs/`; files that are no page lose their link."""
     text = text.replace("](docs/", "](").replace("](examples/README.md)", "](examples.md)")
-    return re.sub(r"\[([^\]]+)\]\((?!\w+://)(?![\w/]+\.(?:md|png|svg))[^)#]+\)", r"`\1`", text)
+
+    def keep(link: re.Match[str]) -> str:
+        name, target = link[1], link[2]
+        there = "://" in target or target == "examples.md" or (ROOT / "docs" / target).is_file()
+        return link[0] if there else f"`{name}`"
+
+    return re.sub(r"(?<!!)\[([^\]]+)\]\(([^)#]+)\)", keep, text)
 
 
 def _gallery() -> str:
