@@ -153,6 +153,21 @@ def test_a_run_of_ours_is_analysed_by_its_journal(tmp_path: Path) -> None:
     assert found.predictions[0].loads.duration_s == pytest.approx(0.999)
 
 
+def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+    with (tmp_path / "load.csv").open("w") as stream:
+        stream.write("t,fx,fy,m\n")
+        stream.writelines(f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion[0], motion[1], strict=True))
+    (tmp_path / "travel.csv").write_text("t,speed\n0.5,2.0\n4.0,-2.0\n")
+    loads = analyse(tmp_path, scene=PAPER, out=tmp_path / "out").predictions[0].loads
+    assert len(loads.passes) == 2 and sum(item.impacts for item in loads.passes) == loads.impacts.sum()
+    assert loads.passes[0].end_m == pytest.approx(7.0, abs=0.01) and loads.passes[1].end_m == pytest.approx(
+        -1.0, abs=0.01
+    )
+    assert replay(tmp_path / "out" / "run").exit_code == 0
+    again = analyse(tmp_path / "out" / "run").predictions[0].loads
+    np.testing.assert_array_equal(again.impacts, loads.impacts)
+
+
 def test_late_repeated_and_non_finite_samples_are_counted_as_live(
     motion: tuple[np.ndarray, ...], tmp_path: Path
 ) -> None:

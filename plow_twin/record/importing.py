@@ -193,7 +193,8 @@ class Feed:
                 self.flush()
                 for walker in self.walkers:
                     walker.speed_m_s = speed
-                    walker.apply(Travel(stamp_ns, abs(speed)), max(0, log_time_ns))
+                    # at once: a speed of the future would have to wait for its time
+                    walker.apply(Travel(self._reached_ns or 0, abs(speed)), max(0, log_time_ns))
         elif name == "excitation":
             self._sample(stamp_ns, (values["fx"], values["fy"], values["m"]), log_time_ns)
         else:

@@ -23,7 +23,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene, loads_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Hold, Loss, Reset, Snapshot, Travel
+from plow_twin.stream.journal import Loss, Reset, SetWear, Snapshot, Travel
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis.loads import LoadTotals
 from plow_twin.study.analysis.signals import Comparison, compare
@@ -256,25 +256,37 @@ def _walk_own(
         Walker(_session(prediction.scene, header.tol, header.origin_ns), prediction.walked)
         for prediction in predictions
     ]
-    used = 0
+    used, late, reached_ns = 0, 0, -1
     for stamps, wrench, other in _journal(reader):
         if on_progress is not None:
             on_progress(reader.position)
         if len(stamps):
-            used += len(stamps)
-            for walker in walkers:
-                walker.samples(stamps, wrench, stamps)
+            order = np.argsort(stamps, kind="stable")  # a late sample stands where its stamp puts it
+            order = order[stamps[order] > reached_ns]
+            used, late = used + len(order), late + len(stamps) - len(order)
+            if len(order):
+                reached_ns = int(stamps[order[-1]])
+                for walker in walkers:
+                    walker.samples(stamps[order], wrench[order], stamps[order])
         if isinstance(other, Travel):
             for walker in walkers:
                 walker.speed_m_s = other.speed_m_s
-                walker.apply(other)
+                walker.apply(Travel(max(0, reached_ns), other.speed_m_s))  # at once
         elif isinstance(other, Reset | Loss):
+            reached_ns = -1
             for walker, prediction in zip(walkers, predictions, strict=True):
                 walker.apply(Reset(0, "loss") if isinstance(other, Loss) else other)
                 prediction.restart()
         elif isinstance(other, Snapshot):
             walkers[0].apply(other)  # the state after a loss; other scenes go on from their own
+            reached_ns = walkers[0].session.stamp_ns or -1
+        elif isinstance(other, SetWear):
+            walkers[0].apply(other)
+            for prediction in predictions:
+                prediction.restart()
     losses = {topic: count for topic, count in reader.lost.items() if count}
+    if late:
+        losses["samples_too_late"] = late
     if reader.status is not FileStatus.COMPLETE:
         losses[reader.status.value] = 1
     unknown: dict[str, str] = {}
@@ -285,22 +297,18 @@ def _walk_own(
 
 
 def _journal(reader: RunReader) -> Iterator[tuple[NDArray[np.int64], Array, Any]]:
-    """Yield runs of samples, and the entry that ends each; a hold is a sample of the load before."""
-    empty, last = (np.zeros(0, np.int64), np.zeros((0, 3))), np.zeros(3)
+    """Yield runs of samples, and the entry that ends each; nothing is held, as in every replay of another recording."""
+    empty = (np.zeros(0, np.int64), np.zeros((0, 3)))
     lost = False
     for batch in reader.batches(outputs=False):
         entries, begin = batch.entries, 0
         for place in (*sorted(entries.others), len(entries)):
             chosen = slice(begin, place)
             if place > begin:
-                last = entries.wrench[place - 1]
                 yield entries.stamp_ns[chosen], entries.wrench[chosen], None
             if place < len(entries):
                 entry = entries.others[place]
-                if isinstance(entry, Hold):
-                    yield np.array([entry.stamp_ns]), last[None].copy(), None
-                elif isinstance(entry, Travel | Reset | Loss) or (isinstance(entry, Snapshot) and lost):
-                    last = np.zeros(3) if isinstance(entry, Reset) else last
+                if isinstance(entry, Travel | Reset | SetWear | Loss) or (isinstance(entry, Snapshot) and lost):
                     yield (*empty, entry)
                 lost = isinstance(entry, Loss)
             begin = place + 1
