@@ -13,6 +13,7 @@ from plow_twin.build import package_version
 from plow_twin.cli.analyse import analyse
 from plow_twin.cli.console import FAILED, WRONG_INPUT
 from plow_twin.cli.demo import demo
+from plow_twin.cli.doctor import doctor
 from plow_twin.cli.estimate import estimate
 from plow_twin.cli.info import info
 from plow_twin.cli.replay import replay
@@ -54,7 +55,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, estimate, replay, analyse, view, info, study):
+for _verb in (simulate, demo, estimate, replay, analyse, doctor, view, info, study):
     commands.add_command(_verb)
 
 

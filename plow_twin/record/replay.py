@@ -173,6 +173,8 @@ class _Replay:
         from plow_twin.scene_file import loads_scene
 
         self.digests_only = digests_only
+        #: every publication is there: windows between two of them can be followed
+        self.all_outputs = not digests_only and header.record_outputs == "all"
         self.header = header
         self.report = report
         here = build_fingerprint()
@@ -390,12 +392,14 @@ class _Replay:
 
     def entry(self, record: EntryRecord) -> None:
         """Apply or compare one entry of the journal."""
+        if not self.report.entries and self.header.part:
+            self.next_sequence = record.sequence  # the parts before it are not here
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
         if missing:
             self.gaps += missing
             self.synced = self.outputs_synced = False
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
-            self.synced = self.outputs_synced = True  # a journal that starts at the scene's own initial state
+            self.synced, self.outputs_synced = True, self.all_outputs  # from the scene's own initial state
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one publication
             self.messages = self.publications = None
@@ -444,7 +448,7 @@ class _Replay:
         if before is not None:  # only messages were lost: the motion must be the same
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
-        self.outputs_synced = not self.digests_only  # without messages nobody takes the outputs' windows
+        self.outputs_synced = self.all_outputs  # without messages nobody takes the outputs' windows
 
     def output(self, record: OutputRecord) -> None:
         """Compare one recorded message with the one that the model gives at that place."""

@@ -106,6 +106,25 @@ class Settings:
         Effect.CONFIGURE,
         "folder to make for the recording of each configured run, with _2, _3, ... when it exists; empty: none",
     )
+    record_outputs: str = _choice(
+        "all",
+        ("all", "decimated", "none"),
+        Effect.CONFIGURE,
+        "outputs in the recording; with none the journal alone, from which `plow-twin replay --write` makes them",
+    )
+    record_rate: float = _number(
+        50.0, "Hz", 0.1, 10000.0, Effect.CONFIGURE, "rate of the outputs in a decimated recording; no peak is lost"
+    )
+    record_part_mb: float = _number(
+        0.0, "MB", 0.0, 1e6, Effect.CONFIGURE, "size at which the recording goes on in a new part; 0: never"
+    )
+    record_part_s: float = _number(
+        0.0, "s", 0.0, 1e9, Effect.CONFIGURE, "time after which the recording goes on in a new part; 0: never"
+    )
+    record_keep_mb: float = _number(
+        0.0, "MB", 0.0, 1e9, Effect.CONFIGURE, "the oldest parts are removed when the ended ones are larger; 0: never"
+    )
+    record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk each second, against a loss of power")
     excitation_timeout: float = _number(
         0.5,
         "s",

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from plow_twin.model.scene import Scene
+from plow_twin.record.decimation import Decimation
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
@@ -58,11 +59,17 @@ class Recording:
             child_frame_id=settings.child_frame_id,
             clock="system" if clock is None else "ros",
             parameters=asdict(settings),
+            record_outputs=settings.record_outputs,
         )
+        self._decimation = Decimation(settings.record_outputs, settings.record_rate)
         self._recorder = Recorder(
             _free(Path(settings.record_path)),
             header,
             queue_size=_QUEUE_SIZE,
+            part_bytes=round(settings.record_part_mb * 1e6),
+            part_s=settings.record_part_s,
+            keep_bytes=round(settings.record_keep_mb * 1e6),
+            sync=settings.record_sync,
             now_ns=clock or time.time_ns,
             on_error=on_error,
         )
@@ -83,7 +90,9 @@ class Recording:
 
     def publication(self, publication: Publication) -> None:
         """Take the messages of a publication that has been published."""
-        self._recorder.publication(publication)
+        wanted = self._decimation.take(publication)
+        if wanted is not None:
+            self._recorder.publication(wanted)
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
         """Take another message that has been published on the topic of that base name."""

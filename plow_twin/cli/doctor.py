@@ -1,0 +1,37 @@
+"""`plow-twin doctor`: what is in a recording, what is missing, and its repair."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console
+
+
+@click.command(
+    epilog="Exit codes: 0 nothing is missing, 1 failed or no recording, 2 wrong usage, 3 something is missing."
+)
+@click.argument("recording", type=click.Path(path_type=Path, exists=True))
+@click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old ones are kept.")
+@json_option
+def doctor(recording: Path, repair: bool, as_json: bool) -> int:
+    """Say what is in RECORDING and what is missing; with --repair give its parts their end again."""
+    from plow_twin.record.doctor import examine
+    from plow_twin.record.doctor import repair as make_whole
+
+    before = examine(recording)
+    rewritten = make_whole(recording) if repair else []
+    report = examine(recording) if repair else before
+    facts = {**report.facts(), "repaired": [path.name for path in rewritten]}
+    if rewritten:
+        facts["problems_before"] = before.problems
+    if as_json:
+        click.echo(json.dumps(facts, indent=2))
+    else:
+        console = output_console()
+        for key, value in facts.items():
+            for line in value if isinstance(value, list) and value else [value]:
+                console.print(f"{key:18} {line}", highlight=False, soft_wrap=True)
+    return DONE_WITH_LOSS if before.problems else DONE

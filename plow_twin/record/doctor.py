@@ -1,0 +1,258 @@
+"""What is in a recording, what is missing, and its repair: a part that was cut off or damaged gets its end again.
+
+A repair copies every message that can be read into a new file and keeps the old one under another name. Nothing is
+invented: what was lost stays lost and is counted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from plow_twin.record.cdr import type_hash
+from plow_twin.record.chunks import ChunkReader, Messages
+from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
+from plow_twin.record.journal_codec import Dropped
+from plow_twin.record.mcap_file import ChunkBuilder, McapFile
+from plow_twin.record.messages import MESSAGE_TYPES
+from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.stream.journal import Digest, Loss, Sample, Snapshot
+
+_CHUNK_SIZE: Final = 2**20
+#: Key in the loss record of a repaired part.
+REPAIRED_KEY: Final = "repaired"
+
+
+@dataclass
+class PartReport:
+    """One file: how it ended and what of it could not be read."""
+
+    path: Path
+    bytes: int
+    finished: bool
+    damaged_chunks: int
+    messages: dict[str, int]
+
+    @property
+    def healthy(self) -> bool:
+        """Whether it has its end and no damage."""
+        return self.finished and not self.damaged_chunks
+
+
+@dataclass
+class RunReport:
+    """A recording: its parts, its journal, and what is missing."""
+
+    path: Path
+    parts: list[PartReport] = field(default_factory=list)
+    metadata_yaml: bool = False
+    status: str = ""
+    layout_version: str = ""
+    entries: Counter[str] = field(default_factory=Counter)
+    gaps: int = 0
+    lost: dict[str, int] = field(default_factory=dict)
+    span_s: float = 0.0
+    problems: list[str] = field(default_factory=list)
+
+    def facts(self) -> dict[str, Any]:
+        """Return everything for JSON."""
+        parts = [
+            {
+                "file": part.path.name,
+                "bytes": part.bytes,
+                "finished": part.finished,
+                "damaged_chunks": part.damaged_chunks,
+                "messages": part.messages,
+            }
+            for part in self.parts
+        ]
+        return {
+            "run": str(self.path),
+            "status": self.status,
+            "healthy": not self.problems,
+            "problems": self.problems,
+            "layout_version": self.layout_version,
+            "metadata_yaml": self.metadata_yaml,
+            "span_s": self.span_s,
+            "entries": dict(self.entries),
+            "missing_entries": self.gaps,
+            "lost": self.lost,
+            "parts": parts,
+        }
+
+
+def examine(path: Path) -> RunReport:
+    """Read a recording from front to back and say what is in it and what is missing.
+
+    Raises
+    ------
+    RecordingError
+        There is no recording of ours, or its journal cannot be understood.
+    """
+    reader = RunReader(path)
+    report = RunReport(path)
+    report.metadata_yaml = (reader.path.parent / "metadata.yaml").is_file()
+    report.parts = [_part(part) for part in reader.parts]
+    expected: int | None = None if reader.header.part else 0
+    first = last = None
+    for batch in reader.batches(outputs=False):
+        entries = batch.entries
+        for index, sequence in enumerate(entries.sequence.tolist()):
+            if expected is not None and sequence > expected:
+                report.gaps += sequence - expected
+            expected = sequence + 1
+            entry = None if entries.sample[index] else entries.others[index]
+            report.entries[Sample.__name__ if entry is None else type(entry).__name__] += 1
+            if entry is None:
+                stamp = int(entries.stamp_ns[index])
+                first, last = stamp if first is None else first, stamp
+            elif isinstance(entry, Loss | Dropped):
+                where = entry.topic if isinstance(entry, Dropped) else "journal"
+                report.lost[where] = report.lost.get(where, 0) + entry.count
+    report.lost = {topic: count for topic, count in (reader.lost or report.lost).items() if count}
+    report.span_s = 0.0 if first is None or last is None else (last - first) * 1e-9
+    report.status = reader.status.value
+    report.layout_version = _layout(reader)
+    _name_problems(report, reader)
+    return report
+
+
+def _layout(reader: RunReader) -> str:
+    found: list[str] = []
+
+    def on_metadata(name: str, record: dict[str, str]) -> None:
+        if name == HEADER_RECORD:
+            found.append(record.get("layout_version", ""))
+
+    for _ in ChunkReader(reader.path, on_metadata):
+        break
+    return found[0] if found else ""
+
+
+def _part(path: Path) -> PartReport:
+    reader = ChunkReader(path)
+    counts: Counter[str] = Counter()
+    for messages in reader:
+        for number in messages.channel.tolist():
+            channel = reader.channels.get(number)
+            counts[channel.topic if channel else "undeclared"] += 1
+    return PartReport(path, path.stat().st_size, reader.finished, reader.damaged, dict(sorted(counts.items())))
+
+
+def _name_problems(report: RunReport, reader: RunReader) -> None:
+    for part in report.parts:
+        if not part.finished:
+            report.problems.append(f"{part.path.name}: cut off: it has no end")
+        if part.damaged_chunks:
+            report.problems.append(f"{part.path.name}: {part.damaged_chunks} damaged chunk(s)")
+    if not report.metadata_yaml:
+        report.problems.append("metadata.yaml is missing")
+    if report.gaps:
+        report.problems.append(f"{report.gaps} journal entries are missing")
+    for topic, count in report.lost.items():
+        report.problems.append(f"{count} lost on {topic}, as counted by the recorder")
+    if reader.status is FileStatus.STOPPED_EARLY:
+        report.problems.append(f"stopped early: {reader.stop_reason}")
+    if not report.entries[Snapshot.__name__] and report.entries[Digest.__name__]:
+        report.problems.append("no snapshot: nothing can be compared")
+
+
+def repair(path: Path) -> list[Path]:
+    """Give each part that was cut off or damaged its end again, and the folder its `metadata.yaml`.
+
+    Returns
+    -------
+    list of Path
+        The parts that were rewritten; the old ones stay beside them as `<name>.damaged`.
+
+    Raises
+    ------
+    RecordingError, OSError
+        There is no recording of ours, or no room.
+    """
+    reader = RunReader(path)
+    rewritten, facts = [], []
+    for part in reader.parts:
+        report = _part(part)
+        if not report.healthy:
+            _rewrite(part)
+            rewritten.append(part)
+        facts.append(_facts(part))
+    if rewritten or not (reader.path.parent / "metadata.yaml").is_file():
+        custom = {f"plow_twin_{REPAIRED_KEY}": ", ".join(part.name for part in rewritten)} if rewritten else {}
+        write_metadata(reader.path.parent, bag_metadata(facts, custom))
+    return rewritten
+
+
+def _rewrite(part: Path) -> None:
+    """Copy what can be read into a new file in the place of the old one."""
+    target = part.with_name(f"{part.name}.partial")
+    target.unlink(missing_ok=True)
+    loss: dict[str, str] = {}
+    file = McapFile(target, "plow_twin doctor")
+
+    def on_metadata(name: str, record: dict[str, str]) -> None:
+        if name == LOSS_RECORD:
+            loss.update(record)
+        else:
+            file.metadata(name, record)
+
+    reader = ChunkReader(part, on_metadata)
+    numbers: dict[int, int] = {}
+    try:
+        for messages in reader:
+            _copy(messages, reader, file, numbers)
+        file.metadata(LOSS_RECORD, loss)
+        file.finish()
+    finally:
+        file.close()
+    part.replace(part.with_name(f"{part.name}.damaged"))
+    target.replace(part)
+
+
+def _copy(messages: Messages, reader: ChunkReader, file: McapFile, numbers: dict[int, int]) -> None:
+    builder = ChunkBuilder("zstd")
+    for index, number in enumerate(messages.channel.tolist()):
+        channel = reader.channels.get(number)
+        if channel is None:
+            continue
+        if number not in numbers:
+            kind = channel.message_type
+            qos = (
+                {"offered_qos_profiles": qos_text(kind), "topic_type_hash": type_hash(kind)}
+                if kind in MESSAGE_TYPES
+                else {}
+            )
+            numbers[number] = file.channel(channel.topic, kind, channel.schema, qos)
+        builder.add(
+            numbers[number],
+            int(messages.sequence[index]),
+            int(messages.log_time_ns[index]),
+            int(messages.publish_time_ns[index]),
+            messages.data(index),
+        )
+        if builder.size >= _CHUNK_SIZE:
+            file.chunk(builder)
+    file.chunk(builder)
+
+
+def _facts(part: Path) -> PartFacts:
+    reader = ChunkReader(part)
+    counts: Counter[int] = Counter()
+    start, end = 0, 0
+    for messages in reader:
+        counts.update(messages.channel.tolist())
+        if len(messages):
+            first, last = int(messages.log_time_ns.min()), int(messages.log_time_ns.max())
+            start, end = first if not start else min(start, first), max(end, last)
+    known: Mapping[int, Any] = reader.channels
+    topics = [
+        TopicCount(known[number].topic, known[number].message_type, count)
+        for number, count in sorted(counts.items())
+        if number in known and known[number].message_type in MESSAGE_TYPES
+    ]
+    return PartFacts(part.name, start, end, topics)

@@ -1,0 +1,122 @@
+"""Recordings of several parts, journals alone, and repairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from record_support import chunk_spans, paper_sample, record_run
+from rosbags.highlevel import AnyReader
+
+from plow_twin.record.decimation import Decimation
+from plow_twin.record.doctor import examine, repair
+from plow_twin.record.header import RunHeader
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.recorder import Recorder
+from plow_twin.record.replay import replay
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.journal import Sample, Snapshot
+from plow_twin.stream.session import Session
+
+COUNT = 3000
+
+
+def test_parts_are_whole_alone_and_nothing_is_lost_between_them(tmp_path: Path) -> None:
+    run = record_run(
+        tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
+    )
+    parts = RunReader(run.folder).parts
+    assert len(parts) >= 3 and not run.loss.lost
+    report = replay(run.folder)
+    assert (report.exit_code, report.samples, report.compared["contact_forces"]) == (0, COUNT, COUNT)
+    assert report.snapshots_compared == len(parts) - 1
+    for part in parts[1:]:
+        first = next(iter(RunReader(part)))
+        assert isinstance(first.entry, Snapshot)  # type: ignore[union-attr]
+        alone = replay(part)
+        assert (alone.exit_code, alone.lost) == (0, {}) and alone.samples > 0
+    bag = yaml.safe_load((run.folder / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert bag["relative_file_paths"] == [part.name for part in parts]
+    with AnyReader([run.folder]) as reader:
+        assert reader.message_count == bag["message_count"] == len(run.entries) + len(run.outputs)
+
+
+def test_the_oldest_parts_are_removed_on_request(tmp_path: Path) -> None:
+    run = record_run(
+        tmp_path / "run",
+        map(paper_sample, range(COUNT)),
+        part_bytes=100_000,
+        keep_bytes=150_000,
+        flush_period_s=0.01,
+        chunk_size=50_000,
+    )
+    parts = RunReader(run.folder).parts
+    assert parts[0].name != "run_0.mcap" and sum(part.stat().st_size for part in parts) < 500_000
+    report = replay(run.folder)
+    assert (report.exit_code, report.divergences, report.lost) == (0, 0, {}) and report.samples < COUNT
+
+
+def test_the_journal_alone_takes_less_than_75_bytes_a_sample(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), frame_every=10**9, pause_every=0)
+    assert run.file.stat().st_size / COUNT < 75
+    assert replay(run.folder).exit_code == 0
+
+
+@pytest.mark.parametrize("share", [0.4, 0.9])
+def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
+    data = run.file.read_bytes()
+    run.file.write_bytes(data[: int(len(data) * share)])
+    (run.folder / "metadata.yaml").unlink()
+    before = examine(run.folder)
+    assert before.problems and before.status == FileStatus.TRUNCATED.value
+    found = list(RunReader(run.folder))
+    assert repair(run.folder) == [run.file]
+    after = examine(run.folder)
+    assert after.problems == [] and after.status == FileStatus.COMPLETE.value
+    # all that could be read before; order among equal places is that of the journal
+    assert {repr(record) for record in RunReader(run.folder)} == {repr(record) for record in found}
+    assert replay(run.folder).exit_code == 0
+    with AnyReader([run.folder]) as reader:
+        assert reader.message_count == len(found)
+
+
+def test_a_damaged_chunk_is_left_out_by_a_repair_and_the_gap_is_named(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
+    data = bytearray(run.file.read_bytes())
+    start, length = chunk_spans(run.file)[2]
+    data[start + length // 2] ^= 0xFF
+    run.file.write_bytes(data)
+    assert repair(run.folder) == [run.file] and (run.folder / "run_0.mcap.damaged").exists()
+    report = examine(run.folder)
+    assert report.parts[0].healthy and report.entries[Sample.__name__] <= COUNT
+    assert replay(run.folder).divergences == 0
+
+
+def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:
+    scene = load_scene(scene_path("paper"))
+    recorder = Recorder(tmp_path / "run", RunHeader(dump_scene(scene), record_outputs="decimated"))
+    session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
+    session.start()
+    decimation, sent, kept = Decimation("decimated", 20.0), [], []
+    for index in range(COUNT):
+        session.apply(paper_sample(index))
+        publication = session.outputs.take()
+        assert publication is not None
+        sent.append(publication)
+        wanted = decimation.take(publication)
+        if wanted is not None:
+            kept.append(wanted)
+            recorder.publication(wanted)
+    session.close()
+    assert recorder.close().complete and len(kept) == COUNT // 50
+    peaks = np.array([publication.peak for publication in sent]).max(axis=0)
+    np.testing.assert_array_equal(np.array([publication.peak for publication in kept]).max(axis=0), peaks)
+    report = replay(tmp_path / "run")
+    assert (report.exit_code, report.compared["contact_forces"]) == (0, len(kept))
+    assert report.not_compared["contact_peaks"] == len(kept)
+    assert Decimation("none", 20.0).take(sent[0]) is None and Decimation("all", 20.0).take(sent[0]) is sent[0]
