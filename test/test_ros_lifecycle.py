@@ -143,6 +143,7 @@ def active(tmp_path_factory: pytest.TempPathFactory) -> Any:
         ("failure_limit", 5, True),
         ("failure_limit", 5.0, False),
         ("autostart", False, False),
+        ("use_sim_time", True, False),
         ("tolerance", 1e-8, False),
         ("no_such_parameter", 1.0, False),
     ],

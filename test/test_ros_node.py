@@ -184,6 +184,18 @@ def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for
         assert stamp_ns(forces[-1].header) == T0 + 41 * MS
 
 
+def test_a_publisher_that_comes_after_the_followed_one_has_gone_is_followed(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=60.0, **RELIABLE_INPUT) as running:
+        probe = running.probe
+        for _ in range(2):
+            publisher = running.publisher("--seconds", "0.3", "--rate", "200")
+            probe.until(lambda: not publisher.running, "the end of the publisher", 100.0)  # noqa: B023
+            assert publisher.wait() == 0, publisher.output()
+        probe.until_figure("input", "samples_used", "120")
+        figures = probe.figures("input")
+        assert (figures["samples_not_followed"], figures["samples_lost"]) == ("0", "0")
+
+
 def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tmp_path: Path) -> None:
     scene = _scene_file(tmp_path, replace(PAPER, wear=WEAR))
     record = tmp_path / "run"
@@ -423,6 +435,7 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
             assert probe.figures("input")["holds"] == "0"
         assert len(forces) == 1
         assert value(probe.status[-1], "stream") == "running"
+        assert "nothing has come on /clock" in probe.status[-1].message and probe.status[-1].level == b"\x01"
 
 
 def test_diagnostics_go_on_without_a_clock_and_hold_every_documented_key(tmp_path: Path) -> None:

@@ -160,6 +160,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         (ERROR, runtime.unsteady, "the stamps jump again and again: too many resets, samples are dropped"),
         (ERROR, values["recorder"] == "trouble", "the recording has lost something or has stopped"),
         (ERROR, bool(runtime.wear_error), runtime.wear_error),
+        (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
         (WARN, runtime.inputs.other_sender, "another publisher sends too and is not followed"),
         (WARN, bool(runtime.inputs.silent()), f"silent: {', '.join(runtime.inputs.silent())}"),
     ]

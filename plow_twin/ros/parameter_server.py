@@ -96,7 +96,12 @@ class ParameterServer:
                 and SPECS[name].metadata["effect"] is Effect.CONFIGURE
                 and parameters.coerce(name, value) != getattr(self.settings, name)
             ]
+            if values.get("use_sim_time", self._sim_time()) != self._sim_time():
+                reasons.append(f"use_sim_time: takes effect {Effect.CONFIGURE.value}")
         return SetParametersResult(successful=not reasons, reason="; ".join(reasons))
+
+    def _sim_time(self) -> bool:
+        return bool(self._node.get_parameter("use_sim_time").value)
 
     def _after(self, changed: list[Parameter]) -> None:
         values = {

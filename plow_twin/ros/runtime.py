@@ -151,6 +151,11 @@ class Runtime:
         return self.driver.unsteady(time.monotonic_ns())
 
     @property
+    def without_clock(self) -> bool:
+        """Whether the node is to follow `/clock` and has heard none."""
+        return self.sim_time and self._ros_time_ns() == 0
+
+    @property
     def wear_error(self) -> str:
         """Why the wear could not be saved; empty: it could, or it is not kept."""
         return self.wear_keeper.error if self.wear_keeper else ""
