@@ -12,11 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
-from rclpy.qos import ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import ROOT, bench, value
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -182,6 +183,25 @@ def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for
         second(T0 + 41 * MS, (30e3, 0.0, 0.0))
         probe.until(lambda: len(forces) == 41, "an answer to the second")
         assert stamp_ns(forces[-1].header) == T0 + 41 * MS
+
+
+def test_a_force_above_its_threshold_is_an_alarm_until_it_is_acknowledged(tmp_path: Path) -> None:
+    with bench(tmp_path, excitation_timeout=60.0, alarm_force="[1.0, 1e9]", **RELIABLE_INPUT) as running:
+        probe = running.probe
+        latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        alarms: list[DiagnosticStatus] = []
+        probe.node.create_subscription(DiagnosticStatus, "alarms", alarms.append, latched)
+        send = probe.excitation()
+        for index in range(600):
+            send(T0 + index * MS, (32e3, 0.0, -45e3))
+            probe.pace(index)
+        probe.until(lambda: alarms, "an alarm")
+        assert alarms[0].level == b"\x01" and alarms[0].message == "force"
+        assert value(alarms[0], "force_level") == "warn"
+        send(T0 + 600 * MS, (0.0, 0.0, 0.0))
+        answer = probe.call(Trigger, f"{running.namespace}/plow_twin/acknowledge_alarms", Trigger.Request())
+        assert answer.success
+        probe.until(lambda: len(alarms) > 1, "what is left")
 
 
 def test_a_publisher_that_comes_after_the_followed_one_has_gone_is_followed(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
@@ -84,6 +85,18 @@ class ToolForces:
             if name in self._directions:
                 total += effort * self._directions[name]
         return (float(total[0]), float(total[1]), float(total[2]))
+
+
+def ros_status(status: plain.DiagnosticStatus) -> DiagnosticStatus:
+    """Return the ROS message of a status."""
+    values = [KeyValue(key=key, value=value) for key, value in status.values]
+    return DiagnosticStatus(
+        level=bytes([status.level]),
+        name=status.name,
+        message=status.message,
+        hardware_id=status.hardware_id,
+        values=values,
+    )
 
 
 class JointStateWriter:

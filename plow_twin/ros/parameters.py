@@ -161,6 +161,23 @@ class Settings:
         Effect.NOW,
         "wear depth of the eight pads that the service ~/set_wear sets; all 0: new pads",
     )
+    alarm_force: tuple[float, ...] = _list(
+        (0.0, 0.0),
+        "N",
+        0.0,
+        1e12,
+        Effect.CONFIGURE,
+        "largest force from which on there is a warning, an error; 0: none",
+    )
+    alarm_clearance: tuple[float, ...] = _list(
+        (0.0, 0.0), "m", 0.0, 10.0, Effect.CONFIGURE, "the same of the larger of the two clearances"
+    )
+    alarm_wear_rate: tuple[float, ...] = _list(
+        (0.0, 0.0), "m/s", 0.0, 1.0, Effect.CONFIGURE, "the same of the fastest wear of a pad"
+    )
+    alarm_duration: float = _number(
+        0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "how long a level must last before there is an alarm"
+    )
     jump_back: float = _number(
         1.0, "s", 0.0, 3600.0, Effect.NOW, "a stamp older than the newest by more than this resets the model"
     )

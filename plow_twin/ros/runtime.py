@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus as RosDiagnosticStatus
 from numpy.typing import NDArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -21,11 +22,14 @@ from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import publication_messages, quality
 from plow_twin.record.wear_state import scene_identity
 from plow_twin.ros.inputs import Inputs
+from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameters import Settings
 from plow_twin.ros.publishers import QUALITY, TOPICS, OutputPublishers
+from plow_twin.ros.qos import LATCHED
 from plow_twin.ros.solver_start import Prepared
 from plow_twin.ros.wear_keeper import WearKeeper
 from plow_twin.run.twin import Twin
+from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
@@ -105,6 +109,14 @@ class Runtime:
             made.callback(self.recording.close)
         self._publishers = OutputPublishers(node)
         made.callback(self._publishers.close)
+        thresholds = {
+            "force": Thresholds(*settings.alarm_force),
+            "clearance": Thresholds(*settings.alarm_clearance),
+            "wear_rate": Thresholds(*settings.alarm_wear_rate),
+        }
+        self.alarms = Alarms(thresholds, settings.alarm_duration)
+        self._alarms_publisher = node.create_publisher(RosDiagnosticStatus, "alarms", LATCHED)
+        made.callback(node.destroy_publisher, self._alarms_publisher)
         session = Session(
             twin,
             on_entry=self.recording.journal if self.recording else _ignore,
@@ -135,6 +147,7 @@ class Runtime:
             ("~/reset", self._on_reset),
             ("~/switch_publisher", self._on_switch),
             ("~/set_wear", self._on_set_wear),
+            ("~/acknowledge_alarms", self._on_acknowledge),
         ):
             self._services.append(node.create_service(Trigger, name, answer))
             made.callback(node.destroy_service, self._services[-1])
@@ -219,6 +232,7 @@ class Runtime:
             lost += [self.wear_keeper.error] if self.wear_keeper.error else []
         self.driver.close()
         self._publishers.close()
+        self._node.destroy_publisher(self._alarms_publisher)
         report = self.recording.close() if self.recording else None
         if report is not None and not report.complete:
             lost.append(f"recording incomplete: lost {dict(report.lost)}, closed {report.closed}, error {report.error}")
@@ -250,7 +264,7 @@ class Runtime:
         from plow_twin.ros.recording import Recording
 
         clock = self._ros_time_ns if self.sim_time else None
-        topics = {topic: self._node.resolve_topic_name(topic) for topic in (*TOPICS, "status")}
+        topics = {topic: self._node.resolve_topic_name(topic) for topic in (*TOPICS, "status", "alarms")}
         name = self._node.get_fully_qualified_name()
         return Recording(self._settings, self.scene, name, topics, clock, self._node.get_logger().error)
 
@@ -312,6 +326,14 @@ class Runtime:
         response.message = "initial motion restored, the wear stays; the next sample starts model time anew"
         return response
 
+    def _on_acknowledge(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        left = self.alarms.acknowledge()
+        self.driver.parameter("alarms_acknowledged", self._stamp_ns())
+        self._publish_alarms(self._stamp_ns())
+        response.success = True
+        response.message = f"still there: {', '.join(left)}" if left else "no alarm is left"
+        return response
+
     def _on_set_wear(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         depth = self._settings.set_wear
         try:
@@ -359,12 +381,35 @@ class Runtime:
         if publication.marked:
             messages[QUALITY] = quality(publication, self._settings.frame_id)
         self._publishers.publish(messages, self._forces_sent)
+        changed = self.alarms.take(publication)
         if self._received_ns and not self.sim_time:
             self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
         if self.recording:
             self.recording.publication(publication)
             if publication.marked:
                 self.recording.message(QUALITY, publication.stamp_ns, messages[QUALITY])
+        if changed:
+            self._publish_alarms(publication.stamp_ns)
+
+    def _publish_alarms(self, stamp_ns: int) -> None:
+        name, head = self._node.get_fully_qualified_name(), self._settings.hardware_id
+        alarms = self.alarms.alarms.items()
+        there = [name for name, alarm in alarms if alarm.level or alarm.latched]
+        values = {
+            key: text
+            for name, alarm in alarms
+            for key, text in (
+                (name, f"{alarm.value:.6g}"),
+                (f"{name}_level", alarm.level.name.lower()),
+                (f"{name}_latched", alarm.latched.name.lower()),
+            )
+        }
+        status = DiagnosticStatus(
+            int(self.alarms.worst), f"{name}: alarms", ", ".join(there) or "none", head, tuple(values.items())
+        )
+        self._alarms_publisher.publish(ros_status(status))
+        if self.recording:
+            self.recording.message("alarms", stamp_ns, status)
 
     def _forces_sent(self) -> None:
         if self._received_ns:

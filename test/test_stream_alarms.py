@@ -1,0 +1,50 @@
+"""Alarms: two levels, hysteresis, a minimum duration, latched until acknowledged."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plow_twin.stream.alarms import Alarms, Level, Thresholds
+from plow_twin.stream.outputs import Publication
+
+MS = 1_000_000
+ZERO = np.zeros(8)
+
+
+def _publication(stamp_ms: int, force: float, *, held: bool = False) -> Publication:
+    peak = np.array([0.0, force, *[0.0] * 6])
+    makes = np.zeros(8, np.int64)
+    return Publication(stamp_ms * MS, ZERO, ZERO, ZERO, makes, ZERO, peak, np.zeros(3), np.zeros(3), None, held)
+
+
+def _levels(alarms: Alarms) -> tuple[Level, Level]:
+    return alarms.levels["force"]
+
+
+def test_an_alarm_comes_after_its_duration_goes_below_its_hysteresis_and_stays_latched() -> None:
+    alarms = Alarms({"force": Thresholds(100.0, 200.0)}, duration_s=0.003)
+    assert not any(alarms.take(_publication(stamp, 150.0)) for stamp in range(3))
+    assert alarms.take(_publication(3, 150.0))
+    assert _levels(alarms) == (Level.WARN, Level.WARN)
+    alarms.take(_publication(4, 96.0))
+    assert _levels(alarms) == (Level.WARN, Level.WARN)
+    alarms.take(_publication(5, 94.0))
+    assert _levels(alarms) == (Level.NONE, Level.WARN)
+    # one that does not last is none, and one without samples says nothing
+    alarms.take(_publication(6, 300.0))
+    alarms.take(_publication(7, 0.0))
+    for stamp in range(8, 20):
+        alarms.take(_publication(stamp, 300.0, held=True))
+    assert _levels(alarms) == (Level.NONE, Level.WARN)
+    assert alarms.acknowledge() == [] and alarms.worst is Level.NONE
+    for stamp in range(20, 30):
+        alarms.take(_publication(stamp, 300.0))
+    assert _levels(alarms) == (Level.ERROR, Level.ERROR)
+    assert alarms.acknowledge() == ["force"] and alarms.worst is Level.ERROR
+
+
+def test_a_threshold_of_zero_is_no_alarm() -> None:
+    alarms = Alarms({"force": Thresholds(0.0, 200.0)})
+    alarms.take(_publication(0, 199.0))
+    assert alarms.worst is Level.NONE
+    assert alarms.take(_publication(1, 201.0))
