@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scenes import pose_error, preset, wall_and_point
 
-from plow_twin import Contact, Friction, Scene, Twin, simulate
+from plow_twin import Clearance, Contact, Frame, Friction, Gravity, Head, Initial, Scene, Twin, simulate
+from plow_twin.model.contact_laws import LAWS
 from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import Implicit
 
@@ -58,6 +59,79 @@ def test_a_damped_slide_has_its_closed_form() -> None:
     expected = mass * g / stiffness * (1.0 - np.exp(-stiffness / damping * result.t))
     assert result.penetration[:, 0] == pytest.approx(expected, rel=1e-5, abs=1e-12)
     assert result.solver["steps"] < 2000
+
+
+BENCH = replace(preset("bench_kv"), frame=replace(preset("bench_kv").frame, width_m=0.33, height_m=0.27))
+THROWN = replace(BENCH, loads=(), initial=Initial((0.0, 0.0, 0.0), (0.5, 0.4, 1.0)))
+CLAMPED = replace(BENCH, clearance=Clearance(-1e-3, -1e-3))
+
+
+def overdamped(law: str, damping: float) -> Contact:
+    additive = law in ("kelvin_voigt", "ramped_damping")
+    return Contact(
+        law, 1e9, 1.5 if law == "ramped_damping" else 1.0, damping=damping if additive else None,
+        restitution=None if additive else damping, ramp_m=1e-4 if law == "ramped_damping" else None,
+    )  # fmt: skip
+
+
+def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
+    """Check that errors stay within ten tolerances of a tight run, and the steps within their limit."""
+    exact = simulate(scene, 2.0, output_dt=0.01, tol=1e-12)
+    nudged = replace(scene, initial=replace(scene.initial, q=(1e-12, 0.0, 0.0)))
+    growth = np.abs(simulate(nudged, 2.0, output_dt=0.01, tol=1e-12).q - exact.q).max() / 1e-12
+    wide = abs(scene.clearance.horizontal_m), abs(scene.clearance.vertical_m)
+    shown = replace(scene, clearance=Clearance(*wide))
+    for tol in tolerances:
+        result = simulate(scene, 2.0, output_dt=0.01, tol=tol)
+        assert result.solver["steps"] <= (15_000 if tol >= 1e-8 else 30_000), tol
+        # where a displacement grows the tolerance means nothing
+        if growth < 1e3:
+            assert pose_error(shown, result.q, exact.q) <= 10.0 * tol, (tol, growth)
+
+
+@pytest.mark.parametrize("damping", [1e8, 1e9, 1e10])
+def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
+    """The tolerance decides how accurate a step is, not which method takes it."""
+    scene = replace(BENCH, contact=overdamped("kelvin_voigt", damping))
+    assert_within_the_gate(scene, (1e-2, 1e-4, 1e-6, 1e-8, 1e-10))
+    for other in (THROWN, CLAMPED):
+        assert_within_the_gate(replace(other, contact=scene.contact), (1e-4,))
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("start", [BENCH, THROWN, CLAMPED], ids=["driven", "thrown", "clamped"])
+@pytest.mark.parametrize(
+    ("law", "damping"),
+    [(law, 10.0**k) for law in ("kelvin_voigt", "ramped_damping") for k in range(4, 14)]
+    + [(law, e) for law, entry in LAWS.items() if entry.takes_restitution for e in (0.05, 0.4, 0.9)],
+)
+def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law: str, damping: float) -> None:
+    scene = replace(start, contact=overdamped(law, damping))
+    assert_within_the_gate(scene, (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10))
+
+
+def test_a_start_inside_a_wall_leaves_as_from_the_middle_of_an_impact() -> None:
+    """At rest at depth d it leaves at e v0 of the impact that turns back at d; undamped at d sqrt(2 K / m)."""
+    depth, stiffness, mass = 1e-3, 1e9, 2430.0
+    for e in (1.0, 0.4):
+        contact = Contact("exact_restitution", stiffness, restitution=e)
+        scene = Scene(
+            Head(mass, 1265.0), Frame(0.33, 0.27), Clearance(0.025, 0.030), contact, Gravity(0.0),
+            initial=Initial((0.0, 0.015 + depth, 0.0)), locked=("x", "theta"),
+        )  # fmt: skip
+        factor = LAWS["exact_restitution"].damping_number(e)
+        work = 0.5 if factor == 0.0 else (factor - np.log1p(factor)) / factor**2
+        impact = depth * np.sqrt(stiffness / mass / work)
+        leaving = -simulate(scene, 0.01).v[-1, 1]
+        assert leaving == pytest.approx(e * impact, rel=1e-8)
+        assert e < 1.0 or leaving == pytest.approx(0.9072, abs=1e-4)
+
+
+@pytest.mark.parametrize("damping", [2e5, 1e9])
+def test_a_symmetric_drop_stays_symmetric(damping: float) -> None:
+    scene = replace(BENCH, loads=(), gravity=Gravity(9.81), contact=overdamped("kelvin_voigt", damping))
+    result = simulate(scene, 3.0, output_dt=0.01)
+    assert abs(result.q[:, [0, 2]]).max() < 1e-17 and len(result.events) >= 2
 
 
 def test_scenes_that_are_not_overdamped_do_not_compile_it() -> None:

@@ -226,8 +226,7 @@ class _Worker(NamedTuple):
 
     @staticmethod
     def of(terms: Terms, compiled: Sequence[CompiledScene]) -> _Worker:
-        # implicit steps do not follow wear
-        stiff = terms.wear is None and any(one.parts.implicit is not None for one in compiled)
+        stiff = any(one.parts.implicit is not None for one in compiled)
         parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit() if stiff else None)
         work = new_records(WORK, 1)
         work[0] = new_work()

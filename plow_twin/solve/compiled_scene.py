@@ -14,13 +14,15 @@ from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import DOF_NAMES, Contact, Scene, Wear
-from plow_twin.solve.method.implicit import new_implicit
+from plow_twin.solve.method.implicit import OVERDAMPED_RATIO, new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
+    COS,
     HARMONIC,
     MAX_ORDER,
     PARAMS,
     SEGMENT,
+    SIN,
     STATE,
     Array,
     Harmonics,
@@ -30,6 +32,8 @@ from plow_twin.solve.state import (
     Segments,
     State,
     Terms,
+    X,
+    Y,
     new_record,
 )
 
@@ -41,9 +45,6 @@ STEP_SHARE = 3e-4
 STEP_SHARE_FRACTION = 1e-6
 #: Mode changes at one instant before the solver goes on past it.
 MAX_EVENTS_AT_ONCE = 64
-#: Rate of decay over the spring's frequency from which implicit steps are compiled in.
-_OVERDAMPED = 200.0
-
 
 _NO_TERMS = Terms(*[None] * len(Terms._fields))
 
@@ -258,21 +259,23 @@ def _release(scene: Scene, velocity_tolerance: float, speed: float) -> float:
 
 
 def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
-    """Return what implicit steps need, where a contact's damping can outweigh its spring far enough to pay."""
+    """Return what implicit steps need, where a contact's damping can outweigh its spring."""
     contact = scene.contact
-    if terms.ramp is not None or terms.wear is not None:
-        return None
     mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
     largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
-    depth = (largest_force / contact.stiffness) ** (1.0 / contact.exponent)
+    y = geometry.body_state(scene.initial.q, scene.initial.v, scene.head.com_offset_m)
+    inside = float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ params.penetration_rows).max())
+    depth = max((largest_force / contact.stiffness) ** (1.0 / contact.exponent), inside)
+    largest_force = contact.stiffness * depth**contact.exponent
     spring = contact.exponent * largest_force / depth
+    damping = 0.0
     if terms.viscous is not None:
         damping = params.viscous
     elif terms.hysteretic is not None:
         damping = largest_force * (contact.damping or params.damping_number / params.speed_floor)
-    else:
-        return None
-    return new_implicit() if damping * mobility > _OVERDAMPED * math.sqrt(spring * mobility) else None
+    if terms.slip is not None:
+        damping += params.friction * largest_force / params.slip_speed
+    return new_implicit() if damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility) else None
 
 
 def _slip(scene: Scene) -> dict[str, Any]:

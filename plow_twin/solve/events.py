@@ -10,6 +10,9 @@ from plow_twin.kernel.polynomial import first_root, first_root_within
 from plow_twin.kernel.simd import below, magnitude, row, set_row, splat
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
+#: Events are one instant when they are closer than this share of the step before them.
+_AT_ONCE = 1e-12
+
 
 @kernel(fast=True)
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
@@ -150,6 +153,43 @@ def _sooner(state, w, order, best) -> float:
         return best
     state.guard_roots += 1
     return min(best, first_root(column, order, best, w))
+
+
+@kernel()
+def _ends_with(column, order, at, within) -> bool:
+    """Tell whether a guard that is positive before `at` turns negative no more than `within` after it."""
+    value, slope = column[order], 0.0
+    for k in range(order - 1, -1, -1):
+        slope = slope * at + value
+        value = value * at + column[k]
+    return slope < 0.0 and value + slope * within <= 0.0
+
+
+@kernel()
+def note_switches(
+    p, state, w, order, at, event, target, penetrating, viscous, hysteretic, integer, fraction, ramp
+) -> None:
+    """Write the mode of each pair that switches at the event to `w.switch`, -1 for the others.
+
+    What happens at one instant but for rounding happens together: a symmetric motion stays symmetric.
+    """
+    column, within = w.column[0], _AT_ONCE * at
+    for pair in range(8):
+        w.switch[pair] = -1
+        for k in range(order + 1):
+            column[k] = w.guard[k, pair]
+        if pair == event:
+            w.switch[pair] = target
+        elif _ends_with(column, order, at, within):
+            w.switch[pair] = _next_mode(p, state.mode[pair], viscous, fraction, ramp)
+        elif penetrating and state.mode[pair] != OFF:
+            guarded = _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp)
+            if guarded and _ends_with(column, order, at, within):
+                w.switch[pair] = CLIPPED if state.mode[pair] == ON else ON
+            elif ramp is not None and state.mode[pair] != RELEASED:
+                _ramp_guard(p, state, w, order, pair)
+                if _ends_with(column, order, at, within):
+                    w.switch[pair] = CROSSING
 
 
 @kernel()

@@ -245,8 +245,8 @@ def lay_out_again(p, parts, state, w) -> None:
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
         # what laying it out has changed
-        state.implicit_size, state.explicit_size = state.implicit_size_before, state.explicit_size_before
-        state.overdamped = state.overdamped_before
+        state.implicit_size, state.decay_times = state.implicit_size_before, state.decay_times_before
+        state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
     recoveries, implicit_steps = state.recoveries, state.implicit_steps
     _lay_out(p, parts, state, w, np.inf)
@@ -285,7 +285,7 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
     while True:
         if state.step_start >= t_end:
             break
-        if log.length[0] >= log.time.size:
+        if log.length[0] + 8 > log.time.size:
             return _LOG_FULL
         code = _next(p, parts, state, w, t_end, budget)
         if code != _OK:

@@ -8,17 +8,21 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import free_force
-from plow_twin.solve.kinematics import penetration_of, rate_of
+from plow_twin.solve.kinematics import penetration_of, rate_of, row_value
 from plow_twin.solve.state import (
     ACTS,
     BASE,
     CLIPPED,
+    COS,
     DAMPS,
     OFF,
     ON,
     RAMPS,
     RELEASED,
+    SIN,
     THETA,
+    X,
+    Y,
 )
 
 #: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees.
@@ -40,6 +44,45 @@ def touch(p, state, pair) -> None:
 
 
 @kernel()
+def _impact_speed(factor, rate, energy) -> float:
+    """Return the speed of the impact that passes through a state inside a wall: its elastic energy per mass, its rate.
+
+    First integral of the free impact, u = D d' / v0:  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
+    """
+    if factor <= 0.0 or (energy <= 0.0 and rate == 0.0):
+        return 0.0
+    full = factor - math.log1p(factor)
+    # an impact of this speed turns back at the energy; what still moves inward needs a faster one
+    low = math.sqrt(factor * factor * energy / full)
+    high = max(low, abs(rate)) * (1.0 + factor)
+    low = max(low, rate, -factor * rate)
+    for _ in range(60):
+        speed = 0.5 * (low + high)
+        u = factor * rate / speed
+        left = np.inf if u <= -1.0 else u - math.log1p(u)
+        if left + factor * factor * energy / (speed * speed) > full:
+            low = speed
+        else:
+            high = speed
+    return high
+
+
+@kernel()
+def _start_inside(p, state, pair, energy) -> None:
+    """Give a pair that starts inside its wall the damping of the impact that it is in the middle of.
+
+    `energy` is the elastic energy of all pairs, all of which may move the head.
+    """
+    if p.damping_number >= 0.0:
+        y = state.y
+        arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
+        mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
+        _, rate = penetration_and_rate(p, state, pair)
+        speed = _impact_speed(p.damping_number, rate, energy * mobility)
+        state.damping_factor[pair] = p.damping_number / max(speed, p.speed_floor)
+
+
+@kernel()
 def mode_inside(p, state, pair):
     """Return the mode of a pair that penetrates, and note on which side of its ramp's end it is."""
     penetration, rate = penetration_and_rate(p, state, pair)
@@ -51,12 +94,17 @@ def mode_inside(p, state, pair):
 
 @kernel()
 def settle_modes(p, state) -> None:
-    """Choose each pair's mode from its penetration, where a motion starts or is changed from outside."""
+    """Choose each pair's mode from its penetration, where a motion starts."""
+    energy = 0.0
+    for pair in range(8):
+        if p.enabled[pair] == 1:
+            penetration = max(penetration_and_rate(p, state, pair)[0], 0.0)
+            energy += p.stiffness * penetration ** (p.exponent + 1.0) / (p.exponent + 1.0)
     for pair in range(8):
         state.mode[pair] = OFF
         state.beyond_ramp[pair] = 0
         if p.enabled[pair] == 1 and penetration_and_rate(p, state, pair)[0] > 0.0:
-            touch(p, state, pair)
+            _start_inside(p, state, pair, energy)
             state.mode[pair] = mode_inside(p, state, pair)
     state.elapsed = 0.0
     state.step_size = -1.0

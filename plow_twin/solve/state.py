@@ -160,9 +160,9 @@ STATE: Final = _in_lines(
         ("touch_time", "f8"),  # of the last touch
         ("time", "f8"),  # the present, bit for bit as it was asked for
         ("implicit_size", "f8"),  # of the next implicit step
-        ("explicit_size", "f8"),  # of the last explicit step
+        ("decay_times", "f8"),  # that have passed in overdamped contact since a contact changed
         ("implicit_size_before", "f8"),  # both as they were before the step under way was laid out
-        ("explicit_size_before", "f8"),
+        ("decay_times_before", "f8"),
         ("order", "i8"),  # of the series of the step under way
         ("event_pair", "i8"),  # the pair whose event ends the step, or -1
         ("event_mode", "i8"),  # the mode that follows
@@ -170,8 +170,8 @@ STATE: Final = _in_lines(
         ("events_at_once", "i8"),  # events so far at one instant
         ("piece", "i8"),  # of the sampled load
         ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
-        ("overdamped", "i8"),  # explicit steps in a row that stability has bound
-        ("overdamped_before", "i8"),  # the same before the step under way was laid out
+        ("refused", "i8"),  # implicit steps that were not worth it since a contact changed
+        ("refused_before", "i8"),  # the same before the step under way was laid out
         ("in_flight", "i8"),  # 1 during a step of free flight
         ("at_rest", "i8"),  # 1 during a step of rest
         # counted since the start
@@ -215,6 +215,7 @@ WORK: Final = np.dtype(
         ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("moved", "f8", (STATE_SIZE,)),
         ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
+        ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
     ]
@@ -298,7 +299,8 @@ class Implicit(NamedTuple):
     matrix: Array  #: (3 s, 3 s)
     residual: Array  #: (3 s,)
     body: Array  #: (s + 1, 8) body coordinates
-    forces: Array  #: (s, 8)
+    pairs: Array  #: (3, s, 8) force, the law's force (of clipped pairs too), rate of penetration at the nodes
+    wear_depth: Array  #: (s + 1, 8) at the start and at the nodes
     load: Array  #: (3,)
 
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.dense_output import evaluate, wear_depth_at
-from plow_twin.solve.events import first_event
+from plow_twin.solve.events import first_event, note_switches
 from plow_twin.solve.method.flight import take_off
-from plow_twin.solve.method.implicit import PATIENCE, STAGES, collocate, note_explicit
+from plow_twin.solve.method.implicit import STAGES, collocate, decay_rate, has_decayed, note_decay, stable_decay
 from plow_twin.solve.method.rest import settle
 from plow_twin.solve.method.step_size import accurate_step, before_sticking, time_to_separation
 from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
@@ -100,10 +100,11 @@ def lay_out_step(
         _note(state, step_size, step_size, 1, -1, 0, limited and step_size == span)
         return True
     if implicit is not None:
-        state.implicit_size_before, state.explicit_size_before = state.implicit_size, state.explicit_size
-        state.overdamped_before = state.overdamped
-    if implicit is not None and penetrating and state.overdamped >= PATIENCE:
-        step_size = collocate(p, parts, state, w, span, implicit)
+        state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
+        state.refused_before = state.refused
+        decay = decay_rate(p, state, w, slip) if penetrating else 0.0
+        if decay > 0.0 and state.touching == 0 and has_decayed(p, state):
+            step_size = collocate(p, parts, state, w, span, decay, implicit, ramp, wear)
     if step_size > 0.0:
         order, sigma = STAGES, step_size
     else:
@@ -134,8 +135,8 @@ def lay_out_step(
             return False
         if slip is not None:
             sigma = before_sticking(p, state, w, order, sigma)
-        if implicit is not None and penetrating:
-            note_explicit(p, state, w, state.alpha * sigma + 0.5 * state.beta * sigma * sigma, sigma < sigma_limit)
+        if implicit is not None and decay > 0.0 and state.beta == 0.0:
+            sigma = min(sigma, stable_decay(p.order) / decay)
     limited = limited and sigma == sigma_limit
     end, pair, target = first_event(
         p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp
@@ -145,8 +146,15 @@ def lay_out_step(
         state.recoveries += 1
         end, pair = max(end, min(sigma, 1e-9)), -1
         limited = limited and end == sigma
+    if pair >= 0:
+        note_switches(p, state, w, order, end, pair, target, penetrating, viscous, hysteretic, integer, fraction, ramp)
     limited = limited and pair < 0
     step_size = span if limited else state.alpha * end + 0.5 * state.beta * end * end
+    if implicit is not None:
+        note_decay(state, decay, step_size)
+        if pair >= 0:
+            # a long polynomial may bring a pair that only hovers at its wall back to it; a short one knows better
+            state.implicit_size = min(state.implicit_size, 4.0 * step_size)
     _note(state, end, step_size, order, pair, target, limited)
     return True
 
@@ -171,20 +179,29 @@ def complete_step(p, parts, state, w, totals, log, wear, fraction) -> None:
     at_once = state.step_start - before <= 1e-15 * (1.0 + abs(before))
     touching = state.touching if at_once else 0
     state.touching = 0
-    pair = state.event_pair
-    if pair < 0:
+    if state.event_pair < 0:
         state.events_at_once = 0
         return
     state.events_at_once = state.events_at_once + 1 if at_once else 0
-    old, new = state.mode[pair], state.event_mode
+    state.refused, state.decay_times = 0, 0.0
+    if fraction is not None:
+        state.touching = touching
+    for pair in range(8):
+        if w.switch[pair] >= 0:
+            _switch(p, state, pair, w.switch[pair], totals, log, fraction)
+
+
+@kernel()
+def _switch(p, state, pair, new, totals, log, fraction) -> None:
+    """Let a pair change its mode; note it."""
+    old = state.mode[pair]
     if new == CROSSING:
         state.beyond_ramp[pair] = 1 - state.beyond_ramp[pair]
         new = old
     state.mode[pair] = new
     state.events += 1
     if fraction is not None:
-        state.touching = touching & ~(1 << pair)
-    state.overdamped = 0
+        state.touching &= ~(1 << pair)
     if new == OFF:
         state.beyond_ramp[pair] = 0
     if old == OFF:

@@ -19,16 +19,22 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
 from plow_twin.model.contact import free_force
 from plow_twin.solve.dynamics import accelerate
-from plow_twin.solve.kinematics import penetration_of, rate_of, row_value, row_values, to_body, to_world
-from plow_twin.solve.state import COS, DAMPS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y
+from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
+from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y
 
 #: Stages: the polynomials' degree. The order is 2 s - 1.
 STAGES = 9
-#: Explicit steps in a row that were bound by stability before an implicit one is tried; how many of them it must be
-#: worth, for it costs as much.
-PATIENCE, _GAIN = 20, 100.0
-#: A step that covers so many decay times is bound by stability, not by what decays.
-_DECAY_TIMES = 4.0
+#: A contact is overdamped where its dampers act so many times faster than its springs; the same ratio decides when a
+#: scene is compiled whether it can need implicit steps.
+OVERDAMPED_RATIO = 20.0
+#: How many explicit steps, bound by stability, an implicit one must be worth: it costs as much.
+_WORTH = 30.0
+#: Share of the tolerance, in shares of a step of the series, that an implicit step may spend: it stands for many.
+_GAIN = 100.0
+#: What rounding leaves undetermined of a velocity, in shares of the largest: no step is refused for less.
+_NOISE = 1e-12
+#: Attempts that fail stop doubling the wait for the next one here.
+_MOST_REFUSED = 12
 
 
 def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
@@ -69,35 +75,67 @@ def new_implicit() -> Implicit:
     return Implicit(
         nodes, weights, from_values, from_stages,
         np.zeros((STAGES + 1, 6)), np.zeros((2, 6)), np.zeros((STAGES, 3)), np.zeros((STAGES, 2, 3, 3)),
-        np.zeros((size, size)), np.zeros(size), np.zeros((STAGES + 1, 8)), np.zeros((STAGES, 8)), np.zeros(3),
+        np.zeros((size, size)), np.zeros(size), np.zeros((STAGES + 1, 8)), np.zeros((3, STAGES, 8)),
+        np.zeros((STAGES + 1, 8)), np.zeros(3),
     )  # fmt: skip
 
 
 @kernel()
-def stiffest(p, state, w):
-    """Return the largest rate of decay in 1/s that a pair's damping gives alone."""
-    y, largest = state.y, 0.0
-    for pair in range(8):
-        if state.mode[pair] == ON:
-            damping = w.per_pair[DAMPS, pair]
-            if p.viscous == 0.0:
-                damping *= max(w.penetration[0, pair], 0.0) ** p.exponent
-            arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
-            largest = max(largest, damping * (p.inverse_mass + arm * arm * p.inverse_inertia))
-    return largest
+def decay_rate(p, state, w, slip) -> float:
+    """Return the sum of the rates in 1/s at which the pairs' dampers stop the head; 0 where their springs matter.
 
-
-@kernel()
-def note_explicit(p, state, w, length, free) -> None:
-    """Count explicit steps in a row that were bound by the stability of an overdamped contact.
-
-    `free`: nothing from outside has ended the step.
+    Friction that sticks is a damper too: its slope at the present slip.
     """
-    bound = free and length * stiffest(p, state, w) > _DECAY_TIMES
-    state.overdamped = state.overdamped + 1 if bound else min(state.overdamped, 0)
-    if bound and state.implicit_size < _GAIN * length:
-        state.implicit_size = 4.0 * _GAIN * length
-    state.explicit_size = length
+    y, decay, spring = state.y, 0.0, 0.0
+    c, s, om, x, yy, vx, vy = y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY]
+    for pair in range(8):
+        if state.mode[pair] != ON:
+            continue
+        depth, rate = max(penetration_of(p, state, pair, y), 0.0), rate_of(p, pair, y)
+        force = free_force(depth, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+        faster = free_force(depth, rate + 1.0, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+        slope = p.stiffness if p.exponent == 1.0 else p.exponent * p.stiffness * depth ** (p.exponent - 1.0)
+        arm = row_value(p.arm_rows, pair, c, s, x, yy)
+        mobility = p.inverse_mass + arm * arm * p.inverse_inertia
+        decay += (faster - force) * mobility
+        spring += slope * mobility
+        if slip is not None:
+            sticking = 1.0 - math.tanh(row_rate(p.slip_rows, pair, c, s, om, x, yy, vx, vy) / p.slip_speed) ** 2
+            arm = row_value(p.slip_arm_rows, pair, c, s, x, yy)
+            mobility = p.inverse_mass + arm * arm * p.inverse_inertia
+            decay += p.friction * max(force, 0.0) / p.slip_speed * sticking * mobility
+    return decay if decay > OVERDAMPED_RATIO * math.sqrt(spring) else 0.0
+
+
+@kernel(inline=True)
+def _admissible(p):
+    """Return the error of a velocity in m/s that an implicit step may make."""
+    return max(_GAIN * p.threshold[p.order], _NOISE * p.threshold[0])
+
+
+@kernel(inline=True)
+def stable_decay(order):
+    """Return over how many decay times a series of this order is stable, with a margin."""
+    return 0.3 * order
+
+
+@kernel(inline=True)
+def has_decayed(p, state) -> bool:
+    """Tell whether what a change of contact has set moving is gone, by the decay times that have passed since.
+
+    Each attempt that failed doubles the wait.
+    """
+    wait = 5.0 - math.log(p.velocity_tolerance / p.threshold[0])
+    return bool(state.decay_times >= wait * 2.0**state.refused)
+
+
+@kernel(inline=True)
+def note_decay(state, decay, length) -> None:
+    """Count the decay times that pass in a step."""
+    if decay > 0.0:
+        state.decay_times += decay * length
+    else:
+        state.decay_times, state.refused = 0.0, 0
 
 
 @kernel()
@@ -174,21 +212,59 @@ def _places(implicit, h) -> None:
 
 
 @kernel()
-def _solve(p, parts, state, t, h, implicit) -> bool:
+def _measure(p, state, implicit) -> None:
+    """Write force, law's force (also of clipped pairs) and rate of penetration of each pair at the nodes."""
+    z, pairs = implicit.z, implicit.pairs
+    for i in range(implicit.nodes.size):
+        y = implicit.body[i + 1]
+        to_body(z[i + 1], y)
+        for pair in range(8):
+            r = rate_of(p, pair, y)
+            pairs[0, i, pair], pairs[1, i, pair], pairs[2, i, pair] = 0.0, 0.0, r
+            if state.mode[pair] == ON or state.mode[pair] == CLIPPED:
+                d = penetration_of(p, state, pair, y) + (state.wear_depth[pair] - implicit.wear_depth[i + 1, pair])
+                force = free_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+                pairs[1, i, pair] = force
+                pairs[0, i, pair] = force if state.mode[pair] == ON else 0.0
+
+
+@kernel()
+def _wear_at_nodes(p, state, h, implicit) -> float:
+    """Write each pad's wear depth at the nodes from the forces there; return the largest change in m."""
+    worn, a, s, change = implicit.wear_depth, implicit.weights, implicit.nodes.size, 0.0
+    _measure(p, state, implicit)
+    for i in range(s):
+        for pair in range(8):
+            value = worn[0, pair]
+            for j in range(s):
+                value += h * a[i, j] * p.wear_per_impulse[pair] * max(implicit.pairs[0, j, pair], 0.0)
+            change = max(change, abs(value - worn[i + 1, pair]))
+            worn[i + 1, pair] = value
+    return change
+
+
+@kernel()
+def _solve(p, parts, state, t, h, implicit, wear) -> bool:
     """Find the velocities at the nodes by Newton's method; return whether it converged.
 
-    The derivatives are taken at every node: as the head turns, so does the direction that is damped.
+    The derivatives are taken at every node: as the head turns, so does the direction that is damped. Down to rounding:
+    a strong damper turns a small error of a velocity into a large one of its force. Wear, which is slow, follows from
+    the iterate before.
     """
     z, s, a, residual = implicit.z, implicit.nodes.size, implicit.weights, implicit.residual
     for i in range(s):
         for c in range(3):
             z[i + 1, 3 + c] = z[0, 3 + c]
     before = np.inf
-    for _ in range(10):
+    for _ in range(15):
         _places(implicit, h)
         for i in range(s):
             at = t + h * implicit.nodes[i]
+            if wear is not None:
+                set_row(state.wear_depth, 0, row(implicit.wear_depth, i + 1))
             _jacobian(p, parts, state, at, z[i + 1], implicit, implicit.accelerations[i], implicit.jacobians[i])
+            if wear is not None:
+                set_row(state.wear_depth, 0, row(implicit.wear_depth, 0))
         _newton_matrix(implicit, h)
         for i in range(s):
             for c in range(3):
@@ -205,8 +281,11 @@ def _solve(p, parts, state, t, h, implicit) -> bool:
         if not math.isfinite(change):
             return False
         state.evaluations += 7 * s
-        # quadratic: a small change, or one that rounding keeps from falling further, is the last
-        if change < 1e-3 * p.threshold[p.order] or (change < p.velocity_tolerance and change > 0.1 * before):
+        if wear is not None:
+            _places(implicit, h)
+            change += _wear_at_nodes(p, state, h, implicit) * p.velocity_tolerance / p.position_tolerance
+        # quadratic: one that rounding keeps from falling further is the last
+        if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True
         before = change
@@ -215,71 +294,115 @@ def _solve(p, parts, state, t, h, implicit) -> bool:
 
 @kernel()
 def _interpolate(values, coefficients, h, out) -> None:
-    """Write the series of the polynomials of a step of length h that take eight values at each node."""
-    scale = 1.0
-    for k in range(len(coefficients)):
+    """Write the series of the polynomials of a step of length h that take eight values at each node.
+
+    Of the differences to the last value: the coefficients are large, and cancel what is common only to rounding.
+    """
+    scale, n = 1.0, len(coefficients)
+    last = row(values, n - 1)
+    for k in range(n):
         value = splat(0.0)
-        for i in range(len(coefficients)):
-            value = value + row(values, i) * coefficients[k, i]
-        set_row(out, k, value * scale)
+        for i in range(n - 1):
+            value = value + (row(values, i) - last) * coefficients[k, i]
+        value = value * scale
+        set_row(out, k, value + last if k == 0 else value)
         scale /= h
 
 
 @kernel()
-def _write_series(p, state, h, w, implicit) -> float:
-    """Write the collocation polynomial of state, penetration, rate and force as series; return its last term's size."""
-    s, body, forces = implicit.nodes.size, implicit.body, implicit.forces
-    for i in range(s + 1):
-        to_body(implicit.z[i], body[i])
+def _write_series(p, state, h, w, implicit, ramp, wear) -> float:
+    """Write the collocation polynomial of state, penetration, rate and force as series; return its last term's size.
+
+    Velocities and forces are those at the nodes, not at the start: what a damper has not yet stopped there, and stops
+    at once, would bend the polynomials between the nodes. The size is infinite where that is more than may be left out.
+    """
+    s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
+    to_body(implicit.z[0], body[0])
+    _measure(p, state, implicit)
     _interpolate(body, implicit.from_values, h, w.series)
+    _interpolate(body[1:], implicit.from_stages, h, scratch)
+    for i in (VX, VY, OMEGA):
+        for k in range(s):
+            w.series[k, i] = scratch[k, i]
+        w.series[s, i] = 0.0
+    _interpolate(pairs[0], implicit.from_stages, h, w.force)
+    _interpolate(pairs[2], implicit.from_stages, h, w.rate)
     for k in range(s + 1):
         y = w.series[k]
         penetration = row_values(p.penetration_rows, y[COS], y[SIN], y[X], y[Y])
         if k == 0:
             penetration = penetration + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
-        else:
-            set_row(w.rate, k - 1, penetration * k)
+        elif wear is not None:
+            worn = row(w.force, k - 1) * row(p.wear_per_impulse, 0) * (1.0 / k)
+            set_row(w.wear, k, worn)
+            penetration = penetration - worn
         set_row(w.penetration, k, penetration)
-    for i in range(s):
-        y = body[i + 1]
-        for pair in range(8):
-            forces[i, pair] = 0.0
-            if state.mode[pair] == ON:
-                d = penetration_of(p, state, pair, y)
-                r = rate_of(p, pair, y)
-                forces[i, pair] = free_force(
-                    d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp
-                )
-    _interpolate(forces, implicit.from_stages, h, w.force)
-    last = w.series[s]
-    size = abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA])
-    size += p.velocity_tolerance / p.position_tolerance * (abs(last[X]) + abs(last[Y]) + p.radius * abs(last[THETA]))
+    size = 0.0
+    if ramp is not None:
+        size = _write_ramp(p, h, w, implicit)
+    off = abs(w.series[0, VX] - body[0, VX]) + abs(w.series[0, VY] - body[0, VY])
+    off += p.radius * abs(w.series[0, OMEGA] - body[0, OMEGA])
+    if not off <= _admissible(p):
+        return np.inf
+    last, place = w.series[s - 1], w.series[s]
+    size += 4.0 * (abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA]))
+    scale = p.velocity_tolerance / p.position_tolerance * h
+    size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA]))
     # its share on [0, h] that polynomials of lower degree cannot take over
-    return size * h**s * 2.0 ** (1 - 2 * s)
+    return size * h ** (s - 1) * 2.0 ** (1 - 2 * s)
 
 
 @kernel()
-def collocate(p, parts, state, w, span, implicit) -> float:
-    """Lay out an implicit step as series of order `STAGES`; return its length, or 0 when an explicit one is better."""
-    least = _GAIN * state.explicit_size
-    h = min(max(state.implicit_size, 2.0 * least), span)
+def _write_ramp(p, h, w, implicit) -> float:
+    """Write the law's force as K times the elastic part, of which only d^1 has a series here, and C times the rest.
+
+    Return the last term's size, as a velocity per h^(STAGES - 1): that of a clipped pair moves nothing, but tells when
+    it pushes again.
+    """
+    s, largest = implicit.nodes.size, 0.0
+    _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)
+    linear = p.exponent == 1.0
+    for pair in range(8):
+        largest = max(largest, abs(w.damped[s - 1, pair]))
+    for k in range(s):
+        rest = row(w.damped, k)
+        if linear:
+            rest = rest - row(w.penetration, k) * p.stiffness
+        set_row(w.damped, k, rest * (1.0 / p.viscous))
+        for i in range(4):
+            set_row(w.power[i], k, splat(0.0))
+    return largest * p.inverse_mass * h
+
+
+@kernel()
+def collocate(p, parts, state, w, span, decay, implicit, ramp, wear) -> float:
+    """Lay out an implicit step as series of order `STAGES`; return its length, or 0 when explicit ones are better.
+
+    `decay` is the `decay_rate`.
+    """
+    least = _WORTH * stable_decay(p.order) / decay
+    if span < least:
+        return 0.0
+    h = min(max(state.implicit_size, 10.0 * least), span)
     to_world(state.y, implicit.z[0])
-    # one that stands for so many explicit steps may spend their shares; much of it is a layer at the start that decays
-    admissible = _GAIN * p.threshold[p.order]
+    admissible = _admissible(p)
     while h >= least:
-        if _solve(p, parts, state, state.step_start, h, implicit):
-            size = _write_series(p, state, h, w, implicit)
-            better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / STAGES)
+        for i in range(implicit.nodes.size + 1):
+            set_row(implicit.wear_depth, i, row(state.wear_depth, 0))
+        if _solve(p, parts, state, state.step_start, h, implicit, wear):
+            size = _write_series(p, state, h, w, implicit, ramp, wear)
+            better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
                 # a step cut short by a sample says nothing against a longer one
                 longer = h * min(better, 4.0)
                 state.implicit_size = max(longer, state.implicit_size) if h == span else longer
                 state.implicit_steps += 1
+                state.refused = 0
                 return h
             h *= min(max(better, 0.1), 0.7)
         else:
             h *= 0.25
     state.implicit_size = 0.0
-    # not soon again: an attempt costs as much as a hundred explicit steps
-    state.overdamped = -500
+    state.decay_times = 0.0
+    state.refused = min(state.refused + 1, _MOST_REFUSED)
     return 0.0
