@@ -12,7 +12,6 @@ from plow_twin.solve.fixed_step import end_coarsely
 from plow_twin.solve.kinematics import pose_of
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.method.rest import write_rest
-from plow_twin.solve.method.taylor import one_by_one
 from plow_twin.solve.modes import within_range
 from plow_twin.solve.state import STATE, Status
 from plow_twin.solve.step import complete_step, lay_out_step
@@ -20,12 +19,6 @@ from plow_twin.solve.totals import add_to_totals
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
-
-
-@kernel(inline=True)
-def _lay_out(p, parts, state, w, stop_time) -> bool:
-    terms = one_by_one(parts.terms)
-    return lay_out_step(p, parts, state, w, stop_time, *terms, parts.implicit, parts.terms.flight, parts.terms.rest)
 
 
 @kernel(inline=True)
@@ -43,7 +36,7 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
         return _BUDGET
     if not within_range(p, state, state.y):
         return _RANGE
-    return _OK if _lay_out(p, parts, state, w, stop_time) else _NON_FINITE
+    return _OK if lay_out_step(p, parts, state, w, stop_time) else _NON_FINITE
 
 
 @kernel()
@@ -249,7 +242,7 @@ def lay_out_again(p, parts, state, w) -> None:
         state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots
     recoveries, implicit_steps = state.recoveries, state.implicit_steps
-    _lay_out(p, parts, state, w, np.inf)
+    lay_out_step(p, parts, state, w, np.inf)
     state.steps, state.evaluations, state.guard_roots = steps, evaluations, guard_roots
     state.recoveries, state.implicit_steps = recoveries, implicit_steps
     state.elapsed = used

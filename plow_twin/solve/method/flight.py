@@ -72,8 +72,20 @@ def _reach(p, w, time, leverage) -> float:
 
 
 @kernel()
-def take_off(p, harmonics, state, w, span) -> float:
-    """Lay out a step of free flight of at most `span`; return its length, or 0 where a series serves as well."""
+def lay_out(p, parts, flight, state, w, span, penetrating) -> bool:
+    """Lay out a step of free flight, where it is longer than one of a series."""
+    if flight is None:
+        return False
+    size = 0.0 if penetrating else _safe_time(p, parts.harmonics, state, w, span)
+    state.in_flight = 1 if size > 0.0 else 0
+    state.sigma_end, state.order = size, 1
+    state.ends_at_stop = 1 if size == span else 0
+    return size > 0.0
+
+
+@kernel()
+def _safe_time(p, harmonics, state, w, span) -> float:
+    """Return a time of at most `span` within which no wall can be reached, or 0 where a series serves as well."""
     least = _LEAST_PHASE / p.fastest
     if span < least:
         return 0.0

@@ -375,7 +375,41 @@ def _write_ramp(p, h, w, implicit) -> float:
 
 
 @kernel()
-def collocate(p, parts, state, w, span, decay, implicit, ramp, wear) -> float:
+def lay_out(p, parts, implicit, ramp, wear, slip, state, w, span, penetrating) -> bool:
+    """Lay out an implicit step, where damping is what bounds explicit ones; `w.decay[0]` keeps its rate of decay."""
+    if implicit is None:
+        return False
+    state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
+    state.refused_before = state.refused
+    w.decay[0] = decay_rate(p, state, w, slip) if penetrating else 0.0
+    if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
+        return False
+    size = _collocate(p, parts, state, w, span, w.decay[0], implicit, ramp, wear)
+    state.sigma_end, state.order = size, STAGES
+    state.ends_at_stop = 1 if size == span else 0
+    return size > 0.0
+
+
+@kernel(inline=True)
+def at_most_stable(p, implicit, state, w, sigma):
+    """Return the part of `sigma` over which an explicit step is stable."""
+    if implicit is not None and w.decay[0] > 0.0 and state.beta == 0.0:
+        sigma = min(sigma, stable_decay(p.order) / w.decay[0])
+    return sigma
+
+
+@kernel()
+def note_step(implicit, state, w, step_size, has_event) -> None:
+    """Note how a step that has been laid out bears on the next implicit one."""
+    if implicit is not None:
+        note_decay(state, w.decay[0], step_size)
+        if has_event:
+            # a long polynomial may bring a pair that only hovers at its wall back to it; a short one knows better
+            state.implicit_size = min(state.implicit_size, 4.0 * step_size)
+
+
+@kernel()
+def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear) -> float:
     """Lay out an implicit step as series of order `STAGES`; return its length, or 0 when explicit ones are better.
 
     `decay` is the `decay_rate`.

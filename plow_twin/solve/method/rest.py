@@ -128,13 +128,26 @@ def _still_as_before(p, parts, state, w) -> bool:
 
 
 @kernel()
-def settle(p, parts, state, w) -> bool:
-    """Write the series of a step of rest to `w` where the head is at rest, the load constant; return whether it is."""
+def lay_out(p, parts, rest, state, w, span, penetrating) -> bool:
+    """Lay out a step of rest where the head is at rest and its load constant."""
+    if rest is None:
+        return False
+    steady = penetrating and w.wrench[1, 0] == 0.0 and w.wrench[1, 1] == 0.0 and w.wrench[1, 2] == 0.0
+    state.at_rest = 1 if steady and _settle(p, parts, state, w) else 0
+    if state.at_rest == 0:
+        return False
+    write_rest(p, state, w)
+    state.sigma_end, state.order, state.ends_at_stop = span, 1, 1
+    return True
+
+
+@kernel()
+def _settle(p, parts, state, w) -> bool:
+    """Bring the head to rest where it is found at rest; tell whether it is."""
     if not (state.at_rest == 1 and _still_as_before(p, parts, state, w)):
         if not _still(p, parts, state, w):
             return False
         to_body(w.rest[0], state.y)
-    write_rest(p, state, w)
     return True
 
 

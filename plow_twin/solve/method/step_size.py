@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.solve.method.taylor import expand, expand_harmonics, one_by_one
+from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import ON
 

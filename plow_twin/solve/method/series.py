@@ -1,0 +1,366 @@
+"""Taylor series of the motion with the contact modes frozen.
+
+With the state in body coordinates (`model.geometry`) the equations of motion (paper, eq. 5) are polynomial:
+
+    X'  = VX + omega Y            VX' =  omega VY + c (Fx/m) + s (Fy/m) + sum n_x F/m
+    Y'  = VY - omega X            VY' = -omega VX - s (Fx/m) + c (Fy/m) + sum n_y F/m
+    c'  = -omega s    s' = omega c    theta' = omega    omega' = M/I + sum arm F/I
+
+so each order of the series follows from the lower ones by Cauchy products (Jorba and Zou, Exp. Math. 14 (2005) 99).
+Time runs as t = alpha sigma + beta sigma^2 / 2. With (1, 0) sigma is time; with (0, 2) the root-like start of a contact
+force with exponent 1.5 becomes analytic.
+"""
+
+from __future__ import annotations
+
+import math
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import lane, magnitude, pack, permutation, row, set_row, splat, spread_total, total
+from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
+from plow_twin.solve.kinematics import row_values
+from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
+
+#: A term has vanished where it is below this share of what the last order may have.
+_VANISHED = 0.4
+#: Factors of omega (S1 in lanes 4 and 7) in the rates of the state's components, and of the rates that are components.
+_turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
+_rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
+
+
+@kernel(fast=True)
+def expand_harmonics(harmonics, second, t, alpha, beta, order, w) -> None:
+    """Write the series of S1, S2 and M to `w.load`.
+
+    sin and cos along t(sigma) follow from one another:  (k+1) sin_{k+1} = omega (alpha cos_k + beta cos_{k-1}).
+    """
+    load = w.load
+    for k in range(order + 1):
+        load[0, k] = load[1, k] = load[2, k] = 0.0
+    for i in range(harmonics.size):
+        one = harmonics[i]
+        omega = one.omega
+        sine, cosine = math.sin(omega * t), math.cos(omega * t)
+        sine_before, cosine_before = 0.0, 0.0
+        f0, f1, m0, m1 = one.first[0], one.first[1], one.moment[0], one.moment[1]
+        for k in range(order + 1):
+            load[0, k] += f0 * sine + f1 * cosine
+            load[2, k] += m0 * sine + m1 * cosine
+            if second is not None:
+                load[1, k] += one.second[0] * sine + one.second[1] * cosine
+            scale = omega * w.inverse[k + 1]
+            new_sine = scale * (alpha * cosine + beta * cosine_before)
+            new_cosine = -scale * (alpha * sine + beta * sine_before)
+            sine_before, cosine_before = sine, cosine
+            sine, cosine = new_sine, new_cosine
+
+
+@kernel(fast=True)
+def _multiply_older(a, b, k):
+    """Return order k of the eight products of the columns of a and b, without the two terms of order k itself.
+
+    The oldest orders come first: most of the sum need not wait for the newest one.
+    """
+    low, high = splat(0.0), splat(0.0)
+    half = k // 2
+    if k == 2 * half and k > 0:
+        low = row(a, half) * row(b, half)
+        half -= 1
+    for j in range(half, 0, -1):
+        low = low + row(a, j) * row(b, k - j)
+        high = high + row(a, k - j) * row(b, j)
+    return low + high
+
+
+@kernel(fast=True)
+def _join(a, b, k, a_k, b_k):
+    """Return order k of the eight products of the columns of a and b; a_k and b_k are their rows k.
+
+    What has just been written is taken as a value: read back, it would be waited for.
+    """
+    if k == 0:
+        return a_k * b_k
+    return _multiply_older(a, b, k) + (row(a, 0) * b_k + a_k * row(b, 0))
+
+
+@kernel(fast=True)
+def _multiply(a, b, k):
+    """Return order k of the eight products of the columns of a and b."""
+    return _join(a, b, k, row(a, k), row(b, k))
+
+
+@kernel(fast=True, inline=True)
+def _raise(w, k, penetration, touching, exponent):
+    """Write order k of penetration^exponent of the pairs that act to `w.power[0]`, and return it.
+
+    Row BASE of `w.per_pair` is 1 / d, for the exponent 1.5 half its root; it is zero for the other pairs.
+    """
+    if exponent == 1.5:
+        # d^1.5 as d times its root: less work than the recurrence for any power
+        if k == 0:
+            for pair in range(8):
+                w.power[1, 0, pair] = math.sqrt(w.penetration[0, pair]) if w.per_pair[BASE, pair] != 0.0 else 0.0
+            root = row(w.power[1], 0)
+        else:
+            root = root_terms(penetration, w.power[1], k) * row(w.per_pair, BASE)
+            set_row(w.power[1], k, root)
+        power = _join(w.penetration, w.power[1], k, penetration, root)
+    elif k == 0:
+        for pair in range(8):
+            w.power[0, 0, pair] = w.penetration[0, pair] ** exponent if w.per_pair[BASE, pair] != 0.0 else 0.0
+        power = row(w.power[0], 0)
+    else:
+        power = power_terms(w.penetration, w.power[0], k, exponent) * row(w.per_pair, BASE)
+    set_row(w.power[0], k, power)
+    if touching != 0:
+        for pair in range(8):
+            if touching >> pair & 1:
+                w.power[0, k, pair] = power_term(w.penetration, w.power[0], pair, k, exponent, 2)
+        power = row(w.power[0], k)
+    return power
+
+
+@kernel(fast=True, inline=True)
+def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
+    """Return order k of the force from that of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
+    force = row(w.per_pair, ACTS) * elastic_k
+    if ramp is not None:
+        _ramp(p, w, k)
+        set_row(w.damped, k, _multiply(w.ramp[2], w.rate, k))
+        return force + row(w.per_pair, DAMPS) * row(w.damped, k)
+    if viscous is not None:
+        return force + row(w.per_pair, DAMPS) * rate
+    return force if hysteretic is None else force + row(w.per_pair, DAMPS) * _join(elastic, w.rate, k, elastic_k, rate)
+
+
+@kernel(fast=True, inline=True)
+def _ramp(p, w, k) -> None:
+    """Write order k of the share of C that acts to `w.ramp[2]`: constant for pairs beyond the ramp."""
+    set_row(w.ramp[0], k, _multiply(w.penetration, w.penetration, k))
+    set_row(w.ramp[1], k, _multiply(w.ramp[0], w.penetration, k))
+    within = row(w.per_pair, RAMPS)
+    share = ramp_terms(w.ramp[0], w.ramp[1], k, p.ramp) * within
+    if k == 0:
+        share = share + (within * -1.0 + 1.0)
+    set_row(w.ramp[2], k, share)
+
+
+@kernel(fast=True, inline=True)
+def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fraction, ramp):
+    """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
+
+    Row ACTS of `w.per_pair` is K for pairs that act, row DAMPS is C or K lambda; both are zero for the others.
+    """
+    if integer is not None:
+        set_row(w.power[0], k, _multiply(w.penetration, w.penetration, k))
+        degree = int(p.exponent)
+        for i in range(1, degree - 1):
+            set_row(w.power[i], k, _multiply(w.power[i - 1], w.penetration, k))
+        elastic = w.power[degree - 2]
+        return _damp(p, elastic, w, k, row(elastic, k), rate, viscous, hysteretic, ramp)
+    if fraction is not None:
+        power = _raise(w, k, penetration, state.touching, p.exponent)
+        return _damp(p, w.power[0], w, k, power, rate, viscous, hysteretic, ramp)
+    return _damp(p, w.penetration, w, k, penetration, rate, viscous, hysteretic, ramp)
+
+
+@kernel(fast=True)
+def _hold(p, w, k, fx, fy):
+    """Return order k of the force per mass in head axes without what acts along a locked world axis."""
+    w.world[0, k], w.world[1, k] = fx, fy
+    right, world = w.right, w.world
+    along_x = along_y = 0.0
+    for j in range(k + 1):
+        along_x += right[k - j, 4] * world[0, j] - right[k - j, 5] * world[1, j]
+        along_y += right[k - j, 5] * world[0, j] + right[k - j, 4] * world[1, j]
+    world[2, k], world[3, k] = p.free[0] * along_x, p.free[1] * along_y
+    fx = fy = 0.0
+    for j in range(k + 1):
+        fx += right[k - j, 4] * world[2, j] + right[k - j, 5] * world[3, j]
+        fy += right[k - j, 4] * world[3, j] - right[k - j, 5] * world[2, j]
+    return fx, fy
+
+
+@kernel(fast=True)
+def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments):
+    """Return order k of the load per mass, turned into head axes, and of its moment per inertia.
+
+    c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before; `product` has S1 c and S1 s.
+    """
+    load, right, start, slope = w.load, w.right, w.wrench[0], w.wrench[1]
+    fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
+    moment = start[2] if k == 0 else 0.0
+    if segments is not None:
+        # wrench start + slope t(sigma): its own series has the terms alpha slope and beta slope / 2
+        fx += alpha * (slope[0] * c1 + slope[1] * s1) + 0.5 * beta * (slope[0] * c2 + slope[1] * s2)
+        fy += alpha * (slope[1] * c1 - slope[0] * s1) + 0.5 * beta * (slope[1] * c2 - slope[0] * s2)
+        if k == 1:
+            moment += alpha * slope[2]
+        elif k == 2:
+            moment += 0.5 * beta * slope[2]
+    if harmonics is not None:
+        along_c, along_s = lane(product, 4), lane(product, 7)
+        fx += p.direction[0, 0] * along_c + p.direction[0, 1] * along_s
+        fy += p.direction[0, 1] * along_c - p.direction[0, 0] * along_s
+        moment += load[2, k]
+        if second is not None:
+            along_c = along_s = 0.0
+            for j in range(k + 1):
+                along_c += load[1, j] * right[k - j, 6]
+                along_s += load[1, j] * right[k - j, 7]
+            fx += p.direction[1, 0] * along_c + p.direction[1, 1] * along_s
+            fy += p.direction[1, 1] * along_c - p.direction[1, 0] * along_s
+    return fx, fy, moment
+
+
+@kernel(fast=True, inline=True)
+def _applied(p, along_x, along_y, torque):
+    """Return the accelerations that forces in head axes and moments of the pairs give, in the lanes of the rates."""
+    mass, inertia = p.inverse_mass, p.inverse_inertia
+    pushed = spread_total(along_x) * pack(0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0, 0.0)
+    pushed = pushed + spread_total(along_y) * pack(0.0, 0.0, 0.0, mass, 0.0, 0.0, 0.0, 0.0)
+    return pushed + spread_total(torque) * pack(0.0, 0.0, 0.0, 0.0, inertia, 0.0, 0.0, 0.0)
+
+
+@kernel(fast=True)
+def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
+    """Return order k of what the friction forces give (`_applied`, `model.friction`).
+
+    With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
+    """
+    weighted, tau, rest, drag, arm = w.slip[1], w.slip[2], w.slip[3], w.slip[4], w.slip[5]
+    rate = row_values(p.slip_rows, dc, ds, dx, dy) * (1.0 / p.slip_speed)
+    set_row(w.slip[0], k, rate)
+    set_row(arm, k, row_values(p.slip_arm_rows, c, s, x, y))
+    if k == 0:
+        for pair in range(8):
+            tau[0, pair] = math.tanh(lane(rate, pair))
+        set_row(rest, 0, row(tau, 0) * row(tau, 0) * -1.0 + 1.0)
+        set_row(weighted, 0, splat(0.0))
+    else:
+        set_row(weighted, k, rate * k)
+        older = _multiply_older(weighted, rest, k) + row(weighted, k) * row(rest, 0)
+        set_row(tau, k, older * w.inverse[k])
+        set_row(rest, k, _multiply(tau, tau, k) * -1.0)
+    force = _multiply(w.force, tau, k) * p.friction
+    set_row(drag, k, force)
+    # t is the wall's normal turned by +90 degrees, the gap's rows for X and Y are minus the normals
+    return _applied(
+        p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
+    )
+
+
+@kernel(fast=True)
+def _wear(p, w, k, alpha, beta) -> None:
+    """Write order k + 1 of the growth of each pad's penetration:  dh/dt = k_s F v / A (Archard)."""
+    growth = row(w.force, k) * alpha
+    if k > 0:
+        growth = growth + row(w.force, k - 1) * beta
+    set_row(w.wear, k + 1, growth * row(p.wear_per_impulse, 0) * w.inverse[k + 1])
+
+
+@kernel(inline=True)
+def one_by_one(terms):
+    """Return the terms as a plain tuple, to be passed on with a star."""
+    return (
+        terms.harmonics, terms.second, terms.segments, terms.viscous, terms.hysteretic, terms.integer, terms.fraction,
+        terms.ramp, terms.wear, terms.offset, terms.free, terms.slip,
+    )  # fmt: skip
+
+
+@kernel(fast=True)
+def expand(
+    p,
+    state,
+    w,
+    limit,
+    penetrating,
+    sigma_limit,
+    harmonics,
+    second,
+    segments,
+    viscous,
+    hysteretic,
+    integer,
+    fraction,
+    ramp,
+    wear,
+    offset,
+    free,
+    slip,
+):
+    """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
+
+    Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. Orders whose terms vanish
+    at `sigma_limit`, the longest sigma of interest, are not computed.
+    """
+    alpha, beta = state.alpha, state.beta
+    left, right, load, inverse = w.left, w.right, w.load, w.inverse
+    here, before, closing, penetration = row(state.y, 0), splat(0.0), splat(0.0), splat(0.0)
+    c1 = s1 = c2 = s2 = 0.0
+    small, quiet, reach, order = _VANISHED * p.threshold[p.order], 0, 1.0, limit
+    for k in range(order + 1):
+        set_row(w.series, k, here)
+        x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
+        om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
+        if k == 0:
+            penetration = (
+                row_values(p.penetration_rows, c, s, x, yy) + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
+            )
+        else:
+            if not penetrating:
+                penetration = row_values(p.penetration_rows, c, s, x, yy)
+            size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
+            if wear is not None and penetrating:
+                penetration = penetration - row(w.wear, k)
+                size += p.weight / p.radius * total(magnitude(row(w.wear, k)))
+            w.term_size[k] = size
+            reach *= sigma_limit
+            quiet = quiet + 1 if size * reach < small else 0
+            if quiet == p.lacuna and k >= 4:
+                order = k
+        set_row(w.penetration, k, penetration)
+        if k == order:
+            break
+        s1_k = 0.0 if harmonics is None else load[0, k]
+        turned, turning_by = _turned(here), pack(om, om, om, om, s1_k, om, om, s1_k)
+        set_row(right, k, turned)
+        set_row(left, k, turning_by)
+        product = _join(left, right, k, turning_by, turned)
+        turning = product * pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
+        turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments)
+        if offset is not None:
+            # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
+            across = p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)
+            moment -= across * p.inverse_inertia / p.inverse_mass
+        applied = pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
+        steady, bent = alpha * inverse[k + 1], beta * inverse[k + 1]
+        if penetrating:
+            dx, dy, dc, ds = lane(turning, X), lane(turning, Y), lane(turning, COS), lane(turning, SIN)
+            rate = row_values(p.penetration_rows, dc, ds, dx, dy)
+            set_row(w.rate, k, rate)
+            arm = row_values(p.arm_rows, c, s, x, yy)
+            set_row(w.arm, k, arm)
+            force = _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fraction, ramp)
+            set_row(w.force, k, force)
+            # the rows for X and Y are minus the walls' inward normals
+            torque = _join(w.arm, w.force, k, arm, force)
+            applied = applied + _applied(
+                p, row(p.penetration_rows, 2) * force * -1.0, row(p.penetration_rows, 3) * force * -1.0, torque
+            )
+            if slip is not None:
+                applied = applied + _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
+            if wear is not None:
+                _wear(p, w, k, alpha, beta)
+            # of the next order, and sooner there than the state, which waits for the forces
+            penetration = rate * steady + closing * bent
+            closing = rate
+        if free is not None:
+            fx, fy = _hold(p, w, k, lane(applied, VX), lane(applied, VY))
+            applied = pack(0.0, 0.0, fx, fy, lane(applied, OMEGA) * p.free[2], 0.0, 0.0, 0.0)
+        c2, s2, c1, s1 = c1, s1, c, s
+        rates = turning + applied
+        here = rates * steady + before * bent
+        before = rates
+    return order
