@@ -48,7 +48,7 @@ LIBRARIES = {
     "run": set(),
     "scene_file": {"yaml", "jsonschema"},
     "record": {"mcap", "rosbags", "ruamel", "numba", "llvmlite", "lz4", "zstandard", "isal", "yaml"},
-    "view": {"rerun"},
+    "view": {"rerun", "matplotlib"},
     "study": {
         "scipy",
         "yaml",

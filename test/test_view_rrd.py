@@ -21,6 +21,7 @@ from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Travel
 from plow_twin.view import ViewSummary, to_rrd
+from plow_twin.view.columns import extremes
 from plow_twin.view.section import ARROW_MM_PER_N, Section
 
 COUNT = 1500
@@ -148,6 +149,45 @@ def test_only_changes_of_the_travel_speed_are_events(tmp_path: Path) -> None:
     lines = [text[0] for text in read(tmp_path / "run.rrd")["/events"]["TextLog:text"].to_pylist()]
     expected = [f"travel along the face at {speed} m/s" for speed in ("1.5", "0", "1.5")]
     assert [line for line in lines if "travel" in line] == expected
+
+
+def test_a_long_run_is_thinned_without_losing_a_peak(run: Run, tmp_path: Path) -> None:
+    thin = to_rrd(run.file, tmp_path / "thin.rrd", most_rows=200)
+    sent = [m for topic, m in run.outputs if topic == "/contact_peaks" and isinstance(m, JointState)]
+    efforts = np.array([message.effort for message in sent])
+    tables = read(thin.path)
+    for pair, name in enumerate(PAIR_NAMES):
+        values = scalars(tables[f"/force/{name}"])
+        assert len(values) <= 600 < COUNT and values.max() == efforts[:, pair].max() / 1e3
+    assert thin.section_rows < COUNT // 10
+
+
+def test_places_of_extremes_are_kept_in_order() -> None:
+    spans, values = np.array([0, 0, 0, 1, 1, 2]), np.array([1.0, 5.0, -2.0, 3.0, 3.0, 7.0])
+    assert extremes(spans, values).tolist() == [1, 2, 3, 5]
+
+
+def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
+    section = Section.of(load_scene(scene_path("paper")))
+    gaps = np.array([-0.01, -0.02, -0.01, -0.03, -0.005, -0.03, -0.005, 0.001])
+    walls, touching = section.exaggerated(gaps, 2.0)
+    top, right, bottom, left = walls
+    np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))  # 10 mm, twice as wide, y down
+    np.testing.assert_allclose(right[:, 0], 165.0 + 60.0)
+    np.testing.assert_allclose(bottom[:, 1], 135.0 + 10.0)
+    np.testing.assert_allclose(sorted(left[:, 0]), [-165.0 - 40.0, -165.0 + 2.0])
+    assert touching.tolist() == [False, False, False, True]
+
+
+def test_a_picture_needs_no_viewer(run: Run, tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.modules['rerun'] = None\n"
+        "from plow_twin.cli import main; main(['view', sys.argv[1], '--png', sys.argv[2], '--quiet'])"
+    )
+    command = [sys.executable, "-c", code, str(run.folder), str(tmp_path / "run.png")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG" and (tmp_path / "run.png").stat().st_size > 50_000
 
 
 def test_progress_runs_from_the_first_record_to_the_whole(run: Run, tmp_path: Path) -> None:

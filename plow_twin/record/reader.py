@@ -31,6 +31,8 @@ from plow_twin.stream.journal import Entry, Sample
 _PENDING: Final = 65_536
 #: A batch is made when so many entries, or the eighth part of so many chunks, have come: their cost is shared.
 _LEAST: Final = 4096
+#: Size of a recording of all outputs at 1 kHz for each second [B].
+_BYTES_PER_S: Final = 400_000
 _HALF, _WHOLE = 2**31, 2**32
 
 
@@ -226,6 +228,24 @@ class RunReader:
             self.status = FileStatus.DAMAGED
         else:
             self.status = FileStatus.COMPLETE if self.stop_reason is None else FileStatus.STOPPED_EARLY
+
+    def duration_s(self) -> float:
+        """Return the span of the receive times [s] by the index of the parts; a guess by their size without one."""
+        from mcap.reader import make_reader
+
+        first, last, size = [], [], 0
+        for part in self.parts:
+            size += part.stat().st_size
+            try:
+                with part.open("rb") as stream:
+                    summary = make_reader(stream).get_summary()
+            except Exception:  # cut off
+                continue
+            if summary is not None and summary.statistics is not None and summary.statistics.message_count:
+                first.append(summary.statistics.message_start_time)
+                last.append(summary.statistics.message_end_time)
+        known = first and len(first) == len(self.parts)
+        return float(max(last) - min(first)) * 1e-9 if known else size / _BYTES_PER_S
 
     def _metadata(self, name: str, record: dict[str, str]) -> None:
         if name != LOSS_RECORD:

@@ -13,14 +13,17 @@ from numpy.typing import NDArray
 BLOCK_ROWS: Final = 20_000
 ROS_TIME: Final = "ros_time"
 STEP: Final = "step"
+#: Time since the first stamp.
+RUN_TIME: Final = "run_time"
 
 
 class TimeAxis:
-    """The two timelines of a block of rows."""
+    """The timelines of a block of rows."""
 
     def __init__(self) -> None:
         self._stamps: list[int] = []
         self._steps: list[int] = []
+        self._first_ns: int | None = None
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -32,19 +35,35 @@ class TimeAxis:
 
     def take(self) -> list[rr.TimeColumn]:
         """Return the timelines and begin anew."""
-        columns = [
-            rr.TimeColumn(ROS_TIME, timestamp=np.array(self._stamps, dtype="datetime64[ns]")),
-            rr.TimeColumn(STEP, sequence=self._steps),
-        ]
+        return self.columns(*self.take_arrays())
+
+    def take_arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return stamps and steps and begin anew."""
+        stamps, steps = np.array(self._stamps, np.int64), np.array(self._steps, np.int64)
         self._stamps, self._steps = [], []
-        return columns
+        return stamps, steps
+
+    def columns(self, stamps: NDArray[np.int64], steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
+        """Return the timelines of some rows."""
+        if self._first_ns is None and len(stamps):
+            self._first_ns = int(stamps[0])
+        since = (stamps - (self._first_ns or 0)).astype("timedelta64[ns]")
+        return [
+            rr.TimeColumn(ROS_TIME, timestamp=stamps.astype("datetime64[ns]")),
+            rr.TimeColumn(RUN_TIME, duration=since),
+            rr.TimeColumn(STEP, sequence=steps),
+        ]
 
 
 class Curves:
-    """Some curves with common times: row by row in, one entity per curve out."""
+    """Some curves with common times: row by row in, one entity per curve out.
 
-    def __init__(self, stream: rr.RecordingStream, entities: Sequence[str]) -> None:
+    With `span_ns` a curve keeps the least and the largest value in each such span of stamps: no peak is lost.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, entities: Sequence[str], span_ns: int = 0) -> None:
         self._stream = stream
+        self._span_ns = span_ns
         self.entities = tuple(entities)
         self._axis = TimeAxis()
         self._rows: list[Any] = []
@@ -64,9 +83,26 @@ class Curves:
         values = np.asarray(self._rows, dtype=np.float64)
         self._rows = []
         self.sent += len(values)
-        indexes = self._axis.take()
+        stamps, steps = self._axis.take_arrays()
+        indexes = self._axis.columns(stamps, steps)
         for entity, column in zip(self.entities, values.T, strict=True):
+            if self._span_ns:
+                kept = extremes(stamps // self._span_ns, column)
+                indexes, column = self._axis.columns(stamps[kept], steps[kept]), column[kept]
             rr.send_columns(entity, indexes, rr.Scalars.columns(scalars=column), recording=self._stream)
+
+
+def extremes(spans: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the places of the least and the largest value in each run of equal `spans`, in order."""
+    starts = np.flatnonzero(np.concatenate(([True], spans[1:] != spans[:-1])))
+    counts = np.diff(np.append(starts, len(spans)))
+    places = np.arange(len(values))
+    kept = []
+    for reduce in (np.minimum, np.maximum):
+        bound = np.repeat(reduce.reduceat(values, starts), counts)
+        kept.append(np.minimum.reduceat(np.where(values == bound, places, len(values)), starts))
+    found = np.unique(np.concatenate(kept))
+    return found[found < len(values)]
 
 
 class Batches:

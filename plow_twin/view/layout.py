@@ -13,7 +13,7 @@ from rerun.components import AggregationPolicy, InterpolationMode
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
-from plow_twin.view.columns import ROS_TIME, STEP
+from plow_twin.view.columns import ROS_TIME, RUN_TIME, STEP
 from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
 
 FORCE: Final = tuple(f"force/{name}" for name in PAIR_NAMES)
@@ -28,12 +28,18 @@ _LOAD_COLORS: Final = (LOAD_COLOR, (86, 180, 233), (200, 200, 200))
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
 
 
-def blueprint(section: Section) -> rrb.Blueprint:
-    """Return the arrangement: the cross-section beside the curves, the events and data quality below."""
+def blueprint(section: Section, exaggerate: float) -> rrb.Blueprint:
+    """Return the arrangement: the cross-sections beside the curves, the events and data quality below."""
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
         origin="section",
         name="Cross-section [mm]: the head moves about the fixed frame",
+        visual_bounds=rrb.VisualBounds2D(x_range=(-half_x, half_x), y_range=(-half_y, half_y)),
+        background=(24, 26, 30),
+    )
+    wide = rrb.Spatial2DView(
+        origin="exaggerated",
+        name=f"Clearance {exaggerate:g} times as wide",
         visual_bounds=rrb.VisualBounds2D(x_range=(-half_x, half_x), y_range=(-half_y, half_y)),
         background=(24, 26, 30),
     )
@@ -57,7 +63,9 @@ def blueprint(section: Section) -> rrb.Blueprint:
         row_shares=[5, 2, 4],
     )
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(picture, below, row_shares=[7, 2]), curves, column_shares=[5, 6]),
+        rrb.Horizontal(
+            rrb.Vertical(rrb.Horizontal(picture, wide), below, row_shares=[5, 3]), curves, column_shares=[6, 5]
+        ),
         rrb.TimePanel(state="collapsed", timeline=ROS_TIME),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -122,7 +130,8 @@ Where a corner of the frame meets a wall of the cavity, an arrow shows the force
 - force curves: the largest force between two messages, no peak is left out (`force_at_stamp`: the force at the stamp)
 - the cross-section is thinned in time; curves keep every row
 - growth of the clearance: over the clearance without wear, in micrometres; the thin lines bound its 5..95 % interval
-- timelines: `{ROS_TIME}` is the stamp, `{STEP}` counts the advances of the model
+- timelines: `{ROS_TIME}` is the stamp, `{RUN_TIME}` the time since the first one, `{STEP}` counts the advances
+- beside it the same with the clearance drawn several times as wide, worn pads included; walls that touch are orange
 
 | | |
 |---|---|

@@ -23,12 +23,17 @@ from plow_twin.view.columns import Batches, Curves, buffers
 from plow_twin.view.events import Events
 from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
 
+#: A curve with more rows is thinned.
+MOST_ROWS: Final = 200_000
 #: The cross-section moves at this rate [Hz]; curves keep every row.
 SECTION_HZ: Final = 100.0
 #: Stamps further than that from the recorder's clock [ns] are on another clock: no age is drawn.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
+#: Size of a recording for each row of its curves [B].
+_BYTES_PER_ROW: Final = 400
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
+_TOUCHING: Final = (240, 140, 40)
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,8 @@ def to_rrd(
     out: Path,
     *,
     section_hz: float = SECTION_HZ,
+    exaggerate: float | None = None,
+    most_rows: int = MOST_ROWS,
     until_s: float | None = None,
     on_progress: Callable[[float], object] | None = None,
 ) -> ViewSummary:
@@ -64,7 +71,12 @@ def to_rrd(
     out
         The .rrd file to write.
     section_hz
-        Rate of the cross-section [Hz]; the force curves are never thinned.
+        Rate of the cross-section [Hz].
+    exaggerate
+        How many times as wide the clearance is drawn in the second cross-section; None: so that it is well seen.
+    most_rows
+        Rows of a curve, and a tenth of them of the cross-section, beyond which a long run is thinned: a curve keeps the
+        least and the largest value of each span, so that no peak is lost.
     until_s
         Stop that long after the first stamp [s].
     on_progress
@@ -81,10 +93,14 @@ def to_rrd(
     stream = rr.RecordingStream("plow_twin")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        stream.save(out, default_blueprint=layout.blueprint(section))
+        wide = exaggerate or section.exaggeration()
+        stream.save(out, default_blueprint=layout.blueprint(section, wide))
     except Exception as error:  # the SDK raises RuntimeError and OSError alike
         raise RecordingError(f"{out}: cannot be written: {error}") from error
-    run = _Run(stream, reader.header, section, scene.clearance, section_hz)
+    duration_s = reader.duration_s()
+    span_ns = _span_ns(reader, duration_s, most_rows)
+    section_hz = min(section_hz, max(1.0, 0.1 * most_rows / max(duration_s, 1e-9)))
+    run = _Run(stream, reader.header, section, scene.clearance, section_hz, wide, span_ns)
     run.start(scene, reader.path)
     for index, record in enumerate(reader):
         if isinstance(record, EntryRecord):
@@ -105,27 +121,44 @@ def to_rrd(
     )
 
 
+def _span_ns(reader: RunReader, duration_s: float, most_rows: int) -> int:
+    """Return the span in which a curve keeps two rows [ns]; 0 for a run of few rows."""
+    size = sum(part.stat().st_size for part in reader.parts)
+    rows = size / _BYTES_PER_ROW
+    return 0 if rows <= most_rows else max(1, round(2e9 * duration_s / most_rows))
+
+
 class _Run:
     """Turn records into curves, moments of the cross-section and events."""
 
     def __init__(
-        self, stream: rr.RecordingStream, header: RunHeader, section: Section, clearance: Clearance, section_hz: float
+        self,
+        stream: rr.RecordingStream,
+        header: RunHeader,
+        section: Section,
+        clearance: Clearance,
+        section_hz: float,
+        exaggerate: float,
+        span_ns: int,
     ) -> None:
+        self._exaggerate = exaggerate
+        self.walls = Batches(stream, "exaggerated/head", rr.LineStrips2D, ("strips", "colors"))
         self.stream = stream
         self.header = header
         self.section = section
-        self.force = Curves(stream, layout.FORCE)
-        self.force_at_stamp = Curves(stream, layout.FORCE_AT_STAMP)
-        self.penetration = Curves(stream, layout.PENETRATION)
-        self.load = Curves(stream, layout.LOAD)
-        self.age = Curves(stream, layout.AGE)
-        self.interval = Curves(stream, layout.INTERVAL)
+        self.force = Curves(stream, layout.FORCE, span_ns)
+        self.force_at_stamp = Curves(stream, layout.FORCE_AT_STAMP, span_ns)
+        self.penetration = Curves(stream, layout.PENETRATION, span_ns)
+        self.load = Curves(stream, layout.LOAD, span_ns)
+        self.age = Curves(stream, layout.AGE, span_ns)
+        self.interval = Curves(stream, layout.INTERVAL, span_ns)
         self.head = Batches(stream, "section/head", rr.LineStrips2D, ("strips",))
         self.corners = Batches(stream, "section/corners", rr.Points2D, ("positions", "radii"))
         self.arrows = Batches(stream, "section/force", rr.Arrows2D, ("origins", "vectors", "colors", "labels"))
         self.names = Batches(stream, "section/head/name", rr.Points2D, ("positions",))
         self.load_arrow = Batches(stream, "section/load", rr.Arrows2D, ("origins", "vectors", "labels"))
         self.events = Events(stream)
+        self._stream_span_ns = span_ns
         self.slow: tuple[Curves, Curves, Curves] | None = None
         self.section_rows = 0
         self.step = -1
@@ -161,6 +194,8 @@ class _Run:
         layout.style_curves(self.stream)
         outline = self.section.frame_strip()
         self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
+        self.stream.log("exaggerated/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
+        self.stream.log("exaggerated/head", rr.LineStrips2D.from_fields(radii=[1.5]), static=True)
         places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.43 * self.section.frame[1]]]))
         names = (*self.section.labels, "frame (fixed)")
         labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
@@ -231,6 +266,9 @@ class _Run:
         colors = [PAIR_COLORS[pair] for pair in pairs]
         labels = [f"{contact.effort[pair] / 1e3:.0f} kN" for pair in pairs]
         self.arrows.add(stamp_ns, self.step, origins=origins, vectors=vectors, colors=colors, labels=labels)
+        walls, touching = self.section.exaggerated(contact.position, self._exaggerate)
+        shades = [_TOUCHING if touches else _WHITE for touches in touching]
+        self.walls.add(stamp_ns, self.step, strips=list(walls), colors=shades)
 
     def _load(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
         """Draw the head's name and the sampled load at its centre; the scene's own loads are not journalled."""

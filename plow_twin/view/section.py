@@ -67,6 +67,30 @@ class Section:
         sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
         return _placed(0.5 * sides[:, None, :] * _SQUARE, pose)
 
+    def exaggeration(self) -> float:
+        """Return the factor at which the clearance fills a third of the frame's smaller side."""
+        gap = float((self.cavity - self.frame).max())
+        return max(1.0, round(float(self.frame.min()) / 3.0 / gap, 1)) if gap > 0.0 else 1.0
+
+    def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the four walls where the gaps are `factor` times as wide, shape (4, 2, 2), and which of them touch.
+
+        Walls in the order top, right, bottom, left; each is drawn through its two places beside the frame's corners, so
+        that wear is part of it.
+        """
+        corners = 0.5 * self.frame * np.stack((CORNER_X, CORNER_Y), axis=1)
+        outwards = (
+            np.stack((NORMAL_X, NORMAL_Y), axis=1)
+            * np.where(
+                (np.stack((NORMAL_X, NORMAL_Y), axis=1) * np.stack((CORNER_X, CORNER_Y), axis=1)).sum(axis=1) > 0.0,
+                1.0,
+                -1.0,
+            )[:, None]
+        )
+        places = (corners - outwards * (_MM * factor * penetration)[:, None]) * _FLIP
+        walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
+        return places[walls], (penetration[walls] > 0.0).any(axis=1)
+
     def head_points(self, pose: Iterable[float]) -> Array:
         """Centre of the cavity and the place of the head's name, shape (2, 2)."""
         return _placed(np.array([[0.0, 0.0], [0.0, 0.5 * self.cavity[1] + 0.5 * BODY_MARGIN_MM]]), pose)

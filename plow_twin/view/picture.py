@@ -1,0 +1,152 @@
+"""A recording as one picture, without a viewer: cross-section at the largest force, forces, load, clearance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import RecordingError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.messages import JointState, Odometry
+from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.scene_file import loads_scene
+from plow_twin.stream.journal import Sample
+from plow_twin.view.section import PAIR_COLORS, Section
+
+_MOST_ROWS: Final = 8000
+
+
+class _Largest:
+    """Rows in time of which only the largest values of neighbours are kept when there are many."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+        self.rows: list[NDArray[np.float64]] = []
+
+    def add(self, time_s: float, row: NDArray[np.float64]) -> None:
+        self.times.append(time_s)
+        self.rows.append(row)
+        if len(self.rows) >= 2 * _MOST_ROWS:
+            self.rows = [np.where(np.abs(a) >= np.abs(b), a, b) for a, b in zip(*[iter(self.rows)] * 2, strict=True)]
+            self.times = self.times[::2]
+
+
+def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> FileStatus:
+    """Draw a recording into a PNG and return how the recording ended.
+
+    Raises
+    ------
+    RecordingError
+        The file is no recording, or `out` cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    reader = RunReader(path)
+    scene = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
+    section = Section.of(scene)
+    force, load, clearance = _Largest(), _Largest(), _Largest()
+    names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}
+    first_ns: int | None = None
+    pose, contact = (0.0, 0.0, 0.0), np.full(8, -np.inf)
+    largest, now, held = 0.0, (0.0, 0.0, 0.0), np.zeros(8)
+    gaps, shown = np.zeros(8), np.zeros(8)
+    for record in reader:
+        if isinstance(record, EntryRecord):
+            if isinstance(record.entry, Sample):
+                first_ns = record.entry.stamp_ns if first_ns is None else first_ns
+                load.add((record.entry.stamp_ns - first_ns) * 1e-9, np.array(record.entry.wrench) / 1e3)
+            continue
+        name = names.get(record.topic)
+        message = record.message() if name is not None else None
+        if isinstance(message, Odometry):
+            turn = message.orientation
+            now = (message.position[0], message.position[1], 2.0 * math.atan2(turn[2], turn[3]))
+            if held.max() > largest or first_ns is None:
+                largest, pose, contact, shown = float(held.max()), now, held, gaps
+        elif isinstance(message, JointState):
+            first_ns = message.stamp_ns if first_ns is None else first_ns
+            time_s = (message.stamp_ns - first_ns) * 1e-9
+            if name == "contact_forces":
+                held, gaps = message.effort, message.position
+            elif name == "contact_peaks":
+                force.add(time_s, message.effort / 1e3)
+            else:
+                clearance.add(time_s, _clearance_row(message))
+    figure = Figure(figsize=(15, 8.5), layout="constrained")
+    grid = figure.add_gridspec(3, 3)
+    factor = exaggerate or section.exaggeration()
+    _draw_section(figure.add_subplot(grid[:2, 0]), section, pose, contact, largest)
+    _draw_wide(figure.add_subplot(grid[2, 0]), section, shown, factor)
+    axis = figure.add_subplot(grid[0, 1:])
+    _curves(
+        axis, force, PAIR_NAMES, "largest force [kN]", [tuple(part / 255 for part in color) for color in PAIR_COLORS]
+    )
+    _curves(figure.add_subplot(grid[1, 1:], sharex=axis), load, ("Fx [kN]", "Fy [kN]", "M [kN m]"), "load", None)
+    below = figure.add_subplot(grid[2, 1:], sharex=axis)
+    _bands(below, clearance)
+    below.set_xlabel("time since the first stamp [s]")
+    figure.suptitle(f"{reader.path.name}: {reader.status.value}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        FigureCanvasAgg(figure).print_png(str(out))  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise RecordingError(f"{out}: cannot be written: {error.strerror}") from error
+    return reader.status
+
+
+def _clearance_row(message: JointState) -> NDArray[np.float64]:
+    wanted = [f"{way}{point}" for way in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
+    return np.array([1e3 * message.position[message.name.index(name)] for name in wanted])
+
+
+def _draw_section(
+    axis: Any, section: Section, pose: tuple[float, float, float], force: NDArray[np.float64], largest: float
+) -> None:
+    axis.plot(*section.frame_strip().T, color="0.5")
+    for strip in section.head_strips(pose):
+        axis.plot(*strip.T, color="k", lw=1.0)
+    if largest > 0.0:
+        origins, vectors, pairs = section.arrows(pose[2], force)
+        for origin, vector, pair in zip(origins, vectors, pairs, strict=True):
+            color = tuple(part / 255 for part in PAIR_COLORS[pair])
+            axis.annotate("", origin + vector, origin, arrowprops={"arrowstyle": "->", "color": color, "lw": 2})
+    axis.set(aspect="equal", title=f"Cross-section [mm] at the largest force, {largest / 1e3:.1f} kN")
+    axis.invert_yaxis()
+
+
+def _draw_wide(axis: Any, section: Section, penetration: NDArray[np.float64], factor: float) -> None:
+    axis.plot(*section.frame_strip().T, color="0.5")
+    walls, touching = section.exaggerated(penetration, factor)
+    for wall, touches in zip(walls, touching, strict=True):
+        axis.plot(*wall.T, color="tab:orange" if touches else "k")
+    axis.set(aspect="equal", title=f"clearance {factor:g} times as wide")
+    axis.invert_yaxis()
+
+
+def _curves(axis: Any, rows: _Largest, names: Sequence[str], label: str, colors: Sequence[Any] | None) -> None:
+    values = np.array(rows.rows).reshape(len(rows.rows), -1)
+    for index, name in enumerate(names):
+        if len(values):
+            axis.plot(rows.times, values[:, index], lw=0.7, label=name, color=colors[index] if colors else None)
+    axis.set_ylabel(label)
+    if len(values):
+        axis.legend(loc="upper right", fontsize=7, ncols=2)
+
+
+def _bands(axis: Any, rows: _Largest) -> None:
+    values = np.array(rows.rows).reshape(-1, 6)
+    for index, name in enumerate(("horizontal", "vertical")):
+        if len(values):
+            line = axis.plot(rows.times, values[:, 3 * index], label=name)[0]
+            axis.fill_between(
+                rows.times, values[:, 3 * index + 1], values[:, 3 * index + 2], alpha=0.25, color=line.get_color()
+            )
+    axis.set_ylabel("clearance, 5..95 % [mm]")
+    if len(values):
+        axis.legend(loc="upper right", fontsize=7)
