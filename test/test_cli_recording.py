@@ -113,3 +113,31 @@ def test_view_writes_where_it_is_told(run: Run, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert f"{SAMPLES} force rows" in done.stdout
     assert (tmp_path / "picture.rrd").read_bytes()[:4] == b"RRF2"
+
+
+def test_view_serves_a_page_on_the_loopback_address_alone(run: Run, tmp_path: Path) -> None:
+    import socket
+    import time
+    import urllib.request
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "plow_twin", "view", str(run.folder), "--out", str(tmp_path / "run.rrd"), "--web"]
+    process = subprocess.Popen(
+        [*command, "--web-port", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    try:
+        deadline = time.monotonic() + 90
+        page = b""
+        while not page and process.poll() is None and time.monotonic() < deadline:
+            try:
+                page = urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5).read()
+            except OSError:
+                time.sleep(0.2)
+        assert b"Rerun" in page
+        listening = {line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]}
+        assert f"0100007F:{port:04X}" in listening and f"00000000:{port:04X}" not in listening
+    finally:
+        process.terminate()
+        process.wait(20)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -64,7 +64,6 @@ def _serve(file: Path, port: int, quiet: bool) -> int:
     command = [program, str(file), "--serve-web", "--bind", "127.0.0.1", "--port", "auto"]
     if not quiet:
         click.echo(f"serving on http://127.0.0.1:{port} until interrupted")
-    try:
-        return subprocess.run([*command, "--web-viewer-port", str(port)], check=False).returncode
-    except KeyboardInterrupt:
-        return DONE
+    sys.stdout.flush()
+    # in the place of this process: whoever stops it stops the server
+    os.execv(program, [*command, "--web-viewer-port", str(port)])
