@@ -129,7 +129,9 @@ def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_p
         assert float(running.probe.figures("output")["latency_max_ms"]) > 0.0
 
 
-@pytest.mark.parametrize(("mode", "rate"), [("on_sample", 3000), ("fixed_rate", 10000)])
+@pytest.mark.parametrize(
+    ("mode", "rate"), [pytest.param("on_sample", 3000, marks=pytest.mark.stress), ("fixed_rate", 10000)]
+)
 def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mode: str, rate: int) -> None:
     # the publisher overruns any queue: what is read is between all and a part
     with bench(tmp_path, publish_mode=mode, input_depth=200, excitation_timeout=60.0) as running:
@@ -149,6 +151,7 @@ def test_every_sample_sent_is_used_dropped_or_counted_as_lost(tmp_path: Path, mo
     assert int(figures["samples_missing"]) == 0  # off: no rate is asked for
 
 
+@pytest.mark.stress
 def test_a_queue_that_overruns_is_loss_and_said(tmp_path: Path) -> None:
     with bench(tmp_path, input_depth=200, excitation_timeout=60.0, publish_mode="fixed_rate") as running:
         probe = running.probe

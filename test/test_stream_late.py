@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from random import Random
 
 import numpy as np
 import pytest
@@ -216,3 +217,42 @@ def test_a_change_faster_than_possible_is_refused() -> None:
     assert counters(live.driver)["dropped_implausible"] == 1
     live.send((T0 + 3 * MS, (2000.0, 0.0, 0.0)))
     assert counters(live.driver)["samples_used"] == 3
+
+
+@pytest.mark.parametrize("seed", range(1, 7))
+def test_whatever_comes_the_journal_repeats_it_at_every_entry(seed: int) -> None:
+    random = Random(seed)
+    hold = random.choice(["hold", "zero"])
+    live = Live(every_sample=bool(seed % 2), policy=Policy(excitation_timeout_s=0.05, hold=hold, hold_limit_s=0.3))
+    again = Session(Twin(SCENE, excitation="sampled"), rollback_span_s=SPAN_S)
+    now = index = done = 0
+    skipped: list[int] = []
+    for _ in range(300):
+        chance = random.random()
+        if chance < 0.6:
+            live.send(*(_arrival(index + offset) for offset in range(5)), now_ns=now)
+            index, now = index + 5, now + 5 * MS
+        elif chance < 0.7:
+            skipped.append(index)
+            index += 1
+        elif chance < 0.8 and skipped:
+            live.send(_arrival(skipped.pop(random.randrange(len(skipped)))), now_ns=now)
+        elif chance < 0.88:
+            now += 80 * MS
+            live.silence(now)
+        elif chance < 0.92:
+            skipped.clear()
+            if chance < 0.9:
+                live.driver.reset(T0 + index * MS, "asked for")
+            else:
+                live.driver.set_wear(T0 + index * MS, [1e-5 * random.random()] * 8, "other pads")
+        elif chance < 0.96:  # late, on time, early and far too late
+            live.driver.travel(T0 + (index + random.randrange(-200, 50)) * MS, 3.0 * random.random())
+        else:
+            live.driver.due()
+        for entry in live.journal[done:]:
+            if not isinstance(entry, Digest):
+                again.apply(entry)
+        done = len(live.journal)
+        assert (again.stamp_ns, again.twin.digest()) == live.motion
+        assert (again.wear_depth == live.wear).all()

@@ -371,8 +371,11 @@ class Session:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             self._travels = sorted([*self._travels, travel], key=lambda item: item.stamp_ns)
-        elif newest_ns is None or oldest_ns is None or travel.stamp_ns <= oldest_ns or travel.stamp_ns >= newest_ns:
+        elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
+        elif travel.stamp_ns <= oldest_ns:
+            # too old to be worked in at its place: it acts from the newest sample on
+            self._set_speed(Travel(newest_ns, travel.speed_m_s))
         else:
             self._work_in(travel.stamp_ns, [], travel)
 
