@@ -21,6 +21,7 @@ from plow_twin.record.outputs import FRAME_TOPICS
 from plow_twin.record.reader import FileStatus, OutputRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import Digest, Sample
+from plow_twin.stream.session import Session
 
 COUNT = 2500
 SAMPLES = "/plow_twin/journal/samples"
@@ -199,3 +200,17 @@ def test_digests_alone_are_compared_without_opening_the_outputs(run: Run, tmp_pa
     changed = replay(rewrite(run.file, tmp_path / "changed.mcap", flip_sample(1234, 0)), digests_only=True)
     assert changed.exit_code == 1 and changed.first_divergence is not None
     assert 1234 <= changed.first_divergence.step < 1300
+
+
+def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    advance = Session.advance_marked
+
+    def counted(session: Session, stamps: Any, *rest: Any, **options: Any) -> Any:
+        calls.append(len(stamps))
+        return advance(session, stamps, *rest, **options)
+
+    monkeypatch.setattr(Session, "advance_marked", counted)
+    assert replay(run.folder).exit_code == 0
+    # one call warms up; the others take thousands of samples, not the hundred between two digests
+    assert sum(calls) == COUNT + 2 and len(calls) <= 4

@@ -213,7 +213,8 @@ class _Replay:
         breaks = np.ones(count, bool)  # entries that no run goes on into
         breaks[1:] = np.diff(entries.sequence) != 1
         breaks |= ~entries.sample
-        late = 1 + np.flatnonzero(np.diff(entries.stamp_ns) < 0)  # worked in one by one
+        samples = np.flatnonzero(entries.sample)
+        late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # worked in one by one
         breaks[late] = True
         breaks[late[late + 1 < count] + 1] = True
         for index, entry in entries.others.items():
