@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import click
@@ -94,6 +95,9 @@ def _print_row(console: Console, row: Row, difference: str) -> None:
         rest = [f"paper {row.published} {row.unit}, here {row.computed} {row.unit}, {difference}"]
     else:
         rest = [f"paper: {row.published}", f"here:  {row.computed}"]
-    console.print(verdict + Text(row.what), soft_wrap=len(row.what) + len(verdict) <= console.width)
+    head, *more = wrap(row.what, console.width - len(verdict))
+    console.print(verdict + Text(head))
+    for text in more:
+        console.print(Padding(Text(text), (0, 0, 0, len(verdict))))
     for text in rest:
         console.print(Padding(Text(text, "dim"), (0, 0, 0, len(verdict) + 2)))
