@@ -1,0 +1,102 @@
+"""Replay beside plain reading of the same file, and what a recording costs: `python benchmark/replay.py [SECONDS]`.
+
+Records the paper's head at 1 kHz with all outputs, then prints size, replay multiples (all messages, digests alone),
+and the time that `mcap` and `rosbags` take to read the same file. Times are processor time of one thread, the least of
+some runs.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+
+from plow_twin.record.header import RunHeader
+from plow_twin.record.recorder import Recorder
+from plow_twin.record.replay import replay
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.journal import Sample
+from plow_twin.stream.session import Session
+
+_AMPLITUDE = np.array([32_000.0, -11_000.0, -45_495.0])
+_START_NS = 1_800_000_000_000_000_000
+_REPEATS = 3
+
+
+def record(folder: Path, seconds: float, outputs: bool) -> int:
+    """Record a run and return its size in bytes."""
+    scene = load_scene(scene_path("paper"))
+    kind = "all" if outputs else "none"
+    header = RunHeader(dump_scene(scene), record_outputs=kind)
+    recorder = Recorder(folder, header, queue_size=10**7)
+    session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
+    session.start()
+    for index in range(round(1000 * seconds)):
+        fx, fy, moment = (np.sin(2e-3 * index) * _AMPLITUDE).tolist()
+        session.apply(Sample(_START_NS + index * 1_000_000, (fx, fy, moment)))
+        publication = session.outputs.take()
+        if outputs and publication is not None:
+            recorder.publication(publication)
+    session.close()
+    report = recorder.close(timeout_s=600.0)
+    if not report.complete:
+        raise SystemExit(f"recording incomplete: {report}")
+    return recorder.path.stat().st_size
+
+
+def least(work: Callable[[], object]) -> float:
+    """Return the least processor time of some runs [s]."""
+    times = []
+    for _ in range(_REPEATS):
+        begin = time.thread_time()
+        work()
+        times.append(time.thread_time() - begin)
+    return min(times)
+
+
+def read_mcap(path: Path) -> None:
+    """Read all messages with the `mcap` library."""
+    with path.open("rb") as stream:
+        for _ in make_reader(stream).iter_messages(log_time_order=False):
+            pass
+
+
+def read_rosbags(folder: Path) -> None:
+    """Read all messages with `rosbags`, undecoded."""
+    with Reader(folder) as reader:
+        for _ in reader.messages():
+            pass
+
+
+def main() -> None:
+    """Print the table."""
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+    with tempfile.TemporaryDirectory() as name:
+        full, bare = Path(name) / "full", Path(name) / "bare"
+        for folder, outputs in ((full, True), (bare, False)):
+            size = record(folder, seconds, outputs)
+            print(f"{folder.name:8} {size / seconds / 1e3:8.1f} kB/s {size / seconds * 3.6e-3:8.0f} MB/h")
+        replay(full)  # compiles
+        replay(full, digests_only=True)
+        works: dict[str, Callable[[], object]] = {
+            "replay, every message": lambda: replay(full),
+            "replay, digests alone": lambda: replay(full, digests_only=True),
+            "replay of the journal": lambda: replay(bare, digests_only=True),
+            "read with mcap": lambda: read_mcap(full / "full_0.mcap"),
+            "read with rosbags": lambda: read_rosbags(full),
+        }
+        for title, work in works.items():
+            spent = least(work)
+            print(f"{title:24} {spent:8.3f} s {seconds / spent:8.0f} x real time")
+
+
+if __name__ == "__main__":
+    main()
