@@ -23,6 +23,10 @@ Array = NDArray[np.float64]
 OBSERVED = 1e-3
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
+#: Knots of the load in a period that are simulated, about.
+KNOTS = 120
+#: Widening of all intervals: the linearisation leaves out some of what noise in the starting states does.
+WIDENED = 1.15
 #: Pairs of the left, right, top and bottom walls of the cavity.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
@@ -46,12 +50,23 @@ def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0) -> Estimate:
     if len(poses.t) < FEWEST_POSES:
         return prior_of(unknowns, (float(load.t[0]), float(load.t[-1])), lost)
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
-    forward = Forward(scene, load.thinned())
+    forward = Forward(scene, thinned(load, period))
     found = search(forward, unknowns, poses, period)
     if found is None:
         return _without_fit(unknowns, poses, lost)
     problem, fit = found
     return summarise(problem, fit, judge(problem, fit, period), lost)
+
+
+def thinned(load: Load, period: float) -> Load:
+    """Leave out of a load what the motion does not feel; a broad-band load down to some hundred knots a period."""
+    most = KNOTS * max(1.0, float(load.t[-1] - load.t[0]) / period)
+    thin = load
+    for share in (5e-4, 1e-3, 2e-3, 4e-3, 8e-3):
+        thin = load.thinned(share)
+        if len(thin.t) <= most:
+            break
+    return thin
 
 
 def warm_up(scene: Scene) -> None:
@@ -118,7 +133,7 @@ def _covariance(problem: Problem, fit: Fit) -> Array:
     scattered = np.diag(sandwich(fit, 1.0 / problem.deviation**2))
     # a ratio from some twenty swings is itself uncertain by a quarter
     ratio = np.maximum(scattered / np.diag(plain), 1.0)
-    scale = np.sqrt(ratio)
+    scale = WIDENED * np.sqrt(ratio)
     covariance: Array = plain * np.outer(scale, scale)
     return covariance
 

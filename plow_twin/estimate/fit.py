@@ -30,7 +30,7 @@ JITTER_WEIGHT = 100.0
 #: Its weight where fits are compared.
 _COMPARED_WEIGHT = 5.0
 #: Steps of the solver after which no further iteration begins: what a fit may cost is counted, not timed.
-MOST_WORK = 2_500_000
+MOST_WORK = 3_000_000
 #: Displacements of a starting state: m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 #: Prior standard deviations of a starting state about its guess.

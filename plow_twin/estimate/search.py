@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from plow_twin.estimate.fit import Fit, Problem, Window, fit
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
-from plow_twin.estimate.start import cut, first_vectors
-from plow_twin.estimate.unknowns import BIAS, DELAY, SOFTNESS, Unknowns
+from plow_twin.estimate.start import cut, first_vectors, range_of_motion
+from plow_twin.estimate.unknowns import BIAS, DELAY, GX, GY, SOFTNESS, Unknowns
 
 Array = NDArray[np.float64]
 
@@ -34,6 +34,9 @@ class Stage:
     keep: int
 
 
+#: Fewest rows within a horizon, and within a swing.
+_FEWEST_ROWS = (8, 12)
+
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: Shortest swing and horizon, as shares of the period, of hard and of soft contacts.
 _SHORT, _LONG = (0.04, 0.11), (0.35, np.inf)
@@ -41,13 +44,15 @@ _SHORT, _LONG = (0.04, 0.11), (0.35, np.inf)
 
 def search(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> tuple[Problem, Fit] | None:
     """Return the best fit of all poses with its problem, or None where no start could be run."""
+    interval = float(np.median(np.diff(poses.t)))
     first = poses.between(float(poses.t[0]), float(poses.t[0]) + _FIRST_PERIODS * period)
-    window = cut(unknowns.scene, first, period, 0.2 * period)
-    vectors = first_vectors(Problem(forward, unknowns, window, horizon=STAGES[0].horizon * period), 6)
+    window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
+    horizons = [max(stage.horizon * period, _FEWEST_ROWS[0] * interval) for stage in STAGES]
+    vectors = first_vectors(Problem(forward, unknowns, window, horizon=horizons[0]), 6)
     points = [(vector, states_at(window, vector), _NOISE) for vector in vectors]
     fits: list[Fit] = []
-    for stage in STAGES:
-        problem = Problem(forward, unknowns, window, horizon=stage.horizon * period)
+    for stage, horizon in zip(STAGES, horizons, strict=True):
+        problem = Problem(forward, unknowns, window, horizon=horizon)
         points = [(shared, better_states(problem, shared, states), noise) for shared, states, noise in points]
         fits = [one for one in (fit(problem, *point, stage.iterations) for point in points) if one is not None]
         fits = sorted(fits, key=lambda one: one.loss)[: stage.keep]
@@ -59,15 +64,31 @@ def refine(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array
 ) -> tuple[Problem, Fit] | None:
     """Fit all poses from a good start: the beginning of each swing first."""
-    shortest, horizon = _SHORT if np.exp(shared[SOFTNESS]) < _HARD else _LONG
-    window = cut(unknowns.scene, poses, period, shortest * period)
-    near = Problem(forward, unknowns, window, horizon=min(0.2, horizon) * period)
-    found = fit(near, shared, better_states(near, shared, states_at(window, shared)), noise, 8)
-    if found is None or horizon <= 0.2:
-        return None if found is None else (near, found)
-    whole = Problem(forward, unknowns, window, horizon=horizon * period)
-    found = fit(whole, found.shared, better_states(whole, found.shared, found.point.states), found.noise, 8)
+    hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
+    rows = float(np.median(np.diff(poses.t))) * np.array(_FEWEST_ROWS)
+    shortest, horizon = _SHORT if hard else _LONG
+    shortest, horizon = max(shortest * period, rows[1]), max(horizon * period, rows[0])
+    window = cut(unknowns.scene, poses, period, shortest)
+    near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon))
+    starts = [shared, *([range_of_hard(unknowns, poses, shared)] if hard else [])]
+    fits = [fit(near, start, better_states(near, start, states_at(window, start)), noise, 10) for start in starts]
+    found = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
+    if found is None:
+        return None
+    whole = Problem(forward, unknowns, window, horizon=horizon)
+    states = better_states(whole, found.shared, found.point.states)
+    found = fit(whole, found.shared, states, found.noise, 12 if hard else 8)
     return None if found is None else (whole, found)
+
+
+def range_of_hard(unknowns: Unknowns, poses: Poses, shared: Array) -> Array:
+    """Return a start in which the range of motion is all clearance and the contact is hard."""
+    start = unknowns.nominal()
+    clearance, bias = range_of_motion(unknowns.scene, poses)
+    start[[GX, GY]], start[BIAS][:2] = clearance, bias
+    start[SOFTNESS] = unknowns.softness_of(unknowns.force / 1e-4**unknowns.scene.contact.exponent)
+    start[DELAY] = shared[DELAY]
+    return unknowns.within(start)
 
 
 def states_at(window: Window, shared: Array) -> Array:

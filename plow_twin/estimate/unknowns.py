@@ -33,6 +33,10 @@ NAMES: Final = (
 #: Unknowns that change the motion; the others only change how it is measured.
 MOVING: Final = tuple(range(7))
 
+#: Impact speed in m/s below which lambda = D / v0 is not followed: touches at rest would make the contact stiff and the
+#: fit slow, for what a sensor of the pose does not see.
+SLOWEST_IMPACT: Final = 0.03
+
 #: u0 in m: penetrations below it cannot be told from none.
 _RESOLVED = 1e-4
 #: Smallest softness in m that is simulated; harder contacts move the head alike.
@@ -137,5 +141,7 @@ class Unknowns:
         if self.damped:
             value = self.damping_of(float(vector[DAMPING]))
             contact = replace(contact, restitution=value) if self._restitution else replace(contact, damping=value)
+        if self._restitution:
+            contact = replace(contact, impact_speed_floor_m_s=max(contact.impact_speed_floor_m_s, SLOWEST_IMPACT))
         clearance = Clearance(float(vector[GX]), float(vector[GY]))
         return replace(self.scene, clearance=clearance, contact=contact, loads=(), wear=None)

@@ -29,7 +29,7 @@ MOST_GAIN = 0.25
 #: Rows in a row with one and the same value, and the motion meanwhile in standard deviations of the noise.
 STUCK_ROWS, STUCK_MOTION = 12, 6.0
 #: Gain in chi^2 from which a change within the window counts, and its least size in m.
-CHANGE_CHI2, CHANGE_M = 60.0, 3e-4
+CHANGE_CHI2, CHANGE_M = 200.0, 5e-4
 #: Quick noise of one part of the window over that of the rest.
 MOST_NOISE_RATIO = 2.0
 
