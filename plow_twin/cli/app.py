@@ -15,6 +15,7 @@ from plow_twin.cli.console import FAILED, WRONG_INPUT
 from plow_twin.cli.demo import demo
 from plow_twin.cli.doctor import doctor
 from plow_twin.cli.estimate import estimate
+from plow_twin.cli.forecast import forecast
 from plow_twin.cli.info import info
 from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
@@ -55,7 +56,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, estimate, replay, analyse, doctor, view, info, study):
+for _verb in (simulate, demo, estimate, forecast, replay, analyse, doctor, view, info, study):
     commands.add_command(_verb)
 
 

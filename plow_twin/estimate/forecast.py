@@ -1,0 +1,134 @@
+"""Remaining life: when a clearance reaches its limit, as a distribution over coefficient, clearance now and load."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.life import LifeError, Path, wear_path
+from plow_twin.estimate.result import NORMAL_P95
+from plow_twin.model.scene import Clearance, Scene
+
+Array = NDArray[np.float64]
+
+HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is asked: limits of the clearances [m], horizon and planned stop [h], how the machine is driven."""
+
+    limit_horizontal_m: float
+    limit_vertical_m: float
+    horizon_h: float
+    stop_h: float | None = None
+    face_length_m: float = 250.0
+    shift_h: float = 8.0
+    #: standard deviation of the load's size, relative
+    load_deviation: float = 0.05
+    draws: int = 2000
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Hours to the limit.
+
+    hours : (draws,) sorted; infinite where the limit is not reached within the horizon
+    path : the wear as it goes on at the clearances believed
+    """
+
+    hours: Array
+    speed_m_s: float
+    plan: Plan
+    path: Path
+
+    def quantile(self, share: float) -> float | None:
+        """Return the hours by which the limit is reached with this probability; None beyond the horizon."""
+        value = float(np.sort(self.hours)[min(int(share * len(self.hours)), len(self.hours) - 1)])
+        return value if math.isfinite(value) else None
+
+    def probability_before(self, hours: float) -> float:
+        """Return the probability that the limit is reached before a time."""
+        return float(np.mean(self.hours <= hours))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for JSON; null stands for `not reached in the horizon`."""
+        plan, out = self.plan, {}
+        for name, share in (("p10", 0.10), ("p50", 0.50), ("p90", 0.90)):
+            hours = self.quantile(share)
+            km = None if hours is None else hours * HOUR_S * self.speed_m_s / 1000.0
+            out[name] = {
+                "hours": hours,
+                "km": km,
+                "passes": None if km is None else km * 1000.0 / plan.face_length_m,
+                "shifts": None if hours is None else hours / plan.shift_h,
+            }
+        return {
+            **out,
+            "not_reached_in_horizon": float(np.mean(~np.isfinite(self.hours))),
+            "probability_before_stop": None if plan.stop_h is None else self.probability_before(plan.stop_h),
+            "horizon_h": plan.horizon_h,
+            "limit_m": [plan.limit_horizontal_m, plan.limit_vertical_m],
+            "path_steps": len(self.path.exposure),
+            "path_error_m": self.path.error,
+        }
+
+
+def forecast(scene: Scene, plan: Plan, deviation_m: tuple[float, float] = (0.0, 0.0)) -> Forecast:
+    """Forecast when a clearance of `scene` reaches its limit.
+
+    Parameters
+    ----------
+    scene : Scene
+        With wear; its clearances are those now, its loads those expected. `wear.prior_m2_n` gives the 5 % and 95 %
+        points of the coefficient, which is taken as log-normal.
+    plan : Plan
+    deviation_m : tuple of float
+        Standard deviations of the clearances now, in m.
+
+    Raises
+    ------
+    LifeError
+        Where the scene has no wear, does not travel or has no period.
+    """
+    wear = scene.wear
+    if wear is None or wear.travel_speed_m_s <= 0.0:
+        raise LifeError("wear: got none or no travel speed, expected both")
+    low, high = (math.log(value) for value in wear.prior_m2_n)
+    travel = plan.horizon_h * HOUR_S * wear.travel_speed_m_s
+    rng = np.random.default_rng(plan.seed)
+    coefficient = np.exp(rng.normal(0.5 * (low + high), (high - low) / (2.0 * NORMAL_P95), plan.draws))
+    load = np.maximum(1.0 + plan.load_deviation * rng.standard_normal(plan.draws), 0.1)
+    now = rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m
+    most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
+    # a clearance that is smaller now has further to go: the path must reach that far
+    spare = tuple(float(value) for value in -now.min(axis=0))
+    limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
+    path = wear_path(scene, limit, most)
+    size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
+    grown = size + path.clearance_growth()
+    needed = np.stack(
+        [
+            _exposure_at(path.exposure, grown[:, axis], limit_m - now[:, axis])
+            for axis, limit_m in enumerate((plan.limit_horizontal_m, plan.limit_vertical_m))
+        ]
+    ).min(axis=0)
+    hours = needed * wear.pad_area_m2 / (coefficient * load * wear.travel_speed_m_s) / HOUR_S
+    return Forecast(np.where(hours <= plan.horizon_h, hours, np.inf), wear.travel_speed_m_s, plan, path)
+
+
+def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
+    """Return the exposure at which a clearance that never falls reaches each limit, infinite where it does not."""
+    rising = np.maximum.accumulate(clearance) + 1e-15 * np.arange(len(clearance))
+    at = np.interp(limit, rising, exposure)
+    return np.where(limit > rising[-1], np.inf, np.where(limit <= rising[0], 0.0, at))
+
+
+def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float) -> Scene:
+    """Return the scene with other clearances: those that were estimated."""
+    return replace(scene, clearance=Clearance(horizontal_m, vertical_m))

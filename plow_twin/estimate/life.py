@@ -1,0 +1,130 @@
+"""Wear over months in seconds: a few load periods tell the mean force on each pad, then many periods are jumped.
+
+The wear rate of a pad is k_s <F> v / A (Archard), so depths depend on time, travel speed and coefficient only through
+the exposure E = k_s s / A in 1/N, s the travel in m:  dh/dE = <F>(h).  One path h(E) serves every coefficient. It is
+followed by Heun's method; the difference from Euler's step, and the change of the clearance in a step, bound the step.
+
+References: Archard, J. Appl. Phys. 24 (1953) 981; Lemaitre and Doghri, Comput. Methods Appl. Mech. Eng. 115 (1994) 197
+(jump in cycles); ISO 13381-1 (prognosis).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
+from plow_twin.model.scene import Harmonic, Scene, Wear
+from plow_twin.run.simulate import simulate
+
+Array = NDArray[np.float64]
+
+#: Load periods that are left out, and over which the mean is taken.
+SETTLE_PERIODS, MEAN_PERIODS = 2, 4
+#: Largest change of a pad's depth in a step, as a share of the smaller clearance, and error allowed in a step.
+LARGEST_CHANGE, ERROR = 0.02, 1e-3
+#: Most steps of a path.
+_MOST_STEPS = 400
+
+
+class LifeError(PlowTwinError):
+    """The scene does not wear, or has no period."""
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Wear depths along the exposure.
+
+    exposure : (n,) in 1/N, rising from 0
+    depth : (n, 8) wear depth of each pad in m
+    force, deviation : (n, 8) mean normal force of each pad in N and the standard error of that mean
+    error : largest estimated error of a depth at the end in m
+    """
+
+    exposure: Array
+    depth: Array
+    force: Array
+    deviation: Array
+    error: float
+
+    def clearance_growth(self) -> Array:
+        """Return how much the horizontal and the vertical clearance have grown, shape (n, 2), in m.
+
+        A wall has two pads: the mean of the two moves it; left and right, top and bottom add up.
+        """
+        horizontal = 0.5 * self.depth @ np.abs(NORMAL_X)
+        vertical = 0.5 * self.depth @ np.abs(NORMAL_Y)
+        return np.stack([horizontal, vertical], axis=1)
+
+
+def period_of(scene: Scene) -> float:
+    """Return the period in s of a scene's slowest harmonic load.
+
+    Raises
+    ------
+    LifeError
+        Without a harmonic load.
+    """
+    omegas = [load.omega_rad_s for load in scene.loads if isinstance(load, Harmonic)]
+    if not omegas:
+        raise LifeError("loads: got no harmonic load, expected one whose period the cycles are counted by")
+    return 2.0 * math.pi / min(omegas)
+
+
+def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
+    """Return the mean force of each pad in N with worn walls, shape (8,), and its standard error over the periods."""
+    period = period_of(scene)
+    wear = scene.wear or Wear(0.0, 1.0, 0.0)
+    worn = replace(scene, wear=replace(wear, coefficient_m2_n=0.0, initial_depth_m=tuple(map(float, depth))))
+    impulses = []
+    for count in range(SETTLE_PERIODS, SETTLE_PERIODS + MEAN_PERIODS + 1):
+        result = simulate(worn, count * period, count * period, tol)
+        impulses.append([values["impulse"] for values in result.statistics.values()])
+    forces = np.diff(np.array(impulses), axis=0) / period
+    return forces.mean(axis=0), forces.std(axis=0, ddof=1) / math.sqrt(len(forces))
+
+
+def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) -> Path:
+    """Follow the wear until a clearance is beyond its limit in m, or to `most_exposure` in 1/N.
+
+    Raises
+    ------
+    LifeError
+        Where the scene has no wear or no period.
+    """
+    if scene.wear is None:
+        raise LifeError("wear: got none, expected its parameters")
+    depth = np.array(scene.wear.initial_depth_m, dtype=np.float64)
+    smallest = min(scene.clearance.horizontal_m, scene.clearance.vertical_m)
+    force, deviation = mean_forces(scene, depth)
+    rows = [(0.0, depth, force, deviation)]
+    error, exposure = 0.0, 0.0
+    step = LARGEST_CHANGE * smallest / max(float(force.max()), 1.0)
+    while exposure < most_exposure and len(rows) < _MOST_STEPS and not _beyond(scene, rows[-1][1], limit):
+        step = min(step, most_exposure - exposure)
+        euler = depth + step * force
+        ahead, ahead_deviation = mean_forces(scene, euler)
+        change = 0.5 * step * (ahead - force)
+        # noise of the means is no error of the step
+        noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
+        off = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
+        if off > ERROR and step * float(force.max()) > 1e-3 * smallest:
+            step *= 0.5
+            continue
+        exposure, depth, force, deviation = exposure + step, euler + change, ahead, ahead_deviation
+        error += off * off * smallest + float(noise.max()) ** 2 / smallest
+        rows.append((exposure, depth, force, deviation))
+        grow = 1.5 if off < 0.3 * ERROR else 1.0
+        step = min(grow * step, LARGEST_CHANGE * smallest / max(float(force.max()), 1.0))
+    columns = [np.array([row[i] for row in rows]) for i in range(4)]
+    return Path(columns[0], columns[1], columns[2], columns[3], error)
+
+
+def _beyond(scene: Scene, depth: Array, limit: tuple[float, float]) -> bool:
+    horizontal = scene.clearance.horizontal_m + 0.5 * float(depth @ np.abs(NORMAL_X))
+    vertical = scene.clearance.vertical_m + 0.5 * float(depth @ np.abs(NORMAL_Y))
+    return horizontal >= limit[0] or vertical >= limit[1]
