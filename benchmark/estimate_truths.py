@@ -69,7 +69,7 @@ GROUPS = {
     "kelvin_voigt": Group("truth: Kelvin-Voigt", law="kelvin_voigt", model="suspect"),
     "exponent": Group("truth: exponent 1.5", exponent=1.5, stiffness=(5e7, 3e8), model="suspect"),
     "shape": Group("truth: third harmonic of 15 %", third_harmonic=0.15, model="suspect"),
-    "scale": Group("truth: 1.4 times the load", load_scale=1.4, model="suspect"),
+    "scale": Group("truth: 1.4 times the load", stiffness=(1e7, 3e7), load_scale=1.4, model="suspect"),
     "jam": Group("packed coal: 4 mm less from a moment on", jam_m=4e-3, model="suspect"),
     "shift": Group("sensor shifted by 3 mm", shift_m=3e-3, sensor="suspect"),
     "stuck": Group("sensor stuck", stuck=True, sensor="suspect"),

@@ -58,6 +58,9 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
             verdict.model.append(f"load {name}: {gain:.2f} times the load believed")
     if not fit.converged:
         verdict.figures["not_converged"] = 1.0
+    if verdict.sensor:
+        # with a sensor that is wrong nothing can be said about the model
+        verdict.model.clear()
     return verdict
 
 
