@@ -122,7 +122,7 @@ def test_the_interface_page_is_the_code_s() -> None:
 
 def test_the_model_page_names_reconstruction_s_figures() -> None:
     text = (ROOT / "docs" / "model.md").read_text()
-    result = plow_twin.run.simulate(loads_scene((ROOT / "config" / "paper.yaml").read_text(), ROOT), 60.0)
+    result = plow_twin.simulate(loads_scene((ROOT / "config" / "paper.yaml").read_text(), ROOT), 60.0)
     table = result.statistics
     for pair, senses in (("bottom_right_bottom", "147.6 / 75.0 kN"), ("top_right_top", "183.3 / 90.2 kN")):
         row = table[pair]
