@@ -43,3 +43,12 @@ def test_the_lowest_versions_are_those_that_setup_names(monkeypatch) -> None:
         # `6` is the first release of 6, `1.26` the last patch of 1.26
         assert lowest[name].removesuffix(".*").split(".")[: len(version.split("."))] == version.split("."), name
     assert "1.26" in lowest["numpy"]
+
+
+def test_ci_ends_within_half_an_hour_and_runs_every_check() -> None:
+    steps = re.findall(r'^step "([^"]+)" (\d+) make (\S+)', (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
+    assert sum(int(limit) for _, limit, _ in steps) <= 1800
+    assert {target for _, _, target in steps} >= {"test", "coverage", "lint", "docs", "demo", "lowest"}
+    assert "test_stream_session.py" in dry_run("coverage") and "--cov" not in dry_run("test")
+    lowest = dry_run("lowest")
+    assert all(name in lowest for name in ("test_solve_reference.py", "test_record_replay.py", "test_ros_node.py"))
