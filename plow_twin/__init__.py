@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 from warnings import warn as _warn
 
 from plow_twin.errors import ArgumentError as ArgumentError
+from plow_twin.errors import LimitError as LimitError
 from plow_twin.errors import PlowTwinError as PlowTwinError
 from plow_twin.errors import Problem as Problem
 from plow_twin.errors import RecordingError as RecordingError
+from plow_twin.errors import RunInterrupted as RunInterrupted
 from plow_twin.errors import SceneError as SceneError
 from plow_twin.errors import SolverError as SolverError
 from plow_twin.model.contact_laws import ContactLaw as ContactLaw

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 
 class PlowTwinError(Exception):
@@ -56,6 +57,24 @@ class ArgumentError(PlowTwinError, ValueError):
 
 class SolverError(PlowTwinError, RuntimeError):
     """The motion could not be continued; the message says when and why."""
+
+
+class LimitError(SolverError):
+    """A run has reached a limit that its caller set; `result` is the motion up to `time_s`."""
+
+    def __init__(self, message: str, result: Any, time_s: float) -> None:
+        super().__init__(message)
+        self.result = result
+        self.time_s = time_s
+
+
+class RunInterrupted(PlowTwinError, KeyboardInterrupt):
+    """A run was interrupted by the user; `result` is the motion up to `time_s`."""
+
+    def __init__(self, message: str, result: Any, time_s: float) -> None:
+        super().__init__(message)
+        self.result = result
+        self.time_s = time_s
 
 
 class RecordingError(PlowTwinError, ValueError):

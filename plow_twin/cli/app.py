@@ -21,7 +21,7 @@ from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
 from plow_twin.cli.view import view
-from plow_twin.errors import PlowTwinError, SceneError
+from plow_twin.errors import PlowTwinError, RunInterrupted, SceneError
 
 #: Extra of the package that brings a module.
 EXTRA_OF_MODULE: Final = {
@@ -79,6 +79,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
     except click.ClickException as error:
         error.show()
         return error.exit_code
+    except RunInterrupted as error:
+        return _fail(str(error))
     except (click.Abort, KeyboardInterrupt):
         return _fail("interrupted")
     except SceneError as error:

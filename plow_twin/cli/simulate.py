@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from plow_twin.cli.console import DONE, POSITIVE, busy, json_option, kilonewton, output_console, quiet_option, table
+from plow_twin.cli.console import DONE, POSITIVE, json_option, kilonewton, output_console, progress, quiet_option, table
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from plow_twin.errors import LimitError, RunInterrupted
     from plow_twin.run.energy_balance import EnergyBalance
     from plow_twin.run.simulate import Result
 
@@ -44,6 +45,10 @@ MOST_ROWS: Final = 10_000_000
     is_flag=True,
     help="Balance energy and momentum; costs about as much as the run.",
 )
+@click.option("--max-steps", type=click.IntRange(min=1), default=10**8, show_default=True, help="Steps at most.")
+@click.option(
+    "--max-wall", metavar="S", type=POSITIVE, default=3600.0, show_default=True, help="Wall-clock time at most [s]."
+)
 @quiet_option
 def simulate(
     scene: str,
@@ -55,12 +60,20 @@ def simulate(
     method: str,
     dt: float | None,
     energy_balance: bool,
+    max_steps: int,
+    max_wall: float,
     quiet: bool,
 ) -> int:
-    """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc."""
+    """Simulate SCENE, a file or one of the presets paper, bench_kv, bench_hc.
+
+    Ctrl-C and the limits end it with what has been computed: files and JSON are written up to there, exit code 1.
+    """
     _check_usage(out, method, dt)
     _check_rows(t_end, output_dt)
-    result = _run(scene, quiet, t_end, output_dt, tol, method, dt, energy_balance)
+    result, stopped = _run(
+        scene, quiet, t_end, output_dt, tol, method, dt, energy_balance, max_steps=max_steps, max_wall_s=max_wall
+    )
+    t_end = t_end if stopped is None else stopped.time_s
     if out is not None:
         try:
             write_samples(result, out)
@@ -70,18 +83,25 @@ def simulate(
         click.echo(json.dumps(as_plain(result, scene, t_end), indent=2, allow_nan=False))
     elif not quiet:
         _print_statistics(result, scene, t_end)
+    if stopped is not None:
+        raise stopped
     return DONE
 
 
-def _run(scene: str, quiet: bool, t_end: float, *settings: Any) -> Result:
-    from plow_twin.errors import SceneError
+def _run(
+    scene: str, quiet: bool, t_end: float, *settings: Any, **limits: Any
+) -> tuple[Result, LimitError | RunInterrupted | None]:
+    """Run the scene; after Ctrl-C or at a limit return what has been computed, and what ended it."""
+    from plow_twin.errors import LimitError, RunInterrupted, SceneError
     from plow_twin.run.simulate import simulate as run
     from plow_twin.scene_file import load_scene
 
     model = load_scene(scene)
     try:
-        with busy(f"simulating {t_end:g} s (the first run compiles)", quiet):
-            return run(model, t_end, *settings)
+        with progress(f"simulating {t_end:g} s (the first run compiles)", quiet) as on_progress:
+            return run(model, t_end, *settings, **limits, on_progress=on_progress), None
+    except (LimitError, RunInterrupted) as stop:
+        return stop.result, stop
     except SceneError:
         raise
     except ValueError as error:

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import time as _time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import ArgumentError, SolverError
+from plow_twin.errors import ArgumentError, LimitError, RunInterrupted, SolverError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
 from plow_twin.solve import fixed_step, loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.energy_balance import BalanceSums, new_balance
-from plow_twin.solve.state import TOTALS, Log, State, Status, Totals, Work, new_log, new_record, new_work
+from plow_twin.solve.state import OFF, TOTALS, Log, State, Status, Totals, Work, new_log, new_record, new_work
 
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
@@ -26,8 +26,12 @@ Array = NDArray[np.float64]
 EVENT_DTYPE: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
 _FIRST_LOG = 4096
 _ROWS_BY_DEFAULT = 1000
-#: Steps after which a run gives up with a named error: minutes of work.
+#: Steps and seconds after which a run gives up with a named error, unless its caller says otherwise.
 BUDGET: Final = 10**8
+MOST_SECONDS: Final = 3600.0
+#: Work between two looks at the clock in s, and steps before the first: explicit ones take microseconds.
+_SLICE_S: Final = 0.02
+_FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,10 @@ def simulate(
     method: Method = "events",
     dt: float | None = None,
     energy_balance: bool = False,
+    *,
+    max_steps: int = BUDGET,
+    max_wall_s: float = MOST_SECONDS,
+    on_progress: Callable[[float], None] | None = None,
 ) -> Result:
     """Simulate a scene from t = 0 to `t_end`.
 
@@ -102,6 +110,12 @@ def simulate(
         The fixed step in s.
     energy_balance : bool
         Balance energy and momentum (`Result.energy_balance`); off, its code does not run.
+    max_steps : int
+        Steps that the run may take.
+    max_wall_s : float
+        Seconds of wall-clock time that the run may take, compiling not counted.
+    on_progress : callable, optional
+        Called with the share of the motion that is done, 0..1, some fifty times a second.
 
     Returns
     -------
@@ -114,19 +128,71 @@ def simulate(
         For an argument that cannot be used.
     SolverError
         When the motion could not be continued; says when and why.
+    LimitError
+        At one of the limits; says where the run stood, `result` holds the motion up to there.
+    RunInterrupted
+        After Ctrl-C, likewise; it is a `KeyboardInterrupt` too.
     """
     check_times(t_end, output_dt, method, dt)
+    _check_limits(max_steps, max_wall_s)
     compiled = compile_scene(scene, tol)
     if output_dt is None and dt is not None:
         output_dt = dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
     times = output_times(t_end, output_dt)
     begin = _time.perf_counter()
-    _run(compiled, np.zeros(1), 0.0, method, dt, energy_balance)
+    _run(compiled, _start(compiled, 1, energy_balance), np.zeros(1), 0.0, method, dt)
     compile_s = _time.perf_counter() - begin
     begin = _time.perf_counter()
-    motion = _run(compiled, times, t_end, method, dt, energy_balance)
-    wall_s = _time.perf_counter() - begin
-    return _result(compiled, times, t_end, tol, method, dt, motion, wall_s, compile_s)
+    motion, watch = _start(compiled, len(times), energy_balance), _Watch(t_end, max_steps, max_wall_s, on_progress)
+
+    def so_far(rows: int, time: float) -> Result:
+        wall_s = _time.perf_counter() - begin
+        return _result(compiled, times, rows, time, tol, method, dt, motion, wall_s, compile_s)
+
+    try:
+        _run(compiled, motion, times, t_end, method, dt, watch)
+    except _StoppedError as stop:
+        raise LimitError(str(stop), so_far(motion.rows, motion.time), motion.time) from None
+    except KeyboardInterrupt:
+        message = f"interrupted at t = {motion.time:.9g} s of {t_end:g} s"
+        raise RunInterrupted(message, so_far(motion.rows, motion.time), motion.time) from None
+    return so_far(len(times), t_end)
+
+
+class _StoppedError(Exception):
+    """A limit was reached."""
+
+
+class _Watch:
+    """What happens between two slices of a run: limits are kept, progress is told."""
+
+    def __init__(
+        self, t_end: float, max_steps: int, max_wall_s: float, on_progress: Callable[[float], None] | None
+    ) -> None:
+        self._t_end, self.max_steps, self._max_wall_s, self._on_progress = t_end, max_steps, max_wall_s, on_progress
+        self._begin = _time.perf_counter()
+
+    def look(self, motion: Motion) -> None:
+        """Raise `_StoppedError` at a limit."""
+        steps, wall = int(motion.state.steps), _time.perf_counter() - self._begin
+        if self._on_progress is not None:
+            self._on_progress(motion.time / self._t_end if self._t_end > 0.0 else 1.0)
+        limit = f"max_steps = {self.max_steps}" if steps >= self.max_steps else f"max_wall_s = {self._max_wall_s:g}"
+        if steps >= self.max_steps or wall >= self._max_wall_s:
+            mode = motion.state.mode
+            pairs = ", ".join(name for name, one in zip(PAIR_NAMES, mode, strict=True) if one != OFF)
+            raise _StoppedError(
+                f"{limit} reached at t = {motion.time:.9g} s of {self._t_end:g} s after {steps} steps and "
+                f"{wall:.1f} s; the last step was {float(motion.state.last_step_size):.3g} s long, in contact: "
+                f"{pairs or 'no pair'}"
+            )
+
+
+def _check_limits(max_steps: int, max_wall_s: float) -> None:
+    if isinstance(max_steps, bool) or not max_steps >= 1:
+        raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
+    if not max_wall_s > 0.0:
+        raise ArgumentError(f"max_wall_s: got {max_wall_s!r}, expected a time > 0 [s]")
 
 
 @dataclass
@@ -141,6 +207,20 @@ class Motion:
     penetration: Array | None = None
     force: Array | None = None
     sums: BalanceSums | None = None
+    #: rows written
+    first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+    #: reached by fixed steps, which leave the state's own time alone
+    fixed_time: float | None = None
+
+    @property
+    def rows(self) -> int:
+        """Rows written so far."""
+        return int(self.first[0])
+
+    @property
+    def time(self) -> float:
+        """Time reached in s."""
+        return float(self.state.step_start) if self.fixed_time is None else self.fixed_time
 
     @staticmethod
     def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
@@ -180,50 +260,99 @@ def output_times(t_end: float, output_dt: float | None) -> Array:
     return times if t_end - times[-1] <= 1e-9 * output_dt else np.append(times, t_end)
 
 
-def _run(
-    compiled: CompiledScene, times: Array, t_end: float, method: Method, dt: float | None, energy_balance: bool = False
-) -> Motion:
-    motion = Motion.start(compiled, np.zeros((len(times), 3)), np.zeros((len(times), 3)), outputs=True)
+def _start(compiled: CompiledScene, rows: int, energy_balance: bool) -> Motion:
+    motion = Motion.start(compiled, np.zeros((rows, 3)), np.zeros((rows, 3)), outputs=True)
     motion.sums = new_balance() if energy_balance else None
-    if dt is None:
-        code, _ = run_events(compiled, motion, times, t_end, new_work(), BUDGET)
-        time = float(motion.state.step_start)
-    else:
-        stride = round(float(times[1]) / dt) if len(times) > 1 else 1
-        code, time = _run_fixed(compiled, motion, round(t_end / dt), stride, dt, method == "euler")
-    if code != Status.OK:
-        raise SolverError(f"at t = {time:.9g} s: {Status(code).text}")
     return motion
 
 
+def _run(
+    compiled: CompiledScene,
+    motion: Motion,
+    times: Array,
+    t_end: float,
+    method: Method,
+    dt: float | None,
+    watch: _Watch | None = None,
+) -> None:
+    budget = BUDGET if watch is None else watch.max_steps
+    look = None if watch is None else watch.look
+    if dt is None:
+        code, _ = run_events(compiled, motion, times, t_end, new_work(), budget, look)
+    else:
+        stride = round(float(times[1]) / dt) if len(times) > 1 else 1
+        code = _run_fixed(compiled, motion, round(t_end / dt), stride, dt, method == "euler", budget, look)
+    if code == Status.BUDGET and watch is not None:
+        watch.look(motion)
+    if code != Status.OK:
+        raise SolverError(f"at t = {motion.time:.9g} s: {Status(code).text}")
+
+
 def run_events(
-    compiled: CompiledScene, motion: Motion, times: Array, t_end: float, work: Work, budget: int
+    compiled: CompiledScene,
+    motion: Motion,
+    times: Array,
+    t_end: float,
+    work: Work,
+    budget: int,
+    look: Callable[[Motion], None] | None = None,
 ) -> tuple[int, int]:
-    """Bring a motion to `t_end` by the event-located series; return its `Status` and the number of rows written."""
-    first = np.zeros(1, np.int64)
+    """Bring a motion to `t_end` by the event-located series; return its `Status` and the number of rows written.
+
+    `look` is called between slices of the run. Slices do not change a bit of it.
+    """
+    size = _FIRST_SLICE if compiled.parts.implicit is None else _FIRST_SLICE_IMPLICIT
     while True:
+        begin = _time.perf_counter()
+        allowed = budget if look is None else min(budget, int(motion.state.steps) + size)
         code = loop.integrate(
-            compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, budget, first,
-            times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
+            compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, allowed,
+            motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
         )  # fmt: skip
-        if code != Status.LOG_FULL:
-            return code, int(first[0])
-        motion.log = _grown(motion.log)
+        if code == Status.LOG_FULL:
+            motion.log = _grown(motion.log)
+        elif code == Status.BUDGET and allowed < budget and look is not None:
+            look(motion)
+            size = _next_slice(size, _time.perf_counter() - begin)
+        else:
+            return code, motion.rows
+
+
+def _next_slice(size: int, took_s: float) -> int:
+    return max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6)))))
 
 
 def _run_fixed(
-    compiled: CompiledScene, motion: Motion, steps: int, stride: int, dt: float, euler: bool
-) -> tuple[int, float]:
-    """Bring a motion through `steps` fixed steps; return its `Status` and the time reached."""
-    done = np.zeros(1, np.int64)
+    compiled: CompiledScene,
+    motion: Motion,
+    steps: int,
+    stride: int,
+    dt: float,
+    euler: bool,
+    budget: int,
+    look: Callable[[Motion], None] | None,
+) -> int:
+    """Bring a motion through `steps` fixed steps; return its `Status`."""
+    done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
-        code = fixed_step.integrate_fixed(
-            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, steps, dt, euler, stride,
+        begin = _time.perf_counter()
+        # the row at the end of a slice is written again by the next one, unless it is due
+        allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
+        code = int(fixed_step.integrate_fixed(
+            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, allowed, dt, euler, stride,
             motion.q, motion.v, motion.penetration, motion.force, motion.sums,
-        )  # fmt: skip
-        if code != Status.LOG_FULL:
-            return code, float(done[0]) * dt
-        motion.log = _grown(motion.log)
+        ))  # fmt: skip
+        motion.fixed_time, motion.first[0] = float(done[0]) * dt, int(done[0]) // stride + 1
+        if code == Status.LOG_FULL:
+            motion.log = _grown(motion.log)
+        elif code == Status.OK and allowed < steps:
+            if allowed == budget:
+                return int(Status.BUDGET)
+            if look is not None:
+                look(motion)
+            size = _next_slice(size, _time.perf_counter() - begin)
+        else:
+            return code
 
 
 def _grown(log: Log) -> Log:
@@ -237,7 +366,8 @@ def _grown(log: Log) -> Log:
 def _result(
     compiled: CompiledScene,
     times: Array,
-    t_end: float,
+    rows: int,
+    time: float,
     tol: float,
     method: str,
     dt: float | None,
@@ -257,9 +387,10 @@ def _result(
         "events": int(state.events) if method != "events" else size,
     }  # fmt: skip
     return Result(
-        t=times, q=motion.q, v=motion.v, force=motion.force, penetration=motion.penetration, events=events,
-        statistics=statistics_of(motion.totals, t_end), contact_sets=contact_sets_of(scene, motion.totals),
-        solver=solver, wear_depth=motion.state.wear_depth.copy(), wall_s=wall_s, compile_s=compile_s,
+        t=times[:rows], q=motion.q[:rows], v=motion.v[:rows], force=motion.force[:rows],
+        penetration=motion.penetration[:rows], events=events, statistics=statistics_of(motion.totals, time),
+        contact_sets=contact_sets_of(scene, motion.totals), solver=solver, wear_depth=motion.state.wear_depth.copy(),
+        wall_s=wall_s, compile_s=compile_s,
         energy_balance=energy_balance_of(compiled, motion.state, motion.sums) if motion.sums is not None else None,
     )  # fmt: skip
 
