@@ -16,7 +16,8 @@ from cases import Array, Case, Row, Sample, pose_error, timed
 from lean import rk4
 
 from plow_twin import Scene, SolverError, Status, simulate
-from plow_twin.run.simulate import BUDGET, Method, Motion, output_times, run_events
+from plow_twin.run.motion import BUDGET, Motion, run_events
+from plow_twin.run.simulate import Method, output_times
 from plow_twin.solve.compiled_scene import compile_scene
 from plow_twin.solve.state import new_work
 

@@ -14,6 +14,7 @@ from plow_twin.errors import RecordingError as RecordingError
 from plow_twin.errors import RunInterrupted as RunInterrupted
 from plow_twin.errors import SceneError as SceneError
 from plow_twin.errors import SolverError as SolverError
+from plow_twin.errors import ToleranceWarning as ToleranceWarning
 from plow_twin.model.contact_laws import ContactLaw as ContactLaw
 from plow_twin.model.contact_laws import add_law as add_law
 from plow_twin.model.pairs import PAIR_NAMES as PAIR_NAMES
@@ -38,6 +39,7 @@ from plow_twin.run.batch import TwinBatch as TwinBatch
 from plow_twin.run.energy_balance import EnergyBalance as EnergyBalance
 from plow_twin.run.ensemble import Ensemble as Ensemble
 from plow_twin.run.ensemble import simulate_many as simulate_many
+from plow_twin.run.sensitivity import Sensitivity as Sensitivity
 from plow_twin.run.simulate import Result as Result
 from plow_twin.run.simulate import simulate as simulate
 from plow_twin.run.twin import Status as Status

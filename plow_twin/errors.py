@@ -77,5 +77,9 @@ class RunInterrupted(PlowTwinError, KeyboardInterrupt):
         self.time_s = time_s
 
 
+class ToleranceWarning(UserWarning):
+    """A motion amplifies errors so much that the tolerance asked for does not hold."""
+
+
 class RecordingError(PlowTwinError, ValueError):
     """A recording cannot be written or read; the message names the file and the record."""

@@ -10,7 +10,8 @@ from scenes import preset
 
 from plow_twin import Contact, Head, Wear, simulate
 from plow_twin.run.energy_balance import energy_balance_of
-from plow_twin.run.simulate import Motion, _run, run_events
+from plow_twin.run.motion import Motion, run_events
+from plow_twin.run.simulate import _start
 from plow_twin.solve.compiled_scene import compile_scene
 from plow_twin.solve.energy_balance import new_balance
 from plow_twin.solve.state import new_work
@@ -46,7 +47,7 @@ def test_the_balance_balance(name: str) -> None:
 def test_the_balance_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -> None:
     plain, balanced = simulate(PAPER, 2.0), simulate(PAPER, 2.0, energy_balance=True)
     assert np.array_equal(plain.q, balanced.q) and plain.solver == balanced.solver and plain.energy_balance is None
-    assert _run(compile_scene(PAPER, 1e-9), np.zeros(1), 0.0, "events", None).sums is None
+    assert _start(compile_scene(PAPER, 1e-9), 1, energy_balance=False).sums is None
 
 
 def test_a_wrong_motion_does_not_balance() -> None:

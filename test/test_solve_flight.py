@@ -9,7 +9,8 @@ import pytest
 from scenes import preset
 
 from plow_twin import Gravity, Harmonic, Initial, Scene, Table, Twin, simulate
-from plow_twin.run.simulate import Motion, output_times, run_events
+from plow_twin.run.motion import Motion, run_events
+from plow_twin.run.simulate import output_times
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.state import new_work
 

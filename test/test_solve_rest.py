@@ -125,3 +125,9 @@ def test_a_spring_that_nothing_damps_goes_on_ringing() -> None:
     result = simulate(scene, 60.0, 0.01, tol=1e-9)
     late = result.q[result.t > 50.0, 1]
     assert np.ptp(late) > 1e-3
+
+
+def test_a_load_that_is_nothing_does_not_keep_a_head_awake() -> None:
+    still = fallen()
+    hum = dataclasses.replace(still, loads=(*still.loads, Harmonic("nothing", (0.0, 0.0), 2.0)))
+    assert simulate(hum, 1000.0).solver == simulate(still, 1000.0).solver

@@ -73,6 +73,16 @@ def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
         yield on_progress
 
 
+@contextmanager
+def busy(title: str, quiet: bool) -> Iterator[None]:
+    """Show on standard error that work without known length goes on."""
+    if quiet:
+        yield
+        return
+    with error_console().status(title):
+        yield
+
+
 def table(title: str, *columns: str) -> Table:
     """Return a table whose first column is text and whose others are numbers."""
     result = Table(title=title, title_justify="left")

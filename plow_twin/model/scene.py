@@ -457,6 +457,10 @@ def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
             yield from _check_table(f"loads[{index}]", load)
 
 
+#: Least time between two samples of a table in s; between closer ones the solver cannot step.
+LEAST_SPACING_S: Final = 1e-15
+
+
 def _check_table(key: str, table: Table) -> Iterator[Problem]:
     t, wrench = np.asarray(table.t), np.asarray(table.wrench)
     if t.ndim != 1 or len(t) < 1:
@@ -469,3 +473,7 @@ def _check_table(key: str, table: Table) -> Iterator[Problem]:
     elif (np.diff(t) <= 0.0).any():
         row = int(np.flatnonzero(np.diff(t) <= 0.0)[0]) + 1
         yield Problem(f"{key}.t[{row}]", float(t[row]), f"more than the time before it, {float(t[row - 1])!r}")
+    elif (np.diff(t) < LEAST_SPACING_S).any():
+        row = int(np.flatnonzero(np.diff(t) < LEAST_SPACING_S)[0]) + 1
+        spacing = f"at least {LEAST_SPACING_S:g} s more than the time before it, {float(t[row - 1])!r}"
+        yield Problem(f"{key}.t[{row}]", float(t[row]), spacing)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
-from plow_twin.run.simulate import BUDGET, Motion, check_times, output_times, run_events
+from plow_twin.run.motion import BUDGET, Motion, run_events
+from plow_twin.run.simulate import check_times, output_times
 from plow_twin.solve.compiled_scene import compile_scene
 from plow_twin.solve.state import Status, Work, new_work
 

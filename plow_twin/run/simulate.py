@@ -3,35 +3,32 @@
 from __future__ import annotations
 
 import time as _time
+import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import ArgumentError, LimitError, RunInterrupted, SolverError
-from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES
+from plow_twin.errors import ArgumentError, LimitError, RunInterrupted, SolverError, ToleranceWarning
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
-from plow_twin.solve import fixed_step, loop
+from plow_twin.run.motion import BUDGET, Motion, run_events, run_fixed
+from plow_twin.run.sensitivity import Sensitivity, sensitivity_of
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
-from plow_twin.solve.energy_balance import BalanceSums, new_balance
-from plow_twin.solve.state import OFF, TOTALS, Log, State, Status, Totals, Work, new_log, new_record, new_work
+from plow_twin.solve.energy_balance import new_balance
+from plow_twin.solve.state import OFF, Status, Totals, new_work
 
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
 
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
 EVENT_DTYPE: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
-_FIRST_LOG = 4096
 _ROWS_BY_DEFAULT = 1000
-#: Steps and seconds after which a run gives up with a named error, unless its caller says otherwise.
-BUDGET: Final = 10**8
+#: Seconds after which a run gives up with a named error, unless its caller says otherwise.
 MOST_SECONDS: Final = 3600.0
-#: Work between two looks at the clock in s, and steps before the first: explicit ones take microseconds.
-_SLICE_S: Final = 0.02
-_FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
 
 
 @dataclass(frozen=True)
@@ -62,6 +59,8 @@ class Result:
         Time taken by the run, and by compiling before it, in s.
     energy_balance : EnergyBalance or None
         Energy and momentum, when asked for.
+    sensitivity : Sensitivity or None
+        How errors grow along the motion, when asked for.
     """
 
     t: Array
@@ -77,6 +76,7 @@ class Result:
     wall_s: float
     compile_s: float
     energy_balance: EnergyBalance | None = None
+    sensitivity: Sensitivity | None = None
 
 
 def simulate(
@@ -91,6 +91,7 @@ def simulate(
     max_steps: int = BUDGET,
     max_wall_s: float = MOST_SECONDS,
     on_progress: Callable[[float], None] | None = None,
+    sensitivity: bool = False,
 ) -> Result:
     """Simulate a scene from t = 0 to `t_end`.
 
@@ -116,6 +117,9 @@ def simulate(
         Seconds of wall-clock time that the run may take, compiling not counted.
     on_progress : callable, optional
         Called with the share of the motion that is done, 0..1, some fifty times a second.
+    sensitivity : bool
+        Follow displaced motions too, and say what the tolerance is worth (`Result.sensitivity`); some ten times the
+        work of the run. Warns with `ToleranceWarning` where errors grow too much for it.
 
     Returns
     -------
@@ -156,7 +160,13 @@ def simulate(
     except KeyboardInterrupt:
         message = f"interrupted at t = {motion.time:.9g} s of {t_end:g} s"
         raise RunInterrupted(message, so_far(motion.rows, motion.time), motion.time) from None
-    return so_far(len(times), t_end)
+    result = so_far(len(times), t_end)
+    if not sensitivity or t_end == 0.0:
+        return result
+    found = sensitivity_of(scene, t_end, tol)
+    if not found.trusted:
+        warnings.warn(str(found), ToleranceWarning, stacklevel=2)
+    return replace(result, sensitivity=found)
 
 
 class _StoppedError(Exception):
@@ -193,41 +203,6 @@ def _check_limits(max_steps: int, max_wall_s: float) -> None:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:
         raise ArgumentError(f"max_wall_s: got {max_wall_s!r}, expected a time > 0 [s]")
-
-
-@dataclass
-class Motion:
-    """A run under way, and the arrays that it fills."""
-
-    state: State
-    totals: Totals
-    log: Log
-    q: Array
-    v: Array
-    penetration: Array | None = None
-    force: Array | None = None
-    sums: BalanceSums | None = None
-    #: rows written
-    first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
-    #: reached by fixed steps, which leave the state's own time alone
-    fixed_time: float | None = None
-
-    @property
-    def rows(self) -> int:
-        """Rows written so far."""
-        return int(self.first[0])
-
-    @property
-    def time(self) -> float:
-        """Time reached in s."""
-        return float(self.state.step_start) if self.fixed_time is None else self.fixed_time
-
-    @staticmethod
-    def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
-        """Start at the scene's initial state; rows go to q and v, shape (n, 3) each, pair outputs to new arrays."""
-        eight = (len(q), PAIR_COUNT)
-        pairs = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
-        return Motion(compiled.initial_state(), new_record(TOTALS), new_log(_FIRST_LOG), q, v, *pairs)
 
 
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
@@ -281,86 +256,11 @@ def _run(
         code, _ = run_events(compiled, motion, times, t_end, new_work(), budget, look)
     else:
         stride = round(float(times[1]) / dt) if len(times) > 1 else 1
-        code = _run_fixed(compiled, motion, round(t_end / dt), stride, dt, method == "euler", budget, look)
+        code = run_fixed(compiled, motion, round(t_end / dt), stride, dt, method == "euler", budget, look)
     if code == Status.BUDGET and watch is not None:
         watch.look(motion)
     if code != Status.OK:
         raise SolverError(f"at t = {motion.time:.9g} s: {Status(code).text}")
-
-
-def run_events(
-    compiled: CompiledScene,
-    motion: Motion,
-    times: Array,
-    t_end: float,
-    work: Work,
-    budget: int,
-    look: Callable[[Motion], None] | None = None,
-) -> tuple[int, int]:
-    """Bring a motion to `t_end` by the event-located series; return its `Status` and the number of rows written.
-
-    `look` is called between slices of the run. Slices do not change a bit of it.
-    """
-    size = _FIRST_SLICE if compiled.parts.implicit is None else _FIRST_SLICE_IMPLICIT
-    while True:
-        begin = _time.perf_counter()
-        allowed = budget if look is None else min(budget, int(motion.state.steps) + size)
-        code = loop.integrate(
-            compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, allowed,
-            motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
-        )  # fmt: skip
-        if code == Status.LOG_FULL:
-            motion.log = _grown(motion.log)
-        elif code == Status.BUDGET and allowed < budget and look is not None:
-            look(motion)
-            size = _next_slice(size, _time.perf_counter() - begin)
-        else:
-            return code, motion.rows
-
-
-def _next_slice(size: int, took_s: float) -> int:
-    return max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6)))))
-
-
-def _run_fixed(
-    compiled: CompiledScene,
-    motion: Motion,
-    steps: int,
-    stride: int,
-    dt: float,
-    euler: bool,
-    budget: int,
-    look: Callable[[Motion], None] | None,
-) -> int:
-    """Bring a motion through `steps` fixed steps; return its `Status`."""
-    done, size = np.zeros(1, np.int64), _FIRST_SLICE
-    while True:
-        begin = _time.perf_counter()
-        # the row at the end of a slice is written again by the next one, unless it is due
-        allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
-        code = int(fixed_step.integrate_fixed(
-            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, allowed, dt, euler, stride,
-            motion.q, motion.v, motion.penetration, motion.force, motion.sums,
-        ))  # fmt: skip
-        motion.fixed_time, motion.first[0] = float(done[0]) * dt, int(done[0]) // stride + 1
-        if code == Status.LOG_FULL:
-            motion.log = _grown(motion.log)
-        elif code == Status.OK and allowed < steps:
-            if allowed == budget:
-                return int(Status.BUDGET)
-            if look is not None:
-                look(motion)
-            size = _next_slice(size, _time.perf_counter() - begin)
-        else:
-            return code
-
-
-def _grown(log: Log) -> Log:
-    larger = new_log(2 * log.time.size)
-    for new, old in zip(larger[:-1], log[:-1], strict=True):
-        new[: old.size] = old
-    larger.length[0] = log.length[0]
-    return larger
 
 
 def _result(

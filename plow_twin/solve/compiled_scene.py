@@ -219,6 +219,10 @@ def _harmonics(scene: Scene, loads: LoadSet) -> tuple[Array, Harmonics | None]:
         return np.eye(2), None
     # (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M
     amplitudes = np.stack([per_mass(scene, loads.sine), per_mass(scene, loads.cosine)], axis=1)
+    acting = amplitudes.any(axis=(1, 2))
+    if not acting.any():
+        return np.eye(2), None
+    amplitudes = amplitudes[acting]
     forces = amplitudes[:, :, :2].reshape(-1, 2)
     largest = forces[np.argmax(np.hypot(forces[:, 0], forces[:, 1]))]
     size = float(np.hypot(*largest))
@@ -226,7 +230,7 @@ def _harmonics(scene: Scene, loads: LoadSet) -> tuple[Array, Harmonics | None]:
     across = np.abs(forces @ np.array([-unit[1], unit[0]]))
     directions = np.array([unit, [0.0, 0.0]]) if across.max() <= 1e-15 * size else np.eye(2)
     harmonics = np.zeros(len(amplitudes), HARMONIC)
-    harmonics["omega"], harmonics["moment"] = loads.omega, amplitudes[:, :, 2]
+    harmonics["omega"], harmonics["moment"] = loads.omega[acting], amplitudes[:, :, 2]
     for i, name in enumerate(("first", "second")):
         harmonics[name] = amplitudes[:, :, :2] @ directions[i]
     return directions, harmonics

@@ -1,0 +1,136 @@
+"""A run under way: the compiled loop in slices, between which limits, progress and Ctrl-C are seen to."""
+
+from __future__ import annotations
+
+import time as _time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve import fixed_step, loop
+from plow_twin.solve.compiled_scene import CompiledScene
+from plow_twin.solve.energy_balance import BalanceSums
+from plow_twin.solve.state import TOTALS, Log, State, Status, Totals, Work, new_log, new_record
+
+Array = NDArray[np.float64]
+
+_FIRST_LOG: Final = 4096
+#: Steps after which a run gives up with a named error, unless its caller says otherwise.
+BUDGET: Final = 10**8
+#: Work between two looks at the clock in s, and steps before the first: explicit ones take microseconds.
+_SLICE_S: Final = 0.02
+_FIRST_SLICE, _FIRST_SLICE_IMPLICIT = 2048, 64
+
+
+@dataclass
+class Motion:
+    """A run under way, and the arrays that it fills."""
+
+    state: State
+    totals: Totals
+    log: Log
+    q: Array
+    v: Array
+    penetration: Array | None = None
+    force: Array | None = None
+    sums: BalanceSums | None = None
+    #: rows written
+    first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+    #: reached by fixed steps, which leave the state's own time alone
+    fixed_time: float | None = None
+
+    @property
+    def rows(self) -> int:
+        """Rows written so far."""
+        return int(self.first[0])
+
+    @property
+    def time(self) -> float:
+        """Time reached in s."""
+        return float(self.state.step_start) if self.fixed_time is None else self.fixed_time
+
+    @staticmethod
+    def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
+        """Start at the scene's initial state; rows go to q and v, shape (n, 3) each, pair outputs to new arrays."""
+        eight = (len(q), PAIR_COUNT)
+        pairs = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
+        return Motion(compiled.initial_state(), new_record(TOTALS), new_log(_FIRST_LOG), q, v, *pairs)
+
+
+def run_events(
+    compiled: CompiledScene,
+    motion: Motion,
+    times: Array,
+    t_end: float,
+    work: Work,
+    budget: int,
+    look: Callable[[Motion], None] | None = None,
+) -> tuple[int, int]:
+    """Bring a motion to `t_end` by the event-located series; return its `Status` and the number of rows written.
+
+    `look` is called between slices of the run. Slices do not change a bit of it.
+    """
+    size = _FIRST_SLICE if compiled.parts.implicit is None else _FIRST_SLICE_IMPLICIT
+    while True:
+        begin = _time.perf_counter()
+        allowed = budget if look is None else min(budget, int(motion.state.steps) + size)
+        code = loop.integrate(
+            compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, allowed,
+            motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
+        )  # fmt: skip
+        if code == Status.LOG_FULL:
+            motion.log = _grown(motion.log)
+        elif code == Status.BUDGET and allowed < budget and look is not None:
+            look(motion)
+            size = _next_slice(size, _time.perf_counter() - begin)
+        else:
+            return code, motion.rows
+
+
+def _next_slice(size: int, took_s: float) -> int:
+    return max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6)))))
+
+
+def run_fixed(
+    compiled: CompiledScene,
+    motion: Motion,
+    steps: int,
+    stride: int,
+    dt: float,
+    euler: bool,
+    budget: int,
+    look: Callable[[Motion], None] | None,
+) -> int:
+    """Bring a motion through `steps` fixed steps; return its `Status`."""
+    done, size = np.zeros(1, np.int64), _FIRST_SLICE
+    while True:
+        begin = _time.perf_counter()
+        # the row at the end of a slice is written again by the next one, unless it is due
+        allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
+        code = int(fixed_step.integrate_fixed(
+            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, allowed, dt, euler, stride,
+            motion.q, motion.v, motion.penetration, motion.force, motion.sums,
+        ))  # fmt: skip
+        motion.fixed_time, motion.first[0] = float(done[0]) * dt, int(done[0]) // stride + 1
+        if code == Status.LOG_FULL:
+            motion.log = _grown(motion.log)
+        elif code == Status.OK and allowed < steps:
+            if allowed == budget:
+                return int(Status.BUDGET)
+            if look is not None:
+                look(motion)
+            size = _next_slice(size, _time.perf_counter() - begin)
+        else:
+            return code
+
+
+def _grown(log: Log) -> Log:
+    larger = new_log(2 * log.time.size)
+    for new, old in zip(larger[:-1], log[:-1], strict=True):
+        new[: old.size] = old
+    larger.length[0] = log.length[0]
+    return larger

@@ -1,0 +1,66 @@
+"""What a tolerance is worth: growth of errors against finite differences, a map's exponent, a scene that amplifies."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import preset
+from test_known_ball import GRAVITY, OMEGA, PERIOD
+
+from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Initial, Scene, ToleranceWarning, simulate
+
+
+def bouncing(gamma: float, r: float, stiffness: float) -> Scene:
+    """A ball on a table that vibrates with A w^2 = gamma g, in the table's frame, on its period-one orbit."""
+    phase = math.acos(math.pi * (1.0 - r) / (1.0 + r) / gamma)
+    speed = 0.5 * GRAVITY * PERIOD - gamma * GRAVITY / OMEGA * math.cos(phase)
+    return Scene(
+        head=Head(1.0, 1.0),
+        frame=Frame(0.2, 0.2),
+        clearance=Clearance(0.5, 0.5),
+        contact=Contact("exact_restitution", stiffness, restitution=r),
+        gravity=Gravity(GRAVITY),
+        loads=(Harmonic("table", (0.0, gamma * GRAVITY), OMEGA, phase),),
+        initial=Initial((0.0, -0.25, 0.0), (0.0, speed, 0.0)),
+        locked=("x", "theta"),
+        pairs=("top_left_top",),
+    )
+
+
+def test_the_exponent_of_a_ball_on_a_vibrating_table_is_that_of_its_map() -> None:
+    """The map of the impacts shrinks areas by r^2 each period, its eigenvalues are a pair of size r: ln(r) a period."""
+    r = 0.5
+    result = simulate(bouncing(1.3, r, 1e10), 4.0, sensitivity=True)
+    assert result.sensitivity is not None and result.sensitivity.trusted
+    assert result.sensitivity.exponent == pytest.approx(math.log(r) / PERIOD, rel=0.05)
+
+
+def test_the_derivatives_are_finite_differences_of_the_motion() -> None:
+    scene = replace(preset("bench_kv"), initial=Initial((0.001, 0.002, 0.003), (0.1, 0.0, 0.2)))
+    found = simulate(scene, 0.5, sensitivity=True).sensitivity
+    assert found is not None
+    for column, (name, size) in enumerate(
+        [("q", 1e-6), ("q", 1e-6), ("q", 1e-6), ("v", 1e-6), ("v", 1e-6), ("v", 1e-6)]
+    ):
+        ends = []
+        for sign in (1.0, -1.0):
+            moved = np.array(getattr(scene.initial, name))
+            moved[column % 3] += sign * size
+            other = replace(scene, initial=replace(scene.initial, **{name: tuple(moved)}))
+            run = simulate(other, 0.5, tol=1e-12)
+            ends.append(np.concatenate([run.q[-1], run.v[-1]]))
+        expected = (ends[0] - ends[1]) / (2.0 * size)
+        assert found.from_start[-1][:, column] == pytest.approx(expected, abs=1e-3 * abs(found.from_start[-1]).max())
+
+
+def test_a_scene_that_amplifies_is_told() -> None:
+    hard = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
+    with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times, largest Lyapunov exponent"):
+        found = simulate(hard, 2.0, tol=1e-9, sensitivity=True).sensitivity
+    assert found is not None and found.good_until(1e-9) < found.good_until(1e-4) <= 2.0
+    calm = simulate(preset("bench_kv"), 2.0, sensitivity=True).sensitivity
+    assert calm is not None and calm.trusted and calm.good_until(1e-2) == 2.0
+    assert simulate(preset("bench_kv"), 2.0).sensitivity is None
