@@ -60,7 +60,15 @@ class SolverError(PlowTwinError, RuntimeError):
 
 
 class LimitError(SolverError):
-    """A run has reached a limit that its caller set; `result` is the motion up to `time_s`."""
+    """A run has reached a limit that its caller set; `result` is the motion up to `time_s`.
+
+    Attributes
+    ----------
+    result : Result
+        The motion so far.
+    time_s : float
+        Model time reached in s.
+    """
 
     def __init__(self, message: str, result: Any, time_s: float) -> None:
         super().__init__(message)
@@ -69,7 +77,15 @@ class LimitError(SolverError):
 
 
 class RunInterrupted(PlowTwinError, KeyboardInterrupt):
-    """A run was interrupted by the user; `result` is the motion up to `time_s`."""
+    """A run was interrupted by the user; `result` is the motion up to `time_s`.
+
+    Attributes
+    ----------
+    result : Result
+        The motion so far.
+    time_s : float
+        Model time reached in s.
+    """
 
     def __init__(self, message: str, result: Any, time_s: float) -> None:
         super().__init__(message)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     from plow_twin.errors import LimitError, RunInterrupted
     from plow_twin.run.energy_balance import EnergyBalance
+    from plow_twin.run.sensitivity import Sensitivity
     from plow_twin.run.simulate import Result
 
 #: A row takes some 200 B.
@@ -45,6 +47,9 @@ MOST_ROWS: Final = 10_000_000
     is_flag=True,
     help="Balance energy and momentum; costs about as much as the run.",
 )
+@click.option(
+    "--trust", is_flag=True, help="Say how errors grow and what the tolerance is worth; costs some ten times the run."
+)
 @click.option("--max-steps", type=click.IntRange(min=1), default=10**8, show_default=True, help="Steps at most.")
 @click.option(
     "--max-wall", metavar="S", type=POSITIVE, default=3600.0, show_default=True, help="Wall-clock time at most [s]."
@@ -60,6 +65,7 @@ def simulate(
     method: str,
     dt: float | None,
     energy_balance: bool,
+    trust: bool,
     max_steps: int,
     max_wall: float,
     quiet: bool,
@@ -71,7 +77,17 @@ def simulate(
     _check_usage(out, method, dt)
     _check_rows(t_end, output_dt)
     result, stopped = _run(
-        scene, quiet, t_end, output_dt, tol, method, dt, energy_balance, max_steps=max_steps, max_wall_s=max_wall
+        scene,
+        quiet,
+        t_end,
+        output_dt,
+        tol,
+        method,
+        dt,
+        energy_balance,
+        max_steps=max_steps,
+        max_wall_s=max_wall,
+        sensitivity=trust,
     )
     t_end = t_end if stopped is None else stopped.time_s
     if out is not None:
@@ -83,6 +99,8 @@ def simulate(
         click.echo(json.dumps(as_plain(result, scene, t_end), indent=2, allow_nan=False))
     elif not quiet:
         _print_statistics(result, scene, t_end)
+        if result.sensitivity is not None:
+            output_console().print(str(result.sensitivity))
     if stopped is not None:
         raise stopped
     return DONE
@@ -92,13 +110,16 @@ def _run(
     scene: str, quiet: bool, t_end: float, *settings: Any, **limits: Any
 ) -> tuple[Result, LimitError | RunInterrupted | None]:
     """Run the scene; after Ctrl-C or at a limit return what has been computed, and what ended it."""
-    from plow_twin.errors import LimitError, RunInterrupted, SceneError
+    from plow_twin.errors import LimitError, RunInterrupted, SceneError, ToleranceWarning
     from plow_twin.run.simulate import simulate as run
     from plow_twin.scene_file import load_scene
 
     model = load_scene(scene)
     try:
-        with progress(f"simulating {t_end:g} s (the first run compiles)", quiet) as on_progress:
+        title = f"simulating {t_end:g} s (the first run compiles)"
+        with progress(title, quiet) as on_progress, warnings.catch_warnings():
+            # said with the results
+            warnings.simplefilter("ignore", ToleranceWarning)
             return run(model, t_end, *settings, **limits, on_progress=on_progress), None
     except (LimitError, RunInterrupted) as stop:
         return stop.result, stop
@@ -163,6 +184,7 @@ def as_plain(result: Result, scene: str, t_end: float) -> dict[str, Any]:
         "solver": _plain(result.solver),
         "wall_s": float(result.wall_s),
         "compile_s": float(result.compile_s),
+        **({} if result.sensitivity is None else {"trust": _trust_of(result.sensitivity)}),
         **({} if result.energy_balance is None else {"energy_balance": _plain(balance_of(result.energy_balance))}),
     }
 
@@ -175,6 +197,15 @@ def balance_of(balance: EnergyBalance) -> dict[str, Any]:
 
     plain = {key: np.asarray(value).tolist() for key, value in asdict(balance).items()}
     return {**plain, "relative_imbalance": balance.relative_imbalance}
+
+
+def _trust_of(found: Sensitivity) -> dict[str, Any]:
+    return {
+        "trusted": found.trusted,
+        "growth": float(found.growth.max()),
+        "lyapunov_exponent_1_s": found.exponent,
+        "good_to_1_percent_until_s": found.good_until(1e-2),
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -63,7 +63,13 @@ class Sensitivity:
         return bool(self.growth.max() <= TRUSTED_GROWTH)
 
     def good_until(self, accuracy: float) -> float:
-        """Return the time in s up to which the pose is good to `accuracy`, relative to the clearance."""
+        """Return the time in s up to which the pose is good to an accuracy.
+
+        Parameters
+        ----------
+        accuracy : float
+            Error of the pose relative to the clearance.
+        """
         bad = np.flatnonzero(self.tol * self.growth > accuracy)
         return float(self.t[-1] if len(bad) == 0 else self.t[max(0, bad[0] - 1)])
 
