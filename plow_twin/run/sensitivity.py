@@ -7,6 +7,7 @@ the variational equations, saltation) is in them, since each shadow has its own 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -26,6 +27,8 @@ Array = NDArray[np.float64]
 _DISPLACEMENT: Final = 1e-7
 _TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
+#: A stretch does not end where some pair is nearer to its wall than so many displacements, unless so many in a row do.
+_CLEAR_OF_WALLS, _MOST_MERGED = 100.0, 20
 #: Steps of one shadow over one stretch.
 _BUDGET: Final = 10**7
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
@@ -39,7 +42,7 @@ class Sensitivity:
     Attributes
     ----------
     t : ndarray, shape (n,)
-        Times in s.
+        Times in s; the last one is a little before the end where a pair is just at its wall there.
     growth : ndarray, shape (n,)
         Largest factor by which an error made at any time before has grown at `t`. Errors count as poses relative to the
         clearance, velocities over the time in which the largest load crosses it.
@@ -101,22 +104,36 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float) -> Sensitivity:
     # finer than the displacement by so much that the difference keeps five digits
     compiled = compile_scene(scene, min(max(_TOLERANCE, TOLERANCE_RANGE[0]), tol))
     scale, free = _scale(compiled), _free(scene)
-    times = np.linspace(0.0, t_end, _STRETCHES + 1)
-    work, state = new_work(), compiled.initial_state()
+    work, state, begin, merged = new_work(), compiled.initial_state(), 0.0, 0
     size = len(free)
     total, since, basis = np.eye(size), np.zeros((0, size, size)), np.eye(size)
-    growth, from_start, logs = [1.0], [np.eye(size)], []
-    for end in times[1:]:
-        after, matrix = _stretch(compiled, state, float(end), free, scale, work)
+    times, growth, from_start, logs = [0.0], [1.0], [np.eye(size)], np.zeros(size)
+    for end in _ends(t_end):
+        after, reached, nearest = _follow(compiled, state, end, None, work)
+        if nearest < _CLEAR_OF_WALLS * _DISPLACEMENT * scale[0] and merged < _MOST_MERGED:
+            merged += 1
+            continue
+        merged = 0
+        matrix = _derivatives(compiled, state, end, reached, free, scale, work)
         total = matrix @ total
         since = matrix @ np.concatenate([since, np.eye(size)[None]])
         basis, upper = np.linalg.qr(matrix @ basis)
-        logs.append(np.log(np.maximum(np.abs(np.diag(upper)), 1e-300)))
+        if times[-1] >= 0.5 * t_end:
+            begin = begin if begin > 0.0 else times[-1]
+            logs += np.log(np.maximum(np.abs(np.diag(upper)), 1e-300))
+        times.append(end)
         growth.append(max(1.0, float(np.linalg.norm(since, 2, axis=(1, 2)).max())))
         from_start.append(total * scale[free][:, None] / scale[free][None, :])
         state = after
-    late = np.array(logs[_STRETCHES // 2 :]).sum(axis=0) / (t_end - times[_STRETCHES // 2])
-    return Sensitivity(times, np.array(growth), np.array(from_start), float(late.max()), tol)
+    exponent = float(logs.max()) / max(times[-1] - begin, 1e-300)
+    return Sensitivity(np.array(times), np.array(growth), np.array(from_start), exponent, tol)
+
+
+def _ends(t_end: float) -> list[float]:
+    """Return where stretches end: not evenly, so that they keep no pace with what is periodic."""
+    ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
+    ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
+    return [*(ends[:-1] / _STRETCHES * t_end).tolist(), t_end]
 
 
 def _scale(compiled: CompiledScene) -> Array:
@@ -133,23 +150,33 @@ def _free(scene: Scene) -> NDArray[np.int64]:
     return np.array(places + [3 + index for index in places], dtype=np.int64)
 
 
-def _stretch(
-    compiled: CompiledScene, state: Any, end: float, free: NDArray[np.int64], scale: Array, work: Work
-) -> tuple[Any, Array]:
-    """Return the state at `end` and the derivatives of the scaled state there by the one at the start."""
-    after, reached = _follow(compiled, state, end, None, work)
-    start = _pose(compiled, state, work)
+def _derivatives(
+    compiled: CompiledScene,
+    state: Any,
+    end: float,
+    reached: Array,
+    free: NDArray[np.int64],
+    scale: Array,
+    work: Work,
+) -> Array:
+    """Return the derivatives of the scaled state at `end`, where it is `reached`, by the one at the start."""
+    start = _follow(compiled, state, float(state.time), None, work)[1]
     columns = []
     for index in free:
         displaced = start.copy()
         displaced[index] += _DISPLACEMENT * scale[index]
-        _, shadow = _follow(compiled, state, end, displaced, work)
+        shadow = _follow(compiled, state, end, displaced, work)[1]
         columns.append((shadow - reached)[free] / scale[free] / _DISPLACEMENT)
-    return after, np.array(columns).T
+    return np.array(columns).T
 
 
-def _follow(compiled: CompiledScene, state: Any, end: float, displaced: Array | None, work: Work) -> tuple[Any, Array]:
-    """Bring a copy of a state, displaced in pose and rate, to `end`; return it with its pose and rate, shape (6,)."""
+def _follow(
+    compiled: CompiledScene, state: Any, end: float, displaced: Array | None, work: Work
+) -> tuple[Any, Array, float]:
+    """Bring a copy of a state, displaced in pose and rate, to `end`.
+
+    Return it with its pose and rate, shape (6,), and how near the nearest pair is to its wall in m, inside or outside.
+    """
     records = new_records(STATE, 1)
     records[0] = state
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
@@ -159,9 +186,6 @@ def _follow(compiled: CompiledScene, state: Any, end: float, displaced: Array | 
     code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _BUDGET)
     if code != Status.OK:
         raise SolverError(f"shadow at t = {motion.time:.9g} s: {Status(code).text}")
-    return motion.state, np.concatenate([motion.q[0], motion.v[0]])
-
-
-def _pose(compiled: CompiledScene, state: Any, work: Work) -> Array:
-    """Return pose and rate at the state's own time, shape (6,)."""
-    return _follow(compiled, state, float(state.time), None, work)[1]
+    assert motion.penetration is not None
+    nearest = float(np.abs(motion.penetration[0, compiled.params.enabled == 1]).min(initial=np.inf))
+    return motion.state, np.concatenate([motion.q[0], motion.v[0]]), nearest
