@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 import runpy
 import subprocess
+from typing import Any
 
+import pytest
 from hypothesis import Phase, settings
 from scenes import ROOT
 
@@ -25,17 +27,32 @@ def test_stress_draws_new_examples_prints_its_seed_and_shrinks() -> None:
     assert "--hypothesis" not in dry_run("test") and settings.get_profile("plow_twin").derandomize
 
 
-def test_the_lowest_versions_are_those_that_setup_names(monkeypatch) -> None:
-    stated: dict[str, str] = {}
-
-    def setup(**keywords) -> None:
-        for line in (*keywords["install_requires"], *keywords["extras_require"]["record"]):
-            name, version = VERSION.fullmatch(line).groups()
-            stated[name] = version
-
+@pytest.fixture
+def metadata(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What setup.py states."""
+    stated: dict[str, Any] = {}
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("setuptools.setup", setup)
+    monkeypatch.setattr("setuptools.setup", lambda **keywords: stated.update(keywords))
     runpy.run_path(str(ROOT / "setup.py"))
+    return stated
+
+
+def test_every_file_of_the_package_is_installed(metadata: dict[str, Any]) -> None:
+    package = ROOT / "plow_twin"
+    tracked = subprocess.run(["git", "ls-files", "plow_twin"], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    others = {ROOT / name for name in tracked if not name.endswith(".py")}
+    installed = {path for pattern in metadata["package_data"]["plow_twin"] for path in package.glob(pattern)}
+    assert others <= installed and installed
+    folders = {path.parent for path in package.rglob("*.py")}
+    assert {".".join(folder.relative_to(ROOT).parts) for folder in folders} == {*metadata["packages"]}
+
+
+def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]) -> None:
+    stated: dict[str, str] = {}
+    for line in (*metadata["install_requires"], *metadata["extras_require"]["record"]):
+        match = VERSION.fullmatch(line)
+        assert match is not None, line
+        stated[match[1]] = match[2]
     lines = (ROOT / "requirements" / "lowest.txt").read_text().splitlines()
     lowest = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert lowest.keys() == stated.keys()
