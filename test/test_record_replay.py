@@ -17,7 +17,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode
 from plow_twin.record.header import HEADER_RECORD
 from plow_twin.record.messages import JointState, WrenchStamped
-from plow_twin.record.outputs import FRAME_TOPICS
+from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.record.reader import FileStatus, OutputRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import Digest, Sample
@@ -57,7 +57,7 @@ def test_the_same_build_gives_the_same_bits(frame_every: int, tmp_path: Path) ->
     assert (report.exit_code, report.first_divergence, report.divergences) == (0, None, 0)
     assert report.status is FileStatus.COMPLETE and not report.loss and not report.build_differences
     sent = Counter(topic.lstrip("/") for topic, _ in run.outputs)
-    assert report.compared == sent and set(sent) == set(FRAME_TOPICS) and not report.not_compared
+    assert report.compared == sent and set(sent) == set(PUBLICATION_TOPICS) and not report.not_compared
     assert report.digests_compared == sum(isinstance(entry, Digest) for entry in run.entries) >= COUNT // 100
     assert report.entries == len(run.entries)
     assert (report.samples, report.steps) == (COUNT, COUNT + 1)
@@ -73,7 +73,7 @@ def test_a_flipped_sample_diverges_at_its_step(index: int, run: Run, tmp_path: P
     assert report.exit_code == 1 and report.first_divergence is not None
     assert report.first_divergence.step == index
     assert report.first_divergence.stamp_ns == BASE_NS + index * STEP_NS
-    assert report.first_divergence.topic in FRAME_TOPICS
+    assert report.first_divergence.topic in PUBLICATION_TOPICS
     assert report.first_divergence.recorded != report.first_divergence.computed
 
 

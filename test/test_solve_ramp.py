@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 from scenes import pose_error, preset, wall_and_point
 
-from plow_twin import Contact, ContactLaw, SceneError, add_law, simulate
+from plow_twin import ArgumentError, Contact, ContactLaw, SceneError, add_law, simulate
 from plow_twin.model import contact_laws
 from plow_twin.model.contact_laws import exact_damping_number
 
@@ -70,3 +70,22 @@ def test_a_law_of_one_s_own_works_like_the_others() -> None:
     assert pose_error(scene, steps.q, simulate(scene, 1.0, output_dt=0.1).q) < 1e-3
     with pytest.raises(ValueError, match="half_exact"):
         add_law("half_exact", ContactLaw("again", ""))
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"additive": True}, "exponent: got None"),
+        ({"additive": True, "exponent": 1.0, "number_of": lambda e: 1.0 - e}, "number_of: expected None"),
+        ({"ramped": True}, "ramped=True: expected additive=True"),
+    ],
+)
+def test_a_law_that_no_solver_could_follow_is_refused(options: dict[str, object], named: str) -> None:
+    with pytest.raises(ArgumentError, match=named):
+        ContactLaw("mine", "nowhere", **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("number", [-0.1, math.nan])
+def test_a_negative_damping_number_is_refused(number: float) -> None:
+    with pytest.raises(ArgumentError, match=r"mine: D\(0.5\): got"):
+        ContactLaw("mine", "nowhere", lambda e: number).damping_number(0.5)

@@ -16,6 +16,8 @@ from typing import Final
 
 from scipy.optimize import brentq
 
+from plow_twin.errors import ArgumentError
+
 #: Largest D = lambda v0 used: a restitution below about 1/1000 would need an unbounded damping.
 DAMPING_NUMBER_CAP: Final = 1e3
 
@@ -62,6 +64,12 @@ class ContactLaw:
         The damping is C d' beside K d^n (Kelvin-Voigt), not a factor of K d^n.
     ramped : bool
         C grows from nothing over the penetration `ramp_m`.
+
+    Raises
+    ------
+    ArgumentError
+        For a combination that is no law: a ramp or a restitution beside the wrong kind of damping, or an additive law
+        without a ramp whose exponent is not 1.
     """
 
     title: str
@@ -71,6 +79,17 @@ class ContactLaw:
     exponent: float | None = None
     additive: bool = False
     ramped: bool = False
+
+    def __post_init__(self) -> None:
+        problems = []
+        if self.ramped and not self.additive:
+            problems.append("ramped=True: expected additive=True, for it is C that is ramped in")
+        if self.additive and self.number_of is not None:
+            problems.append("number_of: expected None with additive=True, whose damping is C")
+        if self.additive and not self.ramped and self.exponent != 1.0:
+            problems.append(f"exponent: got {self.exponent!r}, expected 1 for an additive law without a ramp")
+        if problems:
+            raise ArgumentError(f"contact law {self.title!r}: " + "; ".join(problems))
 
     @property
     def takes_restitution(self) -> bool:
@@ -98,9 +117,12 @@ class ContactLaw:
         if self.number_of is None:
             raise ValueError(f"{self.title} has no restitution form")
         try:
-            return min(self.number_of(restitution), DAMPING_NUMBER_CAP)
+            number = self.number_of(restitution)
         except ZeroDivisionError:
             return DAMPING_NUMBER_CAP
+        if not number >= 0.0:
+            raise ArgumentError(f"{self.title}: D({restitution:g}): got {number!r}, expected a number >= 0")
+        return min(number, DAMPING_NUMBER_CAP)
 
 
 _LAWS: Final[dict[str, ContactLaw]] = {

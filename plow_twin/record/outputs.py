@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 #: Base names of the topics that follow from the journal alone.
-FRAME_TOPICS: Final = ("contact_forces", "contact_peaks", "head_state", "clearance", "wear_rate")
+PUBLICATION_TOPICS: Final = ("contact_forces", "contact_peaks", "head_state", "clearance", "wear_rate")
 #: Names of `quality`: 1 where a publication was computed without a sample, and where late samples have been worked in.
 QUALITY_NAMES: Final = ("held", "corrected")
 
@@ -119,7 +119,7 @@ def contact_peaks(publication: Publication, frame_id: str) -> JointState:
 
 
 def head_state(publication: Publication, frame_id: str, child_frame_id: str) -> Odometry:
-    """Return the head's pose in the slide's publication and its twist in the head's own axes, as Odometry asks."""
+    """Return the head's pose in the slide's frame and its twist in the head's own axes, as Odometry asks."""
     x, y, theta = (float(value) for value in publication.q)
     vx, vy, omega = (float(value) for value in publication.v)
     cos, sin = math.cos(theta), math.sin(theta)

@@ -22,7 +22,7 @@ import numpy as np
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.record.outputs import FRAME_TOPICS, SLOW_TOPICS
+from plow_twin.record.outputs import PUBLICATION_TOPICS, SLOW_TOPICS
 from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
 from plow_twin.stream.outputs import Publication, Publications
 
@@ -118,7 +118,7 @@ class Recorder:
         warm_up_writer(header)
         self._writer = RunWriter(Path(path), header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
-        self._publication_topics = {name: header.topic(name) for name in FRAME_TOPICS}
+        self._publication_topics = {name: header.topic(name) for name in PUBLICATION_TOPICS}
         self._limits = (part_bytes, part_s, keep_bytes)
         self._split_due = False
         self._part_since = time.monotonic()

@@ -26,7 +26,7 @@ from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import (
-    FRAME_TOPICS,
+    PUBLICATION_TOPICS,
     SLOW_TOPICS,
     publication_messages,
     publication_numbers,
@@ -195,7 +195,7 @@ class _Replay:
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
         )
-        self.topics = {header.topic(name): name for name in FRAME_TOPICS}
+        self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS}
         self.next_sequence = 0
         self.synced = False  # the session is where the live one was
         self.outputs_synced = False  # and so are its windows between two messages

@@ -10,14 +10,14 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from plow_twin.record import messages as plain
-from plow_twin.record.outputs import FRAME_TOPICS
+from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.ros.messages import JointStateWriter, OdometryWriter
 from plow_twin.ros.qos import KEPT_OUTPUT, OUTPUT
 
 QUALITY: Final = "quality"
 #: Output topics that follow from the motion, with their types.
 TOPICS: Final[dict[str, type]] = {
-    topic: Odometry if topic == "head_state" else JointState for topic in (*FRAME_TOPICS, QUALITY)
+    topic: Odometry if topic == "head_state" else JointState for topic in (*PUBLICATION_TOPICS, QUALITY)
 }
 
 

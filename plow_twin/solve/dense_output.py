@@ -6,7 +6,8 @@ import math
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
-from plow_twin.model.contact import normal_force
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import pair_force
 from plow_twin.solve.kinematics import row_values
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.modes import any_penetrates
@@ -73,8 +74,8 @@ def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
         row_values(p.penetration_rows, c, s, y[X], y[Y]) + (row(p.penetration_rows, 4) - row(wear_depth, 0)),
     )
     set_row(rate, 0, row_values(p.penetration_rows, -om * s, om * c, y[VX] + om * y[Y], y[VY] - om * y[X]))
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         force[pair] = 0.0
         if state.mode[pair] == ON:
             d, r = penetration[pair], rate[pair]
-            force[pair] = normal_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+            force[pair] = pair_force(p, state, pair, d, r)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.model.contact import free_force
 from plow_twin.model.friction import friction_force
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.kinematics import penetration_at, rate_at, row_rate, row_value, to_body_axes, to_world_axes
 from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import ON
@@ -57,13 +58,13 @@ def _accelerate(p, offset, free, slip, frozen, state, z, load, out) -> None:
     x, y = to_body_axes(c, s, z[0], z[1])
     vx, vy = to_body_axes(c, s, z[3], z[4])
     fx = fy = torque = 0.0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 0:
             continue
         d = penetration_at(p, state, pair, c, s, x, y)
         if (frozen and state.mode[pair] == ON) or (not frozen and d > 0.0):
             r = rate_at(p, pair, c, s, om, x, y, vx, vy)
-            f = free_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+            f = law_force(p, state, pair, d, r)
             if not frozen:
                 f = max(f, 0.0)
             push_x, push_y, moment, _ = push(p, slip, pair, f, c, s, om, x, y, vx, vy)

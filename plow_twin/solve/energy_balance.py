@@ -15,6 +15,7 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
 from plow_twin.model.geometry import STATE_SIZE
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import evaluate, pair_outputs, time_along, wear_depth_at
 from plow_twin.solve.dynamics import about_mass, push
 from plow_twin.solve.kinematics import to_world_axes
@@ -55,7 +56,7 @@ class BalanceSums(NamedTuple):
 
 
 def new_balance() -> BalanceSums:
-    """Return an balance that has seen nothing."""
+    """Return a balance that has seen nothing."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     return BalanceSums(
         0.5 * (nodes + 1.0), 0.5 * weights, np.zeros(SIZE), np.zeros(SIZE), np.zeros(STATE_SIZE), np.zeros(8),
@@ -82,7 +83,7 @@ def _powers_under(p, offset, free, slip, state, wear_depth, y, load, pairs, out)
     load[0], load[1], load[2] = m * load[0], m * load[1], inertia * load[2]
     pair_outputs(p, state, wear_depth, y, pairs[0], pairs[1], pairs[2])
     fx = fy = torque = 0.0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         force = pairs[2, pair]
         push_x, push_y, moment, power = push(p, slip, pair, force, c, s, om, y[0], y[1], y[VX], y[VY])
         fx += push_x

@@ -8,20 +8,25 @@ from __future__ import annotations
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import first_root, first_root_within
 from plow_twin.kernel.simd import below, magnitude, row, set_row, splat
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
 #: Events are one instant when they are closer than this share of the step before them.
 _AT_ONCE = 1e-12
+#: Share of the release penetration at which a pair that is on is released.
+_LET_GO = 0.25
+#: And below which a released pair rests on the wall.
+_ON_THE_WALL = 1e-6
 
 
 @kernel(fast=True)
 def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     """Write each pair's first guard to `w.guard`.
 
-    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, else d >= 0 or a small depth; others: d >= 0.
+    off: -d >= 0; on: F / K = d + (C / K) d' >= 0 for Kelvin-Voigt, else d >= 0 or a small penetration; others: d >= 0.
     """
     guard, weights = w.guard, w.per_pair
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         mode = state.mode[pair]
         weights[SIGN, pair] = 0.0 if p.enabled[pair] == 0 else -1.0 if mode == OFF else 1.0
         weights[RATIO, pair] = 0.0
@@ -33,14 +38,14 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
     if viscous is not None and ramp is None and penetrating:
         for k in range(order):
             set_row(guard, k, row(guard, k) + row(w.rate, k) * ratio)
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         first = max(guard[0, pair], 0.0)
         if state.mode[pair] == ON:
-            # released below a quarter of the depth at which it acts again, so that no pair hovers between
-            first -= min(0.25 * p.release, 0.5 * first)
-        elif state.mode[pair] == RELEASED and first <= 1e-6 * p.release:
+            # released below a quarter of the penetration at which it acts again, so that no pair hovers between
+            first -= min(_LET_GO * p.release, 0.5 * first)
+        elif state.mode[pair] == RELEASED and first <= _ON_THE_WALL * p.release:
             # one that rests on the wall is let go a little outside
-            first = max(guard[0, pair] + 0.25 * p.release, 0.0)
+            first = max(guard[0, pair] + _LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
 
@@ -174,7 +179,7 @@ def note_switches(
     What happens at one instant but for rounding happens together: a symmetric motion stays symmetric.
     """
     column, within = w.column[0], _AT_ONCE * at
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         w.switch[pair] = -1
         for k in range(order + 1):
             column[k] = w.guard[k, pair]
@@ -199,7 +204,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
     best, event, target = sigma, -1, 0
     unsafe = _unsafe_pairs(w, order, sigma)
     column = w.column[0]
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if unsafe >> pair & 1:
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
@@ -211,7 +216,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
             if root < best:
                 best, event, target = root, pair, _next_mode(p, state.mode[pair], viscous, fraction, ramp)
     if penetrating:
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             if state.mode[pair] == OFF:
                 continue
             if _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import pair_outputs
 from plow_twin.solve.dynamics import accelerate
 from plow_twin.solve.energy_balance import balance_fixed_step, start_balance
@@ -24,7 +25,7 @@ _LOG_FULL = int(Status.LOG_FULL)
 @kernel()
 def _switch(p, state, penetration, rate, time, totals, log) -> None:
     """Note which pairs touch or part, at the step's resolution."""
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         inside = p.enabled[pair] == 1 and penetration[pair] > 0.0
         mode = ON if inside else OFF
         if mode == state.mode[pair]:
@@ -42,7 +43,7 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:
 def _add_to_totals(state, force_before, force, dt, totals) -> None:
     """Add one step to the totals by the trapezoidal rule."""
     carrying = 0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         totals.peak[pair] = max(totals.peak[pair], force[pair])
         totals.impulse[pair] += 0.5 * dt * (force_before[pair] + force[pair])
         if force[pair] > 0.0:
@@ -78,7 +79,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     start = state.step_start
     dt = (target - start) / bound.steps
     to_world(y, z)
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         # a pair that was clipped or released is inside all the same
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
@@ -95,12 +96,12 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
         state.steps += 1
         to_body(z, y)
         _wear(p, parts.terms.wear, state, now, dt)
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             before[pair] = now[pair]
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
         _switch(p, state, pen, rate, start + (n + 1) * dt, totals, None)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             if (before[pair] > 0.0) != (now[pair] > 0.0):
                 doubt = 0.5 * dt * (before[pair] + now[pair]) * p.inverse_mass
                 bound.error[0] += doubt * p.position_tolerance / p.velocity_tolerance
@@ -110,7 +111,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     state.step_start = state.time = target
     state.last_step_size, state.touch_time = 0.0, -np.inf
     state.touching = state.events_at_once = 0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if state.mode[pair] == ON:
             state.mode[pair] = mode_inside(p, state, pair)
     return _OK
@@ -170,5 +171,5 @@ def integrate_fixed(
 @kernel()
 def _wear(p, wear, state, force, dt) -> None:
     if wear is not None:
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             state.wear_depth[pair] += p.wear_per_impulse[pair] * force[pair] * dt

@@ -6,6 +6,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import evaluate, pair_outputs, sigma_at, sum_series, wear_depth_at
 from plow_twin.solve.energy_balance import balance_step, start_balance
 from plow_twin.solve.fixed_step import end_coarsely
@@ -91,7 +92,7 @@ def _clear(totals) -> None:
     """Begin to count anew what an advance reports."""
     set_row(totals.peak, 0, splat(0.0))
     set_row(totals.impulse, 0, splat(0.0))
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         totals.makes[pair] = 0
 
 
@@ -140,7 +141,7 @@ def _read_row(p, parts, state, w, totals, out) -> None:
     pose_of(p, y, parts.terms.offset, out.q, out.v)
     _worn_now(state, w, parts.terms.wear, out.wear_depth)
     pair_outputs(p, state, out.wear_depth, y, out.penetration, out.rate, out.force)
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         out.peak[pair] = max(totals.peak[pair], out.force[pair])
         out.impulse[pair], out.makes[pair] = totals.impulse[pair], totals.makes[pair]
     _clear(totals)
@@ -283,8 +284,8 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
         code = _next(p, parts, state, w, t_end, budget)
         if code != _OK:
             return code
-        t0, length = state.step_start, state.step_size
-        end = t0 + length
+        t0 = state.step_start
+        end = t0 + state.step_size
         if state.in_flight == 1:
             i = _rows_in_flight(p, parts, parts.terms.flight, state, w, t, i, q, v, penetration, force)
         while i < t.size and t[i] < end:
@@ -296,7 +297,7 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
                 pair_outputs(p, state, wear_depth, y, penetration[i], rate, force[i])
             i += 1
         first[0] = i
-        add_to_totals(state, w, 0.0, sigma_at(state, length), totals)
+        add_to_totals(state, w, 0.0, sigma_at(state, state.step_size), totals)
         if balance is not None:
             balance_step(p, parts, wear, parts.terms.flight, state, w, balance)
         _end(p, parts, state, w, totals, log)

@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.model.contact import free_force
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_value
 from plow_twin.solve.state import (
     ACTS,
@@ -25,6 +26,10 @@ from plow_twin.solve.state import (
     Y,
 )
 
+#: Share of the release penetration, and of the speed that leads there, that counts as nothing.
+_SHALLOW = 1e-3
+#: Halvings of a bracket: to the last bit of a double.
+_BISECTIONS = 60
 #: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees.
 LARGEST_ANGLE = 0.25 * math.pi
 
@@ -44,23 +49,23 @@ def touch(p, state, pair) -> None:
 
 
 @kernel()
-def _impact_speed(factor, rate, energy) -> float:
+def _impact_speed(number, rate, energy) -> float:
     """Return the speed of the impact that passes through a state inside a wall: its elastic energy per mass, its rate.
 
     First integral of the free impact, u = D d' / v0:  u - ln(1 + u) + D^2 E / (m v0^2) = D - ln(1 + D).
     """
-    if factor <= 0.0 or (energy <= 0.0 and rate == 0.0):
+    if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
-    full = factor - math.log1p(factor)
+    full = number - math.log1p(number)
     # an impact of this speed turns back at the energy; what still moves inward needs a faster one
-    low = math.sqrt(factor * factor * energy / full)
-    high = max(low, abs(rate)) * (1.0 + factor)
-    low = max(low, rate, -factor * rate)
-    for _ in range(60):
+    low = math.sqrt(number * number * energy / full)
+    high = max(low, abs(rate)) * (1.0 + number)
+    low = max(low, rate, -number * rate)
+    for _ in range(_BISECTIONS):
         speed = 0.5 * (low + high)
-        u = factor * rate / speed
+        u = number * rate / speed
         left = np.inf if u <= -1.0 else u - math.log1p(u)
-        if left + factor * factor * energy / (speed * speed) > full:
+        if left + number * number * energy / (speed * speed) > full:
             low = speed
         else:
             high = speed
@@ -87,7 +92,7 @@ def mode_inside(p, state, pair):
     """Return the mode of a pair that penetrates, and note on which side of its ramp's end it is."""
     penetration, rate = penetration_and_rate(p, state, pair)
     state.beyond_ramp[pair] = 1 if penetration > p.ramp else 0
-    if free_force(penetration, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp) < 0.0:
+    if law_force(p, state, pair, penetration, rate) < 0.0:
         return CLIPPED
     return ON if penetration >= p.release else RELEASED
 
@@ -96,11 +101,11 @@ def mode_inside(p, state, pair):
 def settle_modes(p, state) -> None:
     """Choose each pair's mode from its penetration, where a motion starts."""
     energy = 0.0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = max(penetration_and_rate(p, state, pair)[0], 0.0)
             energy += p.stiffness * penetration ** (p.exponent + 1.0) / (p.exponent + 1.0)
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         state.mode[pair] = OFF
         state.beyond_ramp[pair] = 0
         if p.enabled[pair] == 1 and penetration_and_rate(p, state, pair)[0] > 0.0:
@@ -118,7 +123,7 @@ def settle_modes(p, state) -> None:
 def any_penetrates(state) -> bool:
     """Tell whether any pair is inside its wall, with or without force."""
     inside = 0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         inside += 0 if state.mode[pair] == OFF else 1
     return inside > 0
 
@@ -126,23 +131,23 @@ def any_penetrates(state) -> bool:
 @kernel()
 def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
     """Write what each pair that acts contributes per order to `w.per_pair`; return whether any pair penetrates."""
-    mode, lanes = state.mode, w.per_pair
-    for pair in range(8):
-        lanes[BASE, pair] = 0.0
-        lanes[RAMPS, pair] = 1.0 - state.beyond_ramp[pair]
+    mode, per_pair = state.mode, w.per_pair
+    for pair in range(PAIR_COUNT):
+        per_pair[BASE, pair] = 0.0
+        per_pair[RAMPS, pair] = 1.0 - state.beyond_ramp[pair]
         raised = mode[pair] == ON or (ramp is not None and mode[pair] == CLIPPED)
         if fraction is not None and raised and state.touching >> pair & 1 == 0:
             penetration = penetration_and_rate(p, state, pair)[0]
-            if penetration > 1e-3 * p.release:
-                lanes[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
+            if penetration > _SHALLOW * p.release:
+                per_pair[BASE, pair] = 0.5 / math.sqrt(penetration) if p.exponent == 1.5 else 1.0 / penetration
             else:
                 # interrupted right after its touch: too shallow for a series of its power
                 mode[pair] = RELEASED
         acts = mode[pair] == ON
-        lanes[ACTS, pair] = p.stiffness if acts else 0.0
-        lanes[DAMPS, pair] = 0.0
+        per_pair[ACTS, pair] = p.stiffness if acts else 0.0
+        per_pair[DAMPS, pair] = 0.0
         if acts:
-            lanes[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.damping_factor[pair]
+            per_pair[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.damping_factor[pair]
     return any_penetrates(state)
 
 
@@ -150,14 +155,14 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
 def slow_touch(p) -> float:
     """Return the speed below which a pair cannot reach the release penetration by the speed of its touch alone."""
     acceleration = p.threshold[0] * p.weight / p.radius
-    return 1e-3 * math.sqrt(2.0 * acceleration * p.release)
+    return _SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 
 
 @kernel()
 def within_range(p, state, y) -> bool:
     """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
     deepest = 0.0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             deepest = max(deepest, penetration_of(p, state, pair, y))
     return abs(y[THETA]) <= LARGEST_ANGLE and deepest <= p.half_cavity

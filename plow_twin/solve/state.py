@@ -30,10 +30,10 @@ ACTS, DAMPS, BASE, SIGN, RATIO, SUM, FIRST, SECOND, RAMPS = range(9)
 OFF: Final = 0
 ON: Final = 1
 CLIPPED: Final = 2
-#: Not a mode: a pair crosses the end of its damping's ramp.
-CROSSING: Final = 4
 #: Penetrating less than `Params.release`, where the force is negligible (exponents that are not integers).
 RELEASED: Final = 3
+#: Not a mode, but what an event can lead to: a pair crosses the end of its damping's ramp.
+CROSSING: Final = 4
 
 # indices into State.y
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import evaluate, time_along, wear_depth_at
 from plow_twin.solve.events import first_event, note_switches
 from plow_twin.solve.method import flight, implicit, rest, taylor
@@ -124,7 +125,7 @@ def complete_step(p, parts, state, w, totals, log, wear, fraction) -> None:
     state.refused, state.decay_times = 0, 0.0
     if fraction is not None:
         state.touching = touching
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if w.switch[pair] >= 0:
             _switch(p, state, pair, w.switch[pair], totals, log, fraction)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import maximum, shift_column
 from plow_twin.kernel.simd import magnitude, row, set_row, splat
-from plow_twin.model.pairs import STOPS_COUNTER_CLOCKWISE
+from plow_twin.model.pairs import PAIR_COUNT, STOPS_COUNTER_CLOCKWISE
 from plow_twin.solve.dense_output import time_along
 from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
@@ -34,7 +34,7 @@ def add_to_totals(state, w, low, high, totals) -> None:
     """Add what happened between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
     mode = state.mode
     acting = 0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         acting += 1 if mode[pair] == ON else 0
     if acting == 0:
         return
@@ -43,12 +43,12 @@ def add_to_totals(state, w, low, high, totals) -> None:
     h = high - low
     elapsed = time_along(alpha, beta, h)
     if low > 0.0:
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             shift_column(w.force, pair, order, low, w.bernstein)
         _swap_rows(w.force, w.bernstein, order)
     _sums(w, order, h)
     carrying = 0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if mode[pair] != ON:
             continue
         carrying |= 1 << pair
@@ -67,7 +67,7 @@ def add_to_totals(state, w, low, high, totals) -> None:
 def add_set_times(totals, carrying, elapsed) -> None:
     """Add a time to the sets of corners that carry force together, one for each sense; `carrying` has a bit a pair."""
     ccw = cw = 0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if carrying >> pair & 1 == 1:
             if STOPS_COUNTER_CLOCKWISE[pair]:
                 ccw |= 1 << pair // 2

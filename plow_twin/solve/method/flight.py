@@ -1,4 +1,4 @@
-"""Free flight in closed form: where no wall can be reached, a step of any length.
+"""Free flight in closed form: where no wall can be reached, a step of any size.
 
 While no pair touches, the centre of mass and the angle follow from integrating the load twice: constants, linear pieces
 and harmonics have elementary integrals. How far the head can get within a time is bounded without following it
@@ -12,11 +12,12 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 
 #: Radians of the fastest harmonic that a flight must span; a series gets some two of them into a step.
 _LEAST_PHASE = 8.0
-#: Part of the clearance that the bound may use up.
+#: Part of the smallest gap that the bound may use up.
 _SAFE = 0.9
 
 
@@ -30,10 +31,10 @@ def _amplitudes(p, one, j):
 
 
 @kernel()
-def _clearance(p, state) -> float:
+def _smallest_gap(p, state) -> float:
     """Return the distance of the pair that is nearest to touching."""
     y, nearest = state.y, np.inf
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = penetration_of(p, state, pair, y)
             nearest = min(nearest, -penetration)
@@ -89,17 +90,17 @@ def _safe_time(p, harmonics, state, w, span) -> float:
     least = _LEAST_PHASE / p.fastest
     if span < least:
         return 0.0
-    clearance = _clearance(p, state)
+    gap = _smallest_gap(p, state)
     z = w.flight[0]
     to_world(state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
     # the walls' rows turn with the head: a place counts like a point of it
-    leverage = p.leverage + math.hypot(z[0], z[1]) + max(clearance, 0.0)
-    length = span
-    while length >= least:
-        if _reach(p, w, length, leverage) < _SAFE * clearance:
-            return length
-        length *= 0.5
+    leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
+    time = span
+    while time >= least:
+        if _reach(p, w, time, leverage) < _SAFE * gap:
+            return time
+        time *= 0.5
     return 0.0
 
 

@@ -17,7 +17,8 @@ from scipy.special import roots_jacobi
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
-from plow_twin.model.contact import free_force
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
 from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y
@@ -88,13 +89,13 @@ def decay_rate(p, state, w, slip) -> float:
     """
     y, decay, spring = state.y, 0.0, 0.0
     c, s, om, x, yy, vx, vy = y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY]
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if state.mode[pair] != ON:
             continue
-        depth, rate = max(penetration_of(p, state, pair, y), 0.0), rate_of(p, pair, y)
-        force = free_force(depth, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
-        faster = free_force(depth, rate + 1.0, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
-        slope = p.stiffness if p.exponent == 1.0 else p.exponent * p.stiffness * depth ** (p.exponent - 1.0)
+        penetration, rate = max(penetration_of(p, state, pair, y), 0.0), rate_of(p, pair, y)
+        force = law_force(p, state, pair, penetration, rate)
+        faster = law_force(p, state, pair, penetration, rate + 1.0)
+        slope = p.stiffness if p.exponent == 1.0 else p.exponent * p.stiffness * penetration ** (p.exponent - 1.0)
         arm = row_value(p.arm_rows, pair, c, s, x, yy)
         mobility = p.inverse_mass + arm * arm * p.inverse_inertia
         decay += (faster - force) * mobility
@@ -130,10 +131,10 @@ def has_decayed(p, state) -> bool:
 
 
 @kernel(inline=True)
-def note_decay(state, decay, length) -> None:
+def note_decay(state, decay, step_size) -> None:
     """Count the decay times that pass in a step."""
     if decay > 0.0:
-        state.decay_times += decay * length
+        state.decay_times += decay * step_size
     else:
         state.decay_times, state.refused = 0.0, 0
 
@@ -218,12 +219,12 @@ def _measure(p, state, implicit) -> None:
     for i in range(implicit.nodes.size):
         y = implicit.body[i + 1]
         to_body(z[i + 1], y)
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             r = rate_of(p, pair, y)
             pairs[0, i, pair], pairs[1, i, pair], pairs[2, i, pair] = 0.0, 0.0, r
             if state.mode[pair] == ON or state.mode[pair] == CLIPPED:
                 d = penetration_of(p, state, pair, y) + (state.wear_depth[pair] - implicit.wear_depth[i + 1, pair])
-                force = free_force(d, r, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+                force = law_force(p, state, pair, d, r)
                 pairs[1, i, pair] = force
                 pairs[0, i, pair] = force if state.mode[pair] == ON else 0.0
 
@@ -234,7 +235,7 @@ def _wear_at_nodes(p, state, h, implicit) -> float:
     worn, a, s, change = implicit.wear_depth, implicit.weights, implicit.nodes.size, 0.0
     _measure(p, state, implicit)
     for i in range(s):
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             value = worn[0, pair]
             for j in range(s):
                 value += h * a[i, j] * p.wear_per_impulse[pair] * max(implicit.pairs[0, j, pair], 0.0)
@@ -294,7 +295,7 @@ def _solve(p, parts, state, t, h, implicit, wear) -> bool:
 
 @kernel()
 def _interpolate(values, coefficients, h, out) -> None:
-    """Write the series of the polynomials of a step of length h that take eight values at each node.
+    """Write the series of the polynomials of a step of size h that take eight values at each node.
 
     Of the differences to the last value: the coefficients are large, and cancel what is common only to rounding.
     """
@@ -362,7 +363,7 @@ def _write_ramp(p, h, w, implicit) -> float:
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)
     linear = p.exponent == 1.0
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         largest = max(largest, abs(w.damped[s - 1, pair]))
     for k in range(s):
         rest = row(w.damped, k)
@@ -404,13 +405,13 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:
-            # a long polynomial may bring a pair that only hovers at its wall back to it; a short one knows better
+            # the polynomial of a long step can show an event where a pair only comes close to its wall
             state.implicit_size = min(state.implicit_size, 4.0 * step_size)
 
 
 @kernel()
 def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear) -> float:
-    """Lay out an implicit step as series of order `STAGES`; return its length, or 0 when explicit ones are better.
+    """Lay out an implicit step as series of order `STAGES`; return its size, or 0 when explicit ones are better.
 
     `decay` is the `decay_rate`.
     """

@@ -13,7 +13,8 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
-from plow_twin.model.contact import free_force
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 from plow_twin.solve.state import OFF, OMEGA, ON, VX, VY
@@ -31,7 +32,7 @@ AT_REST = 5
 @kernel()
 def _held(p, state, y, least) -> bool:
     """Tell whether each pair is on or off, and neither close to changing that."""
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = penetration_of(p, state, pair, y)
             inside = state.mode[pair] == ON and penetration > least
@@ -156,13 +157,11 @@ def write_rest(p, state, w) -> None:
     """Write the series of a head at rest: it stays where it is."""
     y = state.y
     set_row(w.series, 0, row(y, 0))
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         penetration = penetration_of(p, state, pair, y)
         w.penetration[0, pair], w.force[0, pair] = penetration, 0.0
         if state.mode[pair] == ON:
-            w.force[0, pair] = free_force(
-                penetration, 0.0, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp
-            )
+            w.force[0, pair] = law_force(p, state, pair, penetration, 0.0)
     set_row(w.series, 1, splat(0.0))
     set_row(w.penetration, 1, splat(0.0))
     set_row(w.force, 1, splat(0.0))

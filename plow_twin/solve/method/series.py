@@ -18,6 +18,7 @@ import math
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import lane, magnitude, pack, permutation, row, set_row, splat, spread_total, total
 from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.kinematics import row_values
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
 
@@ -98,7 +99,7 @@ def _raise(w, k, penetration, touching, exponent):
     if exponent == 1.5:
         # d^1.5 as d times its root: less work than the recurrence for any power
         if k == 0:
-            for pair in range(8):
+            for pair in range(PAIR_COUNT):
                 w.power[1, 0, pair] = math.sqrt(w.penetration[0, pair]) if w.per_pair[BASE, pair] != 0.0 else 0.0
             root = row(w.power[1], 0)
         else:
@@ -106,14 +107,14 @@ def _raise(w, k, penetration, touching, exponent):
             set_row(w.power[1], k, root)
         power = _join(w.penetration, w.power[1], k, penetration, root)
     elif k == 0:
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             w.power[0, 0, pair] = w.penetration[0, pair] ** exponent if w.per_pair[BASE, pair] != 0.0 else 0.0
         power = row(w.power[0], 0)
     else:
         power = power_terms(w.penetration, w.power[0], k, exponent) * row(w.per_pair, BASE)
     set_row(w.power[0], k, power)
     if touching != 0:
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             if touching >> pair & 1:
                 w.power[0, k, pair] = power_term(w.penetration, w.power[0], pair, k, exponent, 2)
         power = row(w.power[0], k)
@@ -233,7 +234,7 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
     set_row(w.slip[0], k, rate)
     set_row(arm, k, row_values(p.slip_arm_rows, c, s, x, y))
     if k == 0:
-        for pair in range(8):
+        for pair in range(PAIR_COUNT):
             tau[0, pair] = math.tanh(lane(rate, pair))
         set_row(rest, 0, row(tau, 0) * row(tau, 0) * -1.0 + 1.0)
         set_row(weighted, 0, splat(0.0))
@@ -244,7 +245,7 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
         set_row(rest, k, _multiply(tau, tau, k) * -1.0)
     force = _multiply(w.force, tau, k) * p.friction
     set_row(drag, k, force)
-    # t is the wall's normal turned by +90 degrees, the gap's rows for X and Y are minus the normals
+    # t is the wall's normal turned by +90 degrees, the penetration's rows for X and Y are minus the normals
     return _applied(
         p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
     )
@@ -353,7 +354,7 @@ def expand(
                 applied = applied + _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
             if wear is not None:
                 _wear(p, w, k, alpha, beta)
-            # of the next order, and sooner there than the state, which waits for the forces
+            # the penetration of the next order needs this order's rates alone: no forces to wait for
             penetration = rate * steady + closing * bent
             closing = rate
         if free is not None:

@@ -7,12 +7,17 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import ON
 
 #: A pair that would part within so many steps like the last is looked at, by a series of this order.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
+#: Newton's steps to its root, and the relative change after which it is found: the next step mends the rest.
+_NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
+#: A term beyond this is not finite, or will not be when it is multiplied.
+_FINITE = 1e300
 
 
 @kernel()
@@ -25,16 +30,16 @@ def accurate_step(p, w, order, sigma_limit):
     least = np.inf
     for k in range(order, order - max(p.lacuna, 2), -1):
         size = w.term_size[k]
-        if not (size <= 1e300):
+        if not size <= _FINITE:
             return math.nan
         if size > 0.0:
             least = min(least, math.log(p.threshold[k] / size) / k)
-    length = min(sigma_limit, math.exp(least))
+    sigma = min(sigma_limit, math.exp(least))
     # an error of velocity becomes one of position over a long step
-    stretch = length * p.velocity_tolerance / (p.position_tolerance * (order + 1))
-    if stretch > 1.0 and length < sigma_limit:
-        length *= math.exp(-math.log(stretch) / order)
-    return length
+    stretch = sigma * p.velocity_tolerance / (p.position_tolerance * (order + 1))
+    if stretch > 1.0 and sigma < sigma_limit:
+        sigma *= math.exp(-math.log(stretch) / order)
+    return sigma
 
 
 @kernel()
@@ -45,18 +50,18 @@ def before_sticking(p, state, w, order, sigma) -> float:
     With |r - r_0| at most theta times their distance what the series leaves out is below theta^order.
     """
     theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
-    length = sigma
-    for pair in range(8):
+    within = sigma
+    for pair in range(PAIR_COUNT):
         if state.mode[pair] != ON:
             continue
         change = 0.0
         for k in range(order - 1, 0, -1):
-            change = (change + abs(w.slip[0, k, pair])) * length
+            change = (change + abs(w.slip[0, k, pair])) * within
         limit = theta * math.hypot(w.slip[0, 0, pair], 0.5 * math.pi)
         if change > limit:
             # the change is convex in sigma
-            length *= limit / change
-    return length
+            within *= limit / change
+    return within
 
 
 @kernel()
@@ -66,7 +71,7 @@ def time_to_separation(p, parts, state, w, span, harmonics):
     The root of a short series is enough: what it misses is left to the next step.
     """
     near = False
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if state.mode[pair] == ON:
             penetration, rate = penetration_and_rate(p, state, pair)
             if rate < 0.0 and penetration < -rate * _PARTING_REACH * state.last_step_size:
@@ -79,13 +84,13 @@ def time_to_separation(p, parts, state, w, span, harmonics):
     order = expand(p, state, w, PARTING_ORDER, True, span, *terms)
     state.evaluations += order
     first = np.inf
-    for pair in range(8):
+    for pair in range(PAIR_COUNT):
         if state.mode[pair] != ON or w.penetration[1, pair] >= 0.0:
             continue
         t = -w.penetration[0, pair] / w.penetration[1, pair]
         if t > _PARTING_REACH * state.last_step_size:
             continue
-        for _ in range(6):
+        for _ in range(_NEWTON_STEPS):
             value, slope = w.penetration[order, pair], 0.0
             for k in range(order - 1, -1, -1):
                 slope = slope * t + value
@@ -94,7 +99,7 @@ def time_to_separation(p, parts, state, w, span, harmonics):
                 break
             change = value / slope
             t -= change
-            if abs(change) < 1e-9 * t:
+            if abs(change) < _ROOT_FOUND * t:
                 first = min(first, t)
                 break
     return first if 0.0 < first < np.inf else 0.0

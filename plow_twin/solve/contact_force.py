@@ -1,0 +1,18 @@
+"""The force of a pair from its state: the scene's numbers put into `model.contact`."""
+
+from __future__ import annotations
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.model.contact import free_force, normal_force
+
+
+@kernel(inline=True)
+def law_force(p, state, pair, penetration, rate):
+    """Return the law's force of a pair in N, negative where it would pull."""
+    return free_force(penetration, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
+
+
+@kernel(inline=True)
+def pair_force(p, state, pair, penetration, rate):
+    """Return the force of a pair in N: zero outside the wall and where it would pull."""
+    return normal_force(penetration, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
