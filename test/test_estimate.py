@@ -10,12 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import StoragePlugin
 from scenes import ROOT, preset
+from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
 from plow_twin import Scene, Table, simulate
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.measurements import EstimateError, Load, Poses
 from plow_twin.estimate.result import Interval, State
+
+__all__ = ["motion"]  # a fixture
 
 sys.path.insert(0, str(ROOT / "benchmark"))
 from estimate_truths import GROUPS, draw
@@ -86,6 +90,18 @@ def test_a_wall_never_touched_is_not_observable() -> None:
     assert result.horizontal_state is not State.ESTIMATED
     assert result.horizontal.p05 <= scene.clearance.horizontal_m <= result.horizontal.p95
     assert result.horizontal.p95 - result.horizontal.p05 > 0.01
+
+
+def test_a_bag_is_read_by_its_mapping(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", motion, StoragePlugin.SQLITE3)
+    command = [sys.executable, "-m", "plow_twin", "estimate", str(bag), "--map", str(tmp_path / "map.yaml"), "--json"]
+    done = subprocess.run([*command, "--scene", "paper"], capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["delay"]["mean"] == pytest.approx(LAG_S, abs=2e-3)
+    assert [facts[f"bias_{name}"]["mean"] for name in ("x", "y", "theta")] == pytest.approx(np.negative(BIAS), abs=3e-4)
+    assert facts["horizontal"]["mean_m"] == pytest.approx(0.025, abs=3e-4)
+    assert facts["vertical"]["mean_m"] == pytest.approx(0.030, abs=3e-4)
 
 
 def test_without_measurements_the_prior_is_what_there_is() -> None:

@@ -20,26 +20,32 @@ if TYPE_CHECKING:
     "counted loss."
 )
 @click.argument("source", metavar="INPUT", type=click.Path(path_type=Path, exists=True))
+@click.option("--scene", type=click.Path(path_type=Path), help="Nominal scene, a file or a preset; INPUT's by default.")
 @click.option(
-    "--scene", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="Nominal scene; INPUT's by default."
+    "--map",
+    "mapping",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="YAML that says which topic of a recording is the excitation and which the head_pose.",
 )
 @json_option
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for estimate.json.")
 @quiet_option
-def estimate(source: Path, scene: Path | None, as_json: bool, out: Path | None, quiet: bool) -> int:
+def estimate(
+    source: Path, scene: Path | None, mapping: Path | None, as_json: bool, out: Path | None, quiet: bool
+) -> int:
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
 
     INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed) and pose.csv (t,
-    x, y, theta: the measured pose, a cell left empty was not measured).
+    x, y, theta: the measured pose, a cell left empty was not measured), a run of ours with the measured pose recorded
+    beside it, or another recording (MCAP, rosbag2's sqlite3).
     """
     from plow_twin.estimate.estimate import estimate as run
     from plow_twin.estimate.estimate import warm_up
     from plow_twin.estimate.measurements import Load, Poses
-    from plow_twin.record.measured import read_measured
+    from plow_twin.record.measured import LOAD_FILE, read_measured, read_recording
 
-    if not source.is_dir():
-        raise click.UsageError(f"INPUT: got the file {source}, expected a folder with load.csv and pose.csv")
-    measured = read_measured(source, scene)
+    folder = mapping is None and (source / LOAD_FILE).is_file()
+    measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
     load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:])
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:])
     begin = time.perf_counter()

@@ -1,4 +1,7 @@
-"""A folder with what was measured: scene.yaml, load.csv (t, fx, fy, m) and pose.csv (t, x, y, theta)."""
+"""What was measured, for the estimate: from a folder, from a run of ours, or from any recording by a mapping.
+
+A folder holds scene.yaml, load.csv (t, fx, fy, m) and pose.csv (t, x, y, theta).
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,18 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
-from plow_twin.scene_file import load_scene
+from plow_twin.record.mapping import ROLES, read_map
+from plow_twin.record.reader import RunReader
+from plow_twin.record.sources import open_source
+from plow_twin.scene_file import load_scene, loads_scene
+from plow_twin.scene_file.presets import scene_path
 
 Array = NDArray[np.float64]
 
@@ -48,7 +55,108 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     """
     load, bad_load = _read(folder / LOAD_FILE, _LOAD_COLUMNS)
     poses, bad_poses = _read(folder / POSE_FILE, _POSE_COLUMNS)
-    return Measured(load_scene(scene or folder / SCENE_FILE), load, poses, bad_load + bad_poses)
+    return Measured(
+        load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE), load, poses, bad_load + bad_poses
+    )
+
+
+def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
+    """Read a run of ours by its journal, or another recording (MCAP, rosbag2's sqlite3, csv) by the mapping.
+
+    The measured pose of a run of ours lies in another recording beside it, or in its folder `beside`. Times count from
+    the first sample of the load.
+
+    Raises
+    ------
+    RecordingError
+        When a recording cannot be read, or holds no load or no pose.
+    SceneError
+        When the scene cannot be used.
+    """
+    own = _own(path)
+    if own is None:
+        file = scene or (path / SCENE_FILE if path.is_dir() else path.with_name(SCENE_FILE))
+        if scene is None and not file.is_file():
+            raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
+        model = load_scene(scene_path(str(file)))
+        rows, unfit = _collect([path], mapping, ("excitation", "head_pose"), "")
+        loads = rows["excitation"]
+    else:
+        given = scene is not None
+        model = (
+            load_scene(scene_path(str(scene))) if given else loads_scene(own.header.scene_yaml, source=str(own.path))
+        )
+        loads = _journal_load(own)
+        folder = path if path.is_dir() else path.parent
+        rows, unfit = _collect([folder, folder / "beside"], mapping, ("head_pose",), own.header.node)
+        unfit += sum(own.lost.values())
+    poses = rows["head_pose"]
+    for name, found in (("load", loads), ("measured pose", poses)):
+        if not len(found):
+            raise RecordingError(f"{path}: got no {name}, expected some")
+    origin = loads[0, 0]
+    for table in (loads, poses):
+        table[:, 0] = (table[:, 0] - origin) * 1e-9
+    return Measured(model, loads, poses, unfit)
+
+
+def _own(path: Path) -> RunReader | None:
+    """Return the reader of a run of ours, or None for another recording."""
+    if path.is_dir() and not any(path.glob("*.mcap")):
+        return None
+    try:
+        return RunReader(path)
+    except RecordingError as error:
+        if "is missing: not a recording" in str(error) or "not an MCAP file" in str(error):
+            return None
+        raise
+
+
+def _journal_load(reader: RunReader) -> Array:
+    """Return the samples of a run's journal, shape (n, 4), stamps in ns."""
+    parts = [
+        np.column_stack([batch.entries.stamp_ns, batch.entries.wrench])[_samples(batch.entries)]
+        for batch in reader.batches(outputs=False)
+    ]
+    return np.concatenate(parts) if parts else np.zeros((0, 4))
+
+
+def _samples(entries: Any) -> NDArray[np.bool_]:
+    chosen = np.ones(len(entries), dtype=bool)
+    chosen[list(entries.others)] = False
+    return chosen
+
+
+def _collect(
+    places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
+) -> tuple[dict[str, Array], int]:
+    """Return the rows of each role that is wanted, stamps in ns, and how many messages did not fit."""
+    rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
+    unfit = 0
+    for place in places:
+        if not place.exists() or (place.is_dir() and not any(place.iterdir())):
+            continue
+        try:
+            source = open_source(place)
+        except RecordingError:
+            if len(places) == 1:
+                raise
+            continue
+        topics = source.topics()
+        if node:
+            topics = {topic: kind for topic, kind in topics.items() if not topic.startswith(f"{node}/")}
+        roles = {name: role for name, role in read_map(mapping, topics).items() if name in wanted}
+        names = {role.topic: name for name, role in roles.items()}
+        for arrived in source.messages(names.__contains__):
+            name = names[arrived.topic]
+            found = roles[name].read(arrived)
+            if found is None:
+                unfit += 1
+            else:
+                stamp_ns, values = found
+                rows[name].append([float(stamp_ns), *(values.get(key, math.nan) for key in ROLES[name])])
+        unfit += sum(source.losses.counts.values())
+    return {name: np.array(found, dtype=float).reshape(-1, 4) for name, found in rows.items()}, unfit
 
 
 def _read(path: Path, columns: tuple[str, ...]) -> tuple[Array, int]:
