@@ -141,3 +141,5 @@ def test_view_serves_a_page_on_the_loopback_address_alone(run: Run, tmp_path: Pa
     finally:
         process.terminate()
         process.wait(20)
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", port)) != 0, "the server has outlived the command"

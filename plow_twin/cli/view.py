@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -56,8 +57,7 @@ def view(
 
 def _serve(file: Path, port: int, quiet: bool) -> int:
     """Serve a .rrd with the viewer's own program on the loopback address until it is interrupted."""
-    beside = Path(sys.executable).with_name("rerun")
-    program = str(beside) if beside.exists() else shutil.which("rerun")
+    program = _viewer_program()
     if program is None:
         click.echo("plow-twin: the program `rerun` is not installed: pip install 'plow_twin[view]'", err=True)
         return FAILED
@@ -67,3 +67,13 @@ def _serve(file: Path, port: int, quiet: bool) -> int:
     sys.stdout.flush()
     # in the place of this process: whoever stops it stops the server
     os.execv(program, [*command, "--web-viewer-port", str(port)])
+
+
+def _viewer_program() -> str | None:
+    """Return rerun's own program, not the wrapper of the same name, which would outlive whoever stops it."""
+    found = find_spec("rerun_cli")
+    if found is not None and found.origin is not None:
+        program = Path(found.origin).with_name("rerun")
+        if program.exists():
+            return str(program)
+    return shutil.which("rerun")
