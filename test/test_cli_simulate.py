@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import mcap_bytes
 import numpy as np
 import pytest
 
@@ -157,7 +158,7 @@ main(["simulate", "paper", "--t-end", "1", "--output-dt", "1.1e-7", "--quiet"])
 
 def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:
     (tmp_path / "mcap.py").write_text("raise ModuleNotFoundError(\"No module named 'mcap'\", name='mcap')")
-    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
+    (tmp_path / "run.mcap").write_bytes(mcap_bytes.beginning())
     done = plow_twin("replay", "run.mcap", cwd=tmp_path)  # -m puts the working directory first on the path
     assert done.returncode == 1
     assert "pip install 'plow_twin[record]'" in done.stderr

@@ -62,8 +62,8 @@ def test_intervals_hold_and_the_same_data_give_the_same_bits() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        "kelvin_voigt",
-        "jam",
+        pytest.param("kelvin_voigt", marks=pytest.mark.stress),
+        pytest.param("jam", marks=pytest.mark.stress),
         "shift",
         *(pytest.param(name, marks=pytest.mark.stress) for name in ("exponent", "shape", "scale", "stuck", "noisier")),
     ],

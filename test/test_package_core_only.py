@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import mcap_bytes
 import numpy as np
 import pytest
 from installing import build_wheel, install, make_environment, run
@@ -83,6 +84,6 @@ def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel
     assert (facts["mcap"], facts["rclpy"]) == ("not installed", "not installed")
     said = run(programs / "plow-twin", "demo", cwd=tmp_path, code=1)
     assert "pip install 'plow_twin[ros]'" in said
-    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
+    (tmp_path / "run.mcap").write_bytes(mcap_bytes.beginning())
     assert "pip install 'plow_twin[record]'" in run(programs / "plow-twin", "replay", "run.mcap", cwd=tmp_path, code=1)
     assert "pip install 'plow_twin[view]'" in run(programs / "plow-twin", "view", "run.mcap", cwd=tmp_path, code=1)

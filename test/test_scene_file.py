@@ -34,7 +34,7 @@ from plow_twin import (
 )
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.pairs import CORNER_NAMES
-from plow_twin.model.scene import DOF_NAMES
+from plow_twin.model.scene import DOF_NAMES, LEAST_SPACING_S
 from plow_twin.scene_file import dump_scene, load_scene, loads_scene, scene_schema
 from plow_twin.scene_file.presets import PRESETS, scene_path
 
@@ -257,6 +257,7 @@ def contacts(draw: st.DrawFn) -> Contact:
 @st.composite
 def tables(draw: st.DrawFn, name: str) -> Table:
     t = np.array(sorted(draw(st.sets(FINITE, min_size=1, max_size=5))))
+    t = t[np.diff(t, prepend=-np.inf) >= LEAST_SPACING_S]
     wrench = np.array([draw(TRIPLE) for _ in t])
     return Table(name, t, wrench, draw(st.sampled_from(["linear", "zero"])), draw(PAIR))
 

@@ -54,11 +54,11 @@ def test_a_wrong_motion_does_not_balance() -> None:
     """The balance looks at forces of its own: a solver that takes another stiffness is found out."""
     compiled = compile_scene(PAPER, 1e-9)
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))
-    motion.energy_balance = new_balance()
+    motion.sums = new_balance()
     run_events(compiled, motion, np.zeros(1), 1.0, new_work(), 10**6)
     compiled.params.inverse_inertia *= 1.0 + 1e-6
     run_events(compiled, motion, np.zeros(1), 2.0, new_work(), 10**6)
-    assert energy_balance_of(compiled, motion.state, motion.energy_balance).relative_imbalance > 1e-10
+    assert energy_balance_of(compiled, motion.state, motion.sums).relative_imbalance > 1e-10
 
 
 def test_the_balance_of_fixed_steps_balance_to_their_order() -> None:

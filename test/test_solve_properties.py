@@ -250,7 +250,8 @@ def search(structure: str, examples: int, monkeypatch: pytest.MonkeyPatch) -> No
     assert ended[Status.NON_FINITE] == 0, ended
 
 
-@pytest.mark.parametrize("structure", STRUCTURES)
+# each structure compiles all kernels anew: the others are left to the full count
+@pytest.mark.parametrize("structure", ["viscous, harmonic", "factor, n = 1.5, harmonic", "factor, sampled"])
 def test_random_scenes_keep_the_energy_balance(structure: str, monkeypatch: pytest.MonkeyPatch) -> None:
     search(structure, 12, monkeypatch)
 

@@ -41,6 +41,8 @@ SLOWEST_IMPACT: Final = 0.03
 _RESOLVED = 1e-4
 #: Smallest softness in m that is simulated; harder contacts move the head alike.
 _HARDEST = 3e-5
+#: Softness in m below which a contact is hard.
+_HARD = 3e-4
 #: Largest softness in m.
 _SOFTEST = 0.12
 #: Smallest clearance in m that is simulated.
@@ -101,6 +103,10 @@ class Unknowns:
     def steps(self) -> Array:
         """Return the steps of difference quotients, shape (11,)."""
         return np.array([2e-4, 2e-4, 0.05, 0.05, 0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0])
+
+    def is_hard(self, vector: Array) -> bool:
+        """Tell whether the contact is so hard that its bounces cannot be foretold for long."""
+        return bool(vector[SOFTNESS] < math.log(_HARD + _RESOLVED))
 
     def softness_of(self, stiffness: float) -> float:
         """Return psi of a stiffness."""

@@ -1,6 +1,6 @@
 """Whether what is left over looks like noise: if not, the model or the sensor is not what it is taken for.
 
-Thresholds are set on seeds of their own (`benchmark/estimate.py --calibrate`); see docs/estimate.md.
+The thresholds were set by eye on a few truths of other seeds than those of the benchmark; see docs/estimate.md.
 """
 
 from __future__ import annotations

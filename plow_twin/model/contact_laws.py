@@ -111,11 +111,11 @@ class ContactLaw:
 
         Raises
         ------
-        ValueError
+        ArgumentError
             The law has no restitution form.
         """
         if self.number_of is None:
-            raise ValueError(f"{self.title} has no restitution form")
+            raise ArgumentError(f"{self.title} has no restitution form")
         try:
             number = self.number_of(restitution)
         except ZeroDivisionError:
@@ -184,9 +184,9 @@ def add_law(name: str, law: ContactLaw) -> None:
 
     Raises
     ------
-    ValueError
+    ArgumentError
         The name is taken, or not one that a scene file can hold.
     """
     if name in LAWS or not name.isidentifier():
-        raise ValueError(f"contact law: got {name!r}, expected a new name of letters, digits and _")
+        raise ArgumentError(f"contact law: got {name!r}, expected a new name of letters, digits and _")
     _LAWS[name] = law

@@ -458,7 +458,7 @@ def _check_loads(loads: tuple[Load, ...]) -> Iterator[Problem]:
 
 
 #: Least time between two samples of a table in s; between closer ones the solver cannot step.
-LEAST_SPACING_S: Final = 1e-15
+LEAST_SPACING_S: Final = 1e-100
 
 
 def _check_table(key: str, table: Table) -> Iterator[Problem]:

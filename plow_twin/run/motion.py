@@ -106,14 +106,14 @@ def run_fixed(
     look: Callable[[Motion], None] | None,
 ) -> int:
     """Bring a motion through `steps` fixed steps; return its `Status`."""
-    done, size = np.zeros(1, np.int64), _FIRST_SLICE
+    z, done, size = np.zeros(6), np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
         # the row at the end of a slice is written again by the next one, unless it is due
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
-            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, done, allowed, dt, euler, stride,
-            motion.q, motion.v, motion.penetration, motion.force, motion.sums,
+            compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,
+            stride, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
         ))  # fmt: skip
         motion.fixed_time, motion.first[0] = float(done[0]) * dt, int(done[0]) // stride + 1
         if code == Status.LOG_FULL:

@@ -119,14 +119,17 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
 
 @kernel()
 def integrate_fixed(
-    p, parts, state, totals, log, done, steps, dt, euler, stride, q, v, penetration, force, balance
+    p, parts, state, totals, log, z, done, steps, dt, euler, stride, q, v, penetration, force, balance
 ) -> int:
-    """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`."""
-    z, trial = np.empty(6), np.empty(6)
-    k = np.empty((4, 6))
+    """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`.
+
+    z (6,) keeps what is integrated from one call to the next: converted there and back it would lose its last bits.
+    """
+    trial, k = np.empty(6), np.empty((4, 6))
     load, y = np.empty(3), state.y
     pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
-    to_world(y, z)
+    if done[0] == 0:
+        to_world(y, z)
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     if balance is not None and done[0] == 0:
         start_balance(p, parts, state, y, 0.0, balance)

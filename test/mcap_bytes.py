@@ -1,0 +1,20 @@
+"""The first bytes of a recording, written by hand: enough to be taken for one."""
+
+from __future__ import annotations
+
+import struct
+
+
+def _text(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()
+
+
+def _record(opcode: int, body: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(body)) + body
+
+
+def beginning() -> bytes:
+    """Return magic, header and the metadata record of a run."""
+    pairs = _text("layout_version") + _text("2")
+    metadata = _text("plow_twin") + struct.pack("<I", len(pairs)) + pairs
+    return b"\x89MCAP0\r\n" + _record(0x01, _text("ros2") + _text("plow_twin")) + _record(0x0C, metadata)
