@@ -251,7 +251,8 @@ def contacts(draw: st.DrawFn) -> Contact:
     if LAWS[law].takes_restitution:
         choices.append({"restitution": draw(st.floats(0.0, 1.0))})
     damping = draw(st.sampled_from(choices)) if choices else {}
-    return Contact(law, draw(POSITIVE), exponent, **damping, impact_speed_floor_m_s=draw(POSITIVE))
+    ramp = draw(POSITIVE) if LAWS[law].ramped else None
+    return Contact(law, draw(POSITIVE), exponent, **damping, impact_speed_floor_m_s=draw(POSITIVE), ramp_m=ramp)
 
 
 @st.composite
