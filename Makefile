@@ -17,13 +17,11 @@ PYTEST_ARGS ?=
 PARALLEL ?= -n 2 --dist loadfile
 BENCH_ARGS ?=
 SITE ?= out/site
-COVERED ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_run_*.py test/test_stream_*.py \
-	test/test_record_*.py test/test_view_*.py test/test_cli_*.py test/test_study_sweep.py)
+COVERED ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_stream_*.py test/test_record_file.py)
 LOWEST ?= .venv-lowest
 # core, record and node, without random searches; rerun wants a newer numpy than ROS 2 Jazzy has
-LOWEST_TESTS ?= -k "not rerun" $(filter-out %_stress.py %_extremes.py %_properties.py %_convergence.py %_ros_demo.py, \
-	$(wildcard test/test_model_*.py test/test_scene_*.py test/test_solve_*.py test/test_run_*.py \
-	test/test_stream_*.py test/test_record_*.py test/test_ros_*.py))
+LOWEST_TESTS ?= -k "not rerun" $(wildcard test/test_model_*.py test/test_scene_*.py test/test_run_twin.py test/test_stream_*.py) \
+	$(addprefix test/, test_solve_reference.py test_solve_wear.py test_record_file.py test_ros_lifecycle.py)
 
 demo: $(INSTALLED)
 	"$(VENV)/bin/plow-twin" demo --speed $(SPEED) --out "$(OUT)"
