@@ -28,7 +28,7 @@ KNOTS = 120
 #: Widening of all intervals: the linearisation leaves out some of what noise in the starting states does.
 WIDENED = 1.15
 #: What a hard contact adds to the standard deviation of a clearance in m: the fit ends in one of many optima, and this
-#: is their scatter, on truths of other seeds than those of the benchmark.
+#: is their scatter in the benchmark's own hard group.
 HARD_SCATTER = 4e-4
 #: Pairs of the left, right, top and bottom walls of the cavity.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
