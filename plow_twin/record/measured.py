@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.mapping import ROLES, read_map
-from plow_twin.record.reader import RunReader
+from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene, loads_scene
 from plow_twin.scene_file.presets import scene_path
@@ -73,7 +73,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     SceneError
         When the scene cannot be used.
     """
-    own = _own(path)
+    own = own_run(path)
     if own is None:
         file = scene or (path / SCENE_FILE if path.is_dir() else path.with_name(SCENE_FILE))
         if scene is None and not file.is_file():
@@ -98,18 +98,6 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     for table in (loads, poses):
         table[:, 0] = (table[:, 0] - origin) * 1e-9
     return Measured(model, loads, poses, unfit)
-
-
-def _own(path: Path) -> RunReader | None:
-    """Return the reader of a run of ours, or None for another recording."""
-    if path.is_dir() and not any(path.glob("*.mcap")):
-        return None
-    try:
-        return RunReader(path)
-    except RecordingError as error:
-        if "is missing: not a recording" in str(error) or "not an MCAP file" in str(error):
-            return None
-        raise
 
 
 def _journal_load(reader: RunReader) -> Array:

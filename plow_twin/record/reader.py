@@ -446,3 +446,15 @@ def mcap_path(path: Path) -> Path:
 def _part_number(path: Path) -> tuple[int, str]:
     digits = re.search(r"(\d+)$", path.stem)
     return (int(digits[1]) if digits else -1, path.name)
+
+
+def own_run(path: Path) -> RunReader | None:
+    """Return the reader of a run of ours, or None for another recording."""
+    if path.is_dir() and not any(path.glob("*.mcap")):
+        return None
+    try:
+        return RunReader(path)
+    except RecordingError as error:
+        if "is missing: not a recording" in str(error) or "not an MCAP file" in str(error):
+            return None
+        raise

@@ -17,7 +17,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.importing import Feed, Walked, Walker
 from plow_twin.record.mapping import Role, read_map
-from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import Source, open_source
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene, loads_scene
@@ -201,7 +201,9 @@ def analyse(
         The recording, the mapping or a scene cannot be used.
     """
     begin = time.perf_counter()
-    reader = _own(path)
+    if not path.exists():
+        raise RecordingError(f"{path}: no such recording")
+    reader = own_run(path)
     if reader is not None:
         own = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
         chosen, name = (own, "of the run") if scene is None else (load_scene(scene_path(str(scene))), str(scene))
@@ -221,20 +223,6 @@ def analyse(
         found = _walk_other(path, mapping, predictions, measured, out)
     found.wall_s = time.perf_counter() - begin
     return found
-
-
-def _own(path: Path) -> RunReader | None:
-    """Return the reader of a run of ours, or None for another recording."""
-    if not path.exists():
-        raise RecordingError(f"{path}: no such recording")
-    if path.is_dir() and not any(path.glob("*.mcap")):
-        return None
-    try:
-        return RunReader(path)
-    except RecordingError as error:
-        if "is missing: not a recording" in str(error) or "not an MCAP file" in str(error):
-            return None
-        raise
 
 
 def _session(scene: Scene, tol: float, origin_ns: int | None = None) -> Session:
