@@ -235,7 +235,8 @@ def test_a_delay_that_rises_for_good_is_worked_in_marked_and_replayed_exactly(tm
         for index in range(300):
             send(T0 + index * MS, wrench[index])
             probe.pace(index)
-        probe.until(lambda: quality, "advances without a sample")
+        # far enough ahead of the next sample that it is late, however soon it is sent
+        probe.until(lambda: quality and stamp_ns(quality[-1].header) > T0 + 350 * MS, "advances without a sample")
         assert tuple(quality[0].name) == ("held", "corrected")
         for index in range(300, 600):  # as late as that from now on
             send(T0 + index * MS, wrench[index])
