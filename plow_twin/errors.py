@@ -99,3 +99,7 @@ class ToleranceWarning(UserWarning):
 
 class RecordingError(PlowTwinError, ValueError):
     """A recording cannot be written or read; the message names the file and the record."""
+
+
+class ForeignRecordingError(RecordingError):
+    """A recording that was asked for as a run of plow_twin is none; it may be a recording of another kind."""

@@ -169,6 +169,15 @@ def test_another_build_is_named(run: Run, tmp_path: Path) -> None:
     assert report.exit_code == 0
 
 
+def test_a_damaged_scene_in_a_file_is_named_with_its_key(run: Run, tmp_path: Path) -> None:
+    def metadata(record: dict[str, str]) -> dict[str, str]:
+        return {key: text.replace("mass_kg", "mbss_kg") for key, text in record.items()}
+
+    damaged = rewrite(run.file, tmp_path / "damaged.mcap", metadata=metadata)
+    with pytest.raises(RecordingError, match=r"scene in .*damaged\.mcap(.|\n)*mass_kg"):
+        replay(damaged)
+
+
 def test_a_header_that_lacks_a_key_is_refused(run: Run, tmp_path: Path) -> None:
     def metadata(record: dict[str, str]) -> dict[str, str]:
         record.pop("tol", None)

@@ -15,7 +15,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.template import Bytes, Indexes, compiled
 
 try:  # twenty times as fast as the standard library's
@@ -317,6 +317,6 @@ def open_mcap(path: Path) -> IO[bytes]:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
     if stream.read(len(MAGIC)) != MAGIC:
         stream.close()
-        raise RecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r})")
+        raise ForeignRecordingError(f"{path}: not an MCAP file (its first bytes are not {MAGIC!r})")
     stream.seek(0)
     return stream

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 from plow_twin.build import build_fingerprint, package_version
-from plow_twin.errors import RecordingError
+from plow_twin.errors import RecordingError, SceneError
+from plow_twin.model.scene import Scene
 from plow_twin.stream.journal import ParameterValue
 
 #: Name of the MCAP metadata record that holds the header.
@@ -63,6 +64,21 @@ class RunHeader:
     def topic(self, base_name: str) -> str:
         """Return the name that an output was sent under."""
         return self.topics.get(base_name, f"{self.node.rpartition('/')[0]}/{base_name}")
+
+    def scene(self, source: object) -> Scene:
+        """Return the scene; `source` names the recording in an error.
+
+        Raises
+        ------
+        RecordingError
+            The scene cannot be used: the recording is damaged, or its law is not known here.
+        """
+        from plow_twin.scene_file import loads_scene
+
+        try:
+            return loads_scene(self.scene_yaml, source=f"scene in {source}")
+        except SceneError as error:
+            raise RecordingError(str(error)) from error
 
     def to_record(self) -> dict[str, str]:
         """Return the MCAP metadata record: texts stay as they are, all else is JSON."""

@@ -19,7 +19,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.mapping import ROLES, read_map
 from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
-from plow_twin.scene_file import load_scene, loads_scene
+from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 
 Array = NDArray[np.float64]
@@ -83,9 +83,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         loads = rows["excitation"]
     else:
         given = scene is not None
-        model = (
-            load_scene(scene_path(str(scene))) if given else loads_scene(own.header.scene_yaml, source=str(own.path))
-        )
+        model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
         loads = _journal_load(own)
         folder = path if path.is_dir() else path.parent
         rows, unfit = _collect([folder, folder / "beside"], mapping, ("head_pose",), own.header.node)

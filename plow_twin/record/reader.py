@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
 from plow_twin.record.chunks import ChunkReader, Messages
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
@@ -199,7 +199,7 @@ class RunReader:
             if header is not None:
                 self.header = header
                 return
-        raise RecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
+        raise ForeignRecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
 
     def __iter__(self) -> Iterator[Record]:
         for batch in self.batches():
@@ -454,7 +454,5 @@ def own_run(path: Path) -> RunReader | None:
         return None
     try:
         return RunReader(path)
-    except RecordingError as error:
-        if "is missing: not a recording" in str(error) or "not an MCAP file" in str(error):
-            return None
-        raise
+    except ForeignRecordingError:
+        return None

@@ -139,9 +139,7 @@ def replay(
     Raises
     ------
     RecordingError
-        The file is no recording, or its journal cannot be understood.
-    SceneError
-        The scene in the file is not usable.
+        The file is no recording, or its scene or journal cannot be used.
     """
     reader = RunReader(Path(path))
     run = _Replay(reader.header, ReplayReport(reader.path), digests_only or write is not None)
@@ -170,8 +168,6 @@ class _Replay:
     """The state of one replay: a session, and whether it is where the live one was."""
 
     def __init__(self, header: RunHeader, report: ReplayReport, digests_only: bool) -> None:
-        from plow_twin.scene_file import loads_scene
-
         self.digests_only = digests_only
         #: every publication is there: windows between two of them can be followed
         self.all_outputs = not digests_only and header.record_outputs == "all"
@@ -181,7 +177,7 @@ class _Replay:
         report.build_differences = {
             key: (there, here.get(key, "")) for key, there in header.build.items() if there != here.get(key, "")
         }
-        scene = loads_scene(header.scene_yaml, source=f"scene in {report.path}")
+        scene = header.scene(report.path)
         excitation: Any = "scene" if header.excitation_source == "scene" else "sampled"
         twin = Twin(scene, tol=header.tol, excitation=excitation)
         twin.warm_up()

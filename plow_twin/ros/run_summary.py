@@ -14,7 +14,6 @@ from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKW
 from plow_twin.model.scene import Scene
 from plow_twin.record.messages import JointState
 from plow_twin.record.reader import OutputRecord, RunReader
-from plow_twin.scene_file import loads_scene
 
 #: Mask of the pairs that belong to each sense of swing.
 SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
@@ -66,7 +65,7 @@ def summarise(path: Path) -> RunSummary:
         The file is not a recording of plow_twin.
     """
     reader = RunReader(path)
-    scene = loads_scene(reader.header.scene_yaml)
+    scene = reader.header.scene(reader.path)
     found = _read(reader)
     forces, peaks = found["contact_forces"], found["contact_peaks"]
     largest, impulse, in_contact = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)

@@ -14,7 +14,6 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
-from plow_twin.scene_file import loads_scene
 from plow_twin.stream.journal import Sample
 from plow_twin.view.section import PAIR_COLORS, Section
 
@@ -48,7 +47,7 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> FileSta
     from matplotlib.figure import Figure
 
     reader = RunReader(path)
-    scene = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
+    scene = reader.header.scene(reader.path)
     section = Section.of(scene)
     force, load, clearance = _Largest(), _Largest(), _Largest()
     names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}

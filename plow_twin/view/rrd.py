@@ -16,7 +16,6 @@ from plow_twin.model.scene import Clearance, Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus, JointState, Odometry
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
-from plow_twin.scene_file import loads_scene
 from plow_twin.stream.journal import Hold, Sample
 from plow_twin.view import layout
 from plow_twin.view.columns import Batches, Curves, buffers
@@ -88,7 +87,7 @@ def to_rrd(
         The file is no recording, or `out` cannot be written.
     """
     reader = RunReader(Path(path))
-    scene = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
+    scene = reader.header.scene(reader.path)
     section = Section.of(scene)
     stream = rr.RecordingStream("plow_twin")
     try:

@@ -20,7 +20,7 @@ from plow_twin.record.mapping import Role, read_map
 from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import Source, open_source
 from plow_twin.run.twin import Twin
-from plow_twin.scene_file import dump_scene, load_scene, loads_scene
+from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import Loss, Reset, SetWear, Snapshot, Travel
@@ -205,7 +205,7 @@ def analyse(
         raise RecordingError(f"{path}: no such recording")
     reader = own_run(path)
     if reader is not None:
-        own = loads_scene(reader.header.scene_yaml, source=f"scene in {reader.path}")
+        own = reader.header.scene(reader.path)
         chosen, name = (own, "of the run") if scene is None else (load_scene(scene_path(str(scene))), str(scene))
     else:
         file = scene or (path / "scene.yaml" if path.is_dir() else path.with_name("scene.yaml"))
