@@ -170,6 +170,16 @@ def _ends_with(column, order, at, within) -> bool:
     return slope < 0.0 and value + slope * within <= 0.0
 
 
+@kernel(fast=True)
+def _guards_end_with(w, order, at, within):
+    """Return a bit for each pair whose first guard `_ends_with` the event at `at`."""
+    value, slope, zero = row(w.guard, order), splat(0.0), splat(0.0)
+    for k in range(order - 1, -1, -1):
+        slope = slope * at + value
+        value = value * at + row(w.guard, k)
+    return below(slope, zero) & below(value + slope * within, zero)
+
+
 @kernel()
 def note_switches(
     p, state, w, order, at, event, target, penetrating, viscous, hysteretic, integer, fraction, ramp
@@ -179,13 +189,12 @@ def note_switches(
     What happens at one instant but for rounding happens together: a symmetric motion stays symmetric.
     """
     column, within = w.column[0], _AT_ONCE * at
+    ending = _guards_end_with(w, order, at, within)
     for pair in range(PAIR_COUNT):
         w.switch[pair] = -1
-        for k in range(order + 1):
-            column[k] = w.guard[k, pair]
         if pair == event:
             w.switch[pair] = target
-        elif _ends_with(column, order, at, within):
+        elif ending >> pair & 1:
             w.switch[pair] = _next_mode(p, state.mode[pair], viscous, fraction, ramp)
         elif penetrating and state.mode[pair] != OFF:
             guarded = _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fraction, ramp)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
+from functools import cache
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -185,7 +186,8 @@ STATE: Final = _in_lines(
     ]
 )
 
-#: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes.
+#: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes. What has
+#: eight columns comes first: each of its rows then fills a cache line.
 WORK: Final = np.dtype(
     [
         ("series", "f8", _WIDE),  # state
@@ -202,20 +204,20 @@ WORK: Final = np.dtype(
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
         ("ramp", "f8", (3, *_WIDE)),  # square and cube of the penetration, share of C
         ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
+        ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
+        ("moved", "f8", (STATE_SIZE,)),
+        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
         ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
         ("column", "f8", (2, _ROWS)),  # one polynomial
         ("halves", "f8", (MAX_HALVINGS + 2, _ROWS)),
         ("bounds", "f8", (MAX_HALVINGS + 2, 2)),
-        ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("wrench", "f8", (2, 3)),  # value and slope at the step's start of the load that is linear in time
         ("flight", "f8", (6, 6)),  # start of a flight, what bounds it, scratch (`solve.method.flight`)
         ("rest", "f8", (4, 6)),  # place, rates and load at rest (`solve.method.rest`)
         ("hessian", "f8", (3, 3)),
         ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("decay", "f8", (1,)),  # rate in 1/s at which damping decays, 0 where it does not bound steps
-        ("moved", "f8", (STATE_SIZE,)),
-        ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
         ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
@@ -354,12 +356,20 @@ def new_records(dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
     return records
 
 
+@cache
+def _inverse_binomials() -> Array:
+    """Return 1 / C(order, k), shape (orders, orders)."""
+    table = np.zeros((_ROWS, _ROWS))
+    for order in range(_ROWS):
+        table[order, : order + 1] = [1.0 / math.comb(order, k) for k in range(order + 1)]
+    return table
+
+
 def new_work() -> Work:
     """Return scratch space for series up to `MAX_ORDER`."""
     work = new_record(WORK)
     work.inverse[1:] = 1.0 / np.arange(1, _ROWS + 2)
-    for order in range(_ROWS):
-        work.binomial[order, : order + 1] = [1.0 / math.comb(order, k) for k in range(order + 1)]
+    work.binomial[:] = _inverse_binomials()
     return work
 
 
