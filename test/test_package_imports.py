@@ -29,7 +29,7 @@ ROOMS = {
     "run": SOLVER,
     "stream": CORE,
     "estimate": CORE,
-    "record": CORE | {"build", "scene_file", "stream"},
+    "record": CORE | {"build", "scene_file", "stream", "estimate"},
     "view": CORE | {"scene_file", "stream", "record"},
     "study": CORE | {"build", "scene_file", "stream", "record", "view"},
     "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},

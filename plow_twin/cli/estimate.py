@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, json_option, output_console, quiet_option, table
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, busy, json_option, output_console, quiet_option, table
 
 if TYPE_CHECKING:
     from plow_twin.estimate.result import Estimate, Interval
+    from plow_twin.model.scene import Scene
 
 
 @click.command(
@@ -36,25 +39,24 @@ def estimate(
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
 
     INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed) and pose.csv (t,
-    x, y, theta: the measured pose, a cell left empty was not measured), a run of ours with the measured pose recorded
-    beside it, or another recording (MCAP, rosbag2's sqlite3).
+    x, y, theta: the measured pose, a cell left empty was not measured), a run of ours, or another recording (MCAP,
+    rosbag2's sqlite3). Where the node of a run estimated, its newest estimate is made again from the journal and
+    compared, bit for bit; else the measured pose is one recorded beside the run.
     """
-    from plow_twin.estimate.estimate import estimate as run
     from plow_twin.estimate.estimate import warm_up
-    from plow_twin.estimate.measurements import Load, Poses
-    from plow_twin.record.measured import LOAD_FILE, read_measured, read_recording
+    from plow_twin.record.measured import LOAD_FILE
+    from plow_twin.record.reader import own_run
 
     folder = mapping is None and (source / LOAD_FILE).is_file()
-    measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
-    load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:])
-    poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:])
+    live = scene is None and mapping is None and not folder and own_run(source) is not None
+    task = (_repeated(source) if live else None) or _given(source, scene, mapping, folder)
     begin = time.perf_counter()
     with busy("compiling", quiet or as_json):
-        warm_up(measured.scene)
+        warm_up(task.scene)
     compile_s, begin = time.perf_counter() - begin, time.perf_counter()
     with busy("estimating", quiet or as_json):
-        result = run(measured.scene, load, poses, measured.unreadable + lost_load + lost_poses)
-    facts = {**result.as_dict(), "wall_s": time.perf_counter() - begin, "compile_s": compile_s}
+        result, more = task.run()
+    facts = {**result.as_dict(), **more, "wall_s": time.perf_counter() - begin, "compile_s": compile_s}
     text = json.dumps(facts, indent=2, allow_nan=False)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -63,7 +65,56 @@ def estimate(
         click.echo(text)
     elif not quiet:
         _show(result)
+    if more.get("live", {}).get("repeated") is False:
+        click.echo("the journal gives another estimate than the node published", err=True)
+        return FAILED
     return DONE_WITH_LOSS if result.lost else DONE
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is to be estimated: `run` returns the estimate and what else is to be said."""
+
+    scene: Scene
+    run: Callable[[], tuple[Estimate, dict[str, Any]]]
+
+
+def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
+    """Return the task of estimating from all that was measured."""
+    from plow_twin.estimate.estimate import estimate as run
+    from plow_twin.estimate.measurements import Load, Poses
+    from plow_twin.record.measured import read_measured, read_recording
+
+    measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
+    load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:])
+    poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:])
+    lost = measured.unreadable + lost_load + lost_poses
+    return _Task(measured.scene, lambda: (run(measured.scene, load, poses, lost), {}))
+
+
+def _repeated(source: Path) -> _Task | None:
+    """Return the task of making the newest estimate of a live node again, or None where it made none."""
+    from plow_twin.estimate.estimate import estimate_window
+    from plow_twin.record.estimated import live_estimates
+    from plow_twin.record.reader import RunReader
+    from plow_twin.scene_file import loads_scene
+
+    reader = RunReader(source)
+    found = list(live_estimates(reader))
+    whole = [one for one in found if one.window is not None]
+    if not whole:
+        return None
+    scene = loads_scene(reader.header.scene_yaml, source=str(reader.path))
+
+    def run() -> tuple[Estimate, dict[str, Any]]:
+        entry, window = whole[-1].entry, whole[-1].window
+        assert window is not None
+        result, _ = estimate_window(scene, window.load, window.pose, window.lost, entry.guess)
+        same = json.dumps(result.as_dict(), allow_nan=False) == entry.result
+        live = {"estimates": len(found), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
+        return result, {"live": live}
+
+    return _Task(scene, run)
 
 
 def _show(result: Estimate) -> None:

@@ -11,13 +11,15 @@ from plow_twin.estimate.fit import Fit, Problem
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
 from plow_twin.estimate.result import Estimate, Interval, State
-from plow_twin.estimate.search import search
+from plow_twin.estimate.search import refine, search
 from plow_twin.estimate.start import range_of_motion
-from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, SOFTNESS, Unknowns
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, SIZE, SOFTNESS, Unknowns
 from plow_twin.estimate.verdict import Verdict, judge, sandwich
 from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
+#: Shared unknowns and noise of the window before, 14 numbers; empty: none.
+Guess = tuple[float, ...]
 
 #: Largest standard deviation in m with which a clearance counts as estimated.
 OBSERVED = 1e-3
@@ -48,17 +50,36 @@ def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0) -> Estimate:
     lost : int
         Rows that were left out before.
     """
+    return estimate_window(scene, load, poses, lost)[0]
+
+
+def estimate_window(scene: Scene, load: Load, poses: Poses, lost: int = 0, guess: Guess = ()) -> tuple[Estimate, Guess]:
+    """Estimate as `estimate` does, from what the window before told; return the guess for the next one too.
+
+    Where the fit from `guess` does not hold, all is searched as without one.
+    """
     unknowns = Unknowns(scene)
     poses = poses.between(float(load.t[0]), float(load.t[-1]) + 1e-9)
     if len(poses.t) < FEWEST_POSES:
-        return prior_of(unknowns, (float(load.t[0]), float(load.t[-1])), lost)
+        return prior_of(unknowns, (float(load.t[0]), float(load.t[-1])), lost), ()
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
     forward = Forward(scene, thinned(load, period))
+    if guess:
+        numbers = np.array(guess)
+        near = refine(forward, unknowns, poses, period, unknowns.within(numbers[:SIZE]), numbers[SIZE:])
+        verdict = judge(*near, period) if near else None
+        if near and verdict and not (verdict.model or verdict.sensor):
+            return summarise(*near, verdict, lost), _next_guess(near[1])
+        forward = Forward(scene, thinned(load, period))
     found = search(forward, unknowns, poses, period)
     if found is None:
-        return _without_fit(unknowns, poses, lost)
-    problem, fit = found
-    return summarise(problem, fit, judge(problem, fit, period), lost)
+        return _without_fit(unknowns, poses, lost), ()
+    result = summarise(*found, judge(*found, period), lost)
+    return result, () if State.WITHDRAWN in (result.horizontal_state, result.vertical_state) else _next_guess(found[1])
+
+
+def _next_guess(fit: Fit) -> Guess:
+    return (*fit.shared.tolist(), *fit.noise.tolist())
 
 
 def thinned(load: Load, period: float) -> Load:

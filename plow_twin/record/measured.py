@@ -9,7 +9,7 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.journal import Pose
 
 Array = NDArray[np.float64]
 
@@ -63,8 +64,8 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
     """Read a run of ours by its journal, or another recording (MCAP, rosbag2's sqlite3, csv) by the mapping.
 
-    The measured pose of a run of ours lies in another recording beside it, or in its folder `beside`. Times count from
-    the first sample of the load.
+    The measured pose of a run of ours lies in its journal where the node estimated, else in another recording beside
+    it, or in its folder `beside`. Times count from the first sample of the load.
 
     Raises
     ------
@@ -84,9 +85,11 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     else:
         given = scene is not None
         model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
-        loads = _journal_load(own)
-        folder = path if path.is_dir() else path.parent
-        rows, unfit = _collect([folder, folder / "beside"], mapping, ("head_pose",), own.header.node)
+        loads, journalled = _journal(own)
+        rows, unfit = {"head_pose": journalled}, 0
+        if mapping is not None or not len(journalled):
+            folder = path if path.is_dir() else path.parent
+            rows, unfit = _collect([folder, folder / "beside"], mapping, ("head_pose",), own.header.node)
         unfit += sum(own.lost.values())
     poses = rows["head_pose"]
     for name, found in (("load", loads), ("measured pose", poses)):
@@ -98,19 +101,14 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     return Measured(model, loads, poses, unfit)
 
 
-def _journal_load(reader: RunReader) -> Array:
-    """Return the samples of a run's journal, shape (n, 4), stamps in ns."""
-    parts = [
-        np.column_stack([batch.entries.stamp_ns, batch.entries.wrench])[_samples(batch.entries)]
-        for batch in reader.batches(outputs=False)
-    ]
-    return np.concatenate(parts) if parts else np.zeros((0, 4))
-
-
-def _samples(entries: Any) -> NDArray[np.bool_]:
-    chosen = np.ones(len(entries), dtype=bool)
-    chosen[list(entries.others)] = False
-    return chosen
+def _journal(reader: RunReader) -> tuple[Array, Array]:
+    """Return the samples and the measured poses of a run's journal, shape (n, 4) each, stamps in ns."""
+    loads, poses = [np.zeros((0, 4))], []
+    for batch in reader.batches(outputs=False):
+        entries = batch.entries
+        loads.append(np.column_stack([entries.stamp_ns, entries.wrench])[entries.sample])
+        poses += [(entry.stamp_ns, *entry.pose) for entry in entries.others.values() if isinstance(entry, Pose)]
+    return np.concatenate(loads), np.array(poses, dtype=np.float64).reshape(-1, 4)
 
 
 def _collect(

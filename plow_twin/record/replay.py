@@ -45,7 +45,7 @@ from plow_twin.record.reader import (
 from plow_twin.record.template import Bytes, Indexes, Template, differs, read_numbers
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
-from plow_twin.stream.journal import Digest, Hold, Loss, Sample, Snapshot, Unload
+from plow_twin.stream.journal import Digest, Hold, Loss, Pose, Sample, Snapshot, Unload
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.session import Session
 
@@ -208,16 +208,14 @@ class _Replay:
         count = len(entries)
         breaks = np.ones(count, bool)  # entries that no run goes on into
         breaks[1:] = np.diff(entries.sequence) != 1
-        breaks |= ~entries.sample
+        for index, entry in sorted(entries.others.items()):
+            goes_on = not breaks[index] and (index - 1 not in entries.others or not breaks[index - 1])
+            if not (goes_on and isinstance(entry, Digest | Pose)):
+                breaks[index : index + 2] = True
         samples = np.flatnonzero(entries.sample)
         late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # worked in one by one
         breaks[late] = True
         breaks[late[late + 1 < count] + 1] = True
-        for index, entry in entries.others.items():
-            if isinstance(entry, Digest) and index and entries.sequence[index] - entries.sequence[index - 1] == 1:
-                breaks[index] = False
-            elif index + 1 < count:
-                breaks[index + 1] = True
         ends = np.append(np.flatnonzero(breaks), count)
         place = begin = 0
         while place < count:
@@ -248,7 +246,7 @@ class _Replay:
     def _run(self, entries: Entries, sent: _Sent, begin: int, end: int) -> bool:
         """Apply a run of samples and digests at once and compare what was sent; False: nothing was done."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
-        digests = sorted(entries.others)
+        digests = sorted(index for index, entry in entries.others.items() if isinstance(entry, Digest))
         stamps = entries.stamp_ns[entries.sample]
         before = self.session.snapshot(), self.session.outputs.pending, self.session.origin_ns
         try:

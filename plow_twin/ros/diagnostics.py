@@ -86,6 +86,14 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "recent_latency_p99_ms": "reception to publication since the last report, 99 % [ms]; empty: none",
         "recent_age_p99_ms": "system time minus stamp when published since the last report, 99 % [ms]",
     },
+    "estimate": {
+        "estimates": "estimates that have come since configure; empty: none are made",
+        "skipped": "windows that gave way to a newer one: the machine is too slow for estimate_interval",
+        "window_age_s": "the node's time minus the end of the newest estimate's window [s]; empty without one",
+        "wall_s": "time that the newest estimate took [s]",
+        "reasons": "why model or sensor are suspect; empty: they are not",
+        "error": "why nothing more is estimated; empty: it is",
+    },
     "recorder": {
         "recording": "file being written; empty: none",
         "written": "items in the file",
@@ -101,8 +109,11 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "stream": "waiting, running, stale, ended or failed",
     "stale_inputs": "inputs that have gone silent, separated by commas",
     "recorder": "off, recording, or trouble: something was lost or it has stopped",
-    "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated or not_observable",
+    "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated, not_observable or "
+    "withdrawn",
     "vertical": "the same of the vertical clearance",
+    "model": "whether the model fits what is measured: ok or suspect; empty: nothing has been estimated",
+    "sensor": "the same of the sensor of head_pose",
     "pads": "the same of the pads' wear",
     **{f"publishers_{topic}": f"publishers of `{topic}` that this node is connected to" for topic in TOPICS},
 }
@@ -151,6 +162,9 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     values["stale_inputs"] = ",".join(stale)
     values["recorder"] = runtime.recorder_state
     values |= dict.fromkeys(("horizontal", "vertical", "pads"), "prior")
+    estimation = runtime.estimation
+    if estimation is not None:
+        values |= {name: state.value for name, state in estimation.states.items()} | estimation.trust
     values |= {f"publishers_{topic}": str(count) for topic, count in runtime.inputs.publishers.items()}
     if lifecycle != "active":
         return OK, lifecycle, values
@@ -160,6 +174,12 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         (ERROR, runtime.unsteady, "the stamps jump again and again: too many resets, samples are dropped"),
         (ERROR, values["recorder"] == "trouble", "the recording has lost something or has stopped"),
         (ERROR, bool(runtime.wear_error), runtime.wear_error),
+        (WARN, estimation is not None and bool(estimation.error), estimation.error if estimation else ""),
+        (
+            WARN,
+            estimation is not None and bool(estimation.reasons),
+            "; ".join(estimation.reasons if estimation else ()),
+        ),
         (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
         (WARN, runtime.inputs.other_sender, "another publisher sends too and is not followed"),
         (WARN, bool(runtime.inputs.silent()), f"silent: {', '.join(runtime.inputs.silent())}"),
@@ -258,6 +278,24 @@ class Health:
         }
         grown = self._grown({"withheld": runtime.withheld}, ("withheld",))
         return (ERROR if grown else OK), "; ".join(grown) or "publishing", values
+
+    def estimate(self, runtime: Runtime) -> Part:
+        """Return how the estimate is doing."""
+        values = dict.fromkeys(KEYS["estimate"], "")
+        found = runtime.estimation
+        if found is None:
+            return OK, "not estimating", values
+        age_s = runtime.estimate_age_s()
+        values |= {
+            "estimates": str(found.count),
+            "skipped": str(found.skipped),
+            "window_age_s": "" if age_s is None else f"{age_s:.3f}",
+            "wall_s": f"{found.wall_s:.3f}" if found.count else "",
+            "reasons": "; ".join(found.reasons),
+            "error": found.error,
+        }
+        trouble = found.error or values["reasons"]
+        return (ERROR if found.error else WARN if trouble else OK), trouble or "estimating", values
 
     def recorder(self, runtime: Runtime) -> Part:
         """Return how the recording is doing; loss is an error."""

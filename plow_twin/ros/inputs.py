@@ -20,6 +20,7 @@ from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.messages import ToolForces, read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
+from plow_twin.stream.history import RecentStamps
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.limits import Limits
 from plow_twin.stream.senders import Senders
@@ -56,6 +57,9 @@ class Inputs:
         Receives stamp [ns] and speed along the face [m/s].
     on_matched
         Called when the number of publishers of an input has changed.
+    on_pose
+        Receives stamp [ns] and x, y [m], theta [rad] of measured poses, late ones up to `pose_span_s` too; None: only
+        the newest is kept.
     """
 
     def __init__(
@@ -68,12 +72,16 @@ class Inputs:
         on_samples: Callable[[list[Arrival]], None],
         on_travel: Callable[[int, float], None],
         on_matched: Callable[[], None],
+        on_pose: Callable[[int, tuple[float, float, float]], None] | None = None,
+        pose_span_s: float = 0.0,
     ) -> None:
         self._node = node
         self._intake = intake
         self._on_samples = on_samples
         self._on_travel = on_travel
         self._on_matched = on_matched
+        self._on_pose = on_pose
+        self._poses = None if on_pose is None else RecentStamps(pose_span_s)
         self._tool_forces = ToolForces(scene)
         self.active = False
         #: publishers of the selected source
@@ -245,6 +253,16 @@ class Inputs:
         values = (position.x, position.y, theta)
         if not self.active:
             self.head_pose.refuse(Verdict.INACTIVE)
-        elif self.head_pose.judge(stamp_ns(message.header), values).used:
-            self._heard_ns["head_pose"] = time.monotonic_ns()
+            return
+        stamp = stamp_ns(message.header)
+        verdict = self.head_pose.judge(stamp, values, history=self._poses)
+        if not verdict.used:
+            return
+        self._heard_ns["head_pose"] = time.monotonic_ns()
+        if verdict is not Verdict.WORKED_IN:
             self.measured = values
+        if self._on_pose is not None and self._poses is not None:
+            if verdict.resets:
+                self._poses.clear()
+            self._poses.add(stamp)
+            self._on_pose(stamp, values)

@@ -199,6 +199,7 @@ class TwinNode(LifecycleNode):
         if runtime is not None:
             parts["input"] = self._health.input(runtime)
             parts["output"] = self._health.output(runtime)
+            parts["estimate"] = self._health.estimate(runtime)
             parts["recorder"] = self._health.recorder(runtime)
         array = DiagnosticArray()
         array.header.stamp = self.get_clock().now().to_msg()

@@ -92,6 +92,17 @@ class Settings:
         Effect.CONFIGURE,
         "how much older than the newest sample a late one may be and still be worked in; 0: late samples are dropped",
     )
+    estimate: bool = _plain(
+        False,
+        Effect.CONFIGURE,
+        "estimate clearances and contact from head_pose and the samples of the load, in a process of its own",
+    )
+    estimate_window: float = _number(
+        32.0, "s", 1.0, 600.0, Effect.CONFIGURE, "length of the window that an estimate is made of, ten load periods"
+    )
+    estimate_interval: float = _number(
+        10.0, "s", 0.5, 3600.0, Effect.CONFIGURE, "distance of the ends of the windows; one takes some seconds of work"
+    )
     wear_state_path: str = _plain(
         "",
         Effect.CONFIGURE,

@@ -103,10 +103,12 @@ class Recording:
         """Whether so much is queued that losses are near."""
         return self._recorder.counters.queued > _QUEUE_SIZE // 2
 
-    def renew(self, session: Session) -> None:
-        """Journal a snapshot when entries were lost and there is room again."""
-        if self._recorder.snapshot_wanted:
+    def renew(self, session: Session) -> bool:
+        """Journal a snapshot when entries were lost and there is room again; tell whether that was so."""
+        wanted = self._recorder.snapshot_wanted
+        if wanted:
             self._recorder.journal(session.renew())
+        return wanted
 
     def close(self) -> LossReport:
         """Write what is queued and close the file."""

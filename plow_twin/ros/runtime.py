@@ -17,13 +17,14 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from std_srvs.srv import Trigger
 
+from plow_twin.errors import Problem
 from plow_twin.model.scene import Scene
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import publication_messages, quality
 from plow_twin.record.wear_state import scene_identity
 from plow_twin.ros.inputs import Inputs
 from plow_twin.ros.messages import ros_status
-from plow_twin.ros.parameters import Settings
+from plow_twin.ros.parameters import ParameterError, Settings
 from plow_twin.ros.publishers import QUALITY, TOPICS, OutputPublishers
 from plow_twin.ros.qos import LATCHED
 from plow_twin.ros.solver_start import Prepared
@@ -33,12 +34,13 @@ from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
-from plow_twin.stream.journal import Entry
+from plow_twin.stream.journal import Entry, Pose
 from plow_twin.stream.limits import Limits, excitation_limits
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
+    from plow_twin.ros.estimation import Estimation
     from plow_twin.ros.recording import Recording
 
 _CATCH_UP_S: Final = 0.002
@@ -117,9 +119,12 @@ class Runtime:
         self.alarms = Alarms(thresholds, settings.alarm_duration)
         self._alarms_publisher = node.create_publisher(RosDiagnosticStatus, "alarms", LATCHED)
         made.callback(node.destroy_publisher, self._alarms_publisher)
+        self.estimation = self._estimate()
+        if self.estimation:
+            made.callback(self.estimation.close)
         session = Session(
             twin,
-            on_entry=self.recording.journal if self.recording else _ignore,
+            on_entry=self._journal(),
             rollback_span_s=settings.rollback_span,
             wear_depth=wear_depth,
         )
@@ -134,6 +139,8 @@ class Runtime:
             self._on_samples,
             self.driver.travel,
             self._changed,
+            self._on_pose if self.estimation else None,
+            settings.rollback_span,
         )
         self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
         made.callback(self.inputs.close)
@@ -200,6 +207,11 @@ class Runtime:
         newest_ns = self.driver.newest_ns
         return None if newest_ns is None else (self._ros_time_ns() - newest_ns) * 1e-9
 
+    def estimate_age_s(self) -> float | None:
+        """Return the node's time minus the end of the newest estimate's window [s], or None before one."""
+        end_ns = self.estimation.end_ns if self.estimation else None
+        return None if end_ns is None else (self._ros_time_ns() - end_ns) * 1e-9
+
     def record_status(self, status: DiagnosticStatus) -> None:
         """Put a published status into the recording."""
         if self.recording:
@@ -227,6 +239,9 @@ class Runtime:
             self._node.destroy_service(service)
         self.inputs.close()
         lost = []
+        if self.estimation:
+            lost += [self.estimation.error] if self.estimation.error else []
+            self.estimation.close()
         if self.wear_keeper:
             self.wear_keeper.close(self.driver.session.wear_depth)
             lost += [self.wear_keeper.error] if self.wear_keeper.error else []
@@ -264,9 +279,32 @@ class Runtime:
         from plow_twin.ros.recording import Recording
 
         clock = self._ros_time_ns if self.sim_time else None
-        topics = {topic: self._node.resolve_topic_name(topic) for topic in (*TOPICS, "status", "alarms")}
+        topics = {topic: self._node.resolve_topic_name(topic) for topic in (*TOPICS, "status", "alarms", "estimate")}
         name = self._node.get_fully_qualified_name()
         return Recording(self._settings, self.scene, name, topics, clock, self._node.get_logger().error)
+
+    def _estimate(self) -> Estimation | None:
+        if not self._settings.estimate:
+            return None
+        if self.source == "scene":
+            raise ParameterError([Problem("estimate", True, "false where excitation_source is scene: no load comes")])
+        from plow_twin.ros.estimation import Estimation
+
+        return Estimation(self._node, self._settings, self.scene)
+
+    def _journal(self) -> Callable[[Entry], object]:
+        """Return who is told of each entry: the recording, the estimate, both or nobody."""
+        recording, estimation = self.recording, self.estimation
+        if estimation is None:
+            return recording.journal if recording else _ignore
+        if recording is None:
+            return estimation.take
+
+        def both(entry: Entry) -> None:
+            recording.journal(entry)
+            estimation.take(entry)
+
+        return both
 
     def _periodic(self) -> list[tuple[float, Callable[[], None]]]:
         settings = self._settings
@@ -279,6 +317,10 @@ class Runtime:
             periodic.append((settings.publish_rate, lambda: self._publish(self.driver.due())))
         if self.wear_keeper:
             periodic.append((1.0 / settings.wear_save_period, self._save_wear))
+        if self.estimation:
+            from plow_twin.ros.estimation import RATE_HZ
+
+            periodic.append((RATE_HZ, self._on_estimate))
         return periodic
 
     def _timer(self, rate_hz: float, callback: Callable[[], None]) -> Any:
@@ -313,6 +355,17 @@ class Runtime:
             self._received_ns = 0
             self._publish(publication)
             self._advanced()
+
+    def _on_pose(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
+        self.driver.session.apply(Pose(stamp_ns, pose))
+
+    def _on_estimate(self) -> None:
+        assert self.estimation is not None
+        message = self.estimation.poll(self.driver.session)
+        if message is not None:
+            if self.recording:
+                self.recording.message("estimate", message.stamp_ns, message)
+            self._changed()
 
     def _on_clock(self) -> None:
         self._received_ns = now_ns = time.monotonic_ns()
@@ -359,7 +412,10 @@ class Runtime:
 
     def _advanced(self) -> None:
         if self.recording:
-            self.recording.renew(self.driver.session)
+            renewed = self.recording.renew(self.driver.session)
+            if renewed and self.estimation and self.estimation.entry:
+                # no part of a snapshot
+                self.recording.journal(self.estimation.entry)
             if self.sim_time and self.recording.behind:
                 # under /clock nothing is late: a bounded pause lets the recorder's thread catch up
                 time.sleep(_CATCH_UP_S)

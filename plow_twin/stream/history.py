@@ -5,7 +5,7 @@ All of it follows from the journal alone: a replay has the same history at the s
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, bisect_right, insort
 from typing import Final
 
 import numpy as np
@@ -137,3 +137,31 @@ class History:
         del self._samples[kept:], self._stamps_ns[kept:]
         self._travels = [item for item in self._travels if item.stamp_ns < reached_ns]
         return data, samples, travels
+
+
+class RecentStamps:
+    """The stamps of a stream that only has to be in order: what is late by less than `span_s` can still be used."""
+
+    def __init__(self, span_s: float) -> None:
+        self._span_ns = round(span_s * 1e9)
+        self._stamps_ns: list[int] = []
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp before which nothing can be used any more [ns]; None before the first."""
+        return self._stamps_ns[-1] - self._span_ns if self._stamps_ns else None
+
+    def __contains__(self, stamp_ns: int) -> bool:
+        """Tell whether that stamp has been there."""
+        index = bisect_left(self._stamps_ns, stamp_ns)
+        return self._stamps_ns[index : index + 1] == [stamp_ns]
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._stamps_ns.clear()
+
+    def add(self, stamp_ns: int) -> None:
+        """Remember a stamp, and forget those that are too old by now."""
+        insort(self._stamps_ns, stamp_ns)
+        if self._stamps_ns[0] < self._stamps_ns[-1] - 2 * self._span_ns:
+            del self._stamps_ns[: bisect_left(self._stamps_ns, self._stamps_ns[-1] - self._span_ns)]

@@ -8,11 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
+from typing import Protocol
 
-from plow_twin.stream.history import History
 from plow_twin.stream.limits import Limits
 
 NS_PER_S = 1_000_000_000
+
+
+class Remembers(Protocol):
+    """What a late sample can be worked into."""
+
+    @property
+    def oldest_ns(self) -> int | None:
+        """Stamp behind which all can be worked in [ns], None: nothing can."""
+
+    def __contains__(self, stamp_ns: int) -> bool:
+        """Tell whether there is a sample of that stamp."""
 
 
 class Verdict(Enum):
@@ -117,7 +128,7 @@ class Intake:
         stamp_ns: int,
         values: Sequence[float],
         reached_ns: int | None = None,
-        history: History | None = None,
+        history: Remembers | None = None,
         may_reset: bool = True,
     ) -> Verdict:
         """Return the verdict on one sample and count it.
@@ -159,7 +170,7 @@ class Intake:
         self._newest_ns = None
 
     def _judge(
-        self, stamp_ns: int, values: Sequence[float], reached_ns: int | None, history: History | None
+        self, stamp_ns: int, values: Sequence[float], reached_ns: int | None, history: Remembers | None
     ) -> Verdict:
         if not all(map(math.isfinite, values)):
             return Verdict.NON_FINITE

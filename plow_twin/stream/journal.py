@@ -71,6 +71,32 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class Pose:
+    """The head was measured at `pose` (x, y [m], theta [rad]) at `stamp_ns`: kept for the estimate, moves nothing."""
+
+    stamp_ns: int
+    pose: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Estimated:
+    """An estimate of the window from `start_ns` to before `end_ns` has come.
+
+    The window had so many `samples` of the load and `poses`; the fit began at `guess`, or was searched from nothing
+    where that is empty. `shift` is added to the horizontal clearance that the model's wear makes, to its 5 % and its
+    95 % point, then to those of the vertical one (6 numbers [m]) from here on. `result` is all of the estimate, JSON.
+    """
+
+    start_ns: int
+    end_ns: int
+    samples: int
+    poses: int
+    guess: tuple[float, ...]
+    shift: tuple[float, ...]
+    result: str
+
+
+@dataclass(frozen=True)
 class Snapshot:
     """The exact state of the session at `stamp_ns`, from which a run can be resumed."""
 
@@ -93,4 +119,4 @@ class Loss:
     count: int
 
 
-Entry = Sample | Hold | Unload | Travel | Reset | SetWear | Parameter | Snapshot | Digest | Loss
+Entry = Sample | Hold | Unload | Travel | Reset | SetWear | Parameter | Pose | Estimated | Snapshot | Digest | Loss

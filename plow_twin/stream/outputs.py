@@ -165,6 +165,24 @@ class Outputs:
         #: from when on what was told before has been computed again [ns]
         self._corrected_ns: int | None = None
         self._marked = False
+        #: what an estimate adds to the clearances and their points, as in `CLEARANCE_NAMES`; None: nothing is estimated
+        self._shift: Array | None = None
+
+    def set_shift(self, shift: Sequence[float]) -> None:
+        """Add to the horizontal and the vertical clearance of the model, and to their points, from now on.
+
+        `shift` has 6 numbers [m]: horizontal, its 5 % and 95 % points, vertical, its points. No part of `state`: an
+        estimate stays when late samples are worked in.
+        """
+        values = np.zeros(len(CLEARANCE_NAMES))
+        for axis in range(2):
+            points = len(_CLEARANCES) + 2 * axis
+            values[[axis, points, points + 1]] = shift[3 * axis : 3 * axis + 3]
+        self._shift = values if values.any() else None
+
+    def clear_shift(self) -> None:
+        """Let the clearances be those of the model again."""
+        self._shift = None
 
     def add(self, stamp_ns: int, advance: Advance, held: bool = False) -> None:
         """Take in one good advance that ended at `stamp_ns`; `held`: computed without a sample."""
@@ -316,6 +334,8 @@ class Outputs:
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         intervals = np.stack((low, high), axis=-1).reshape(len(wear_depth), -1)
         clearance = np.concatenate((clearances(self._scene, wear_depth), intervals), axis=-1)
+        if self._shift is not None:
+            clearance += self._shift
         return index, clearance, grown / elapsed_s[:, None]
 
     def _slow_part(self, wear_depth: Array) -> Slow | None:
@@ -328,7 +348,16 @@ class Outputs:
         self._slow_ns, self._slow_wear_depth = self._stamp_ns, wear_depth.copy()
         low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
         intervals = np.stack((low, high), axis=1).ravel()
-        return Slow(np.concatenate((clearances(self._scene, wear_depth), intervals)), grown / elapsed_s)
+        clearance = np.concatenate((clearances(self._scene, wear_depth), intervals))
+        if self._shift is not None:
+            clearance += self._shift
+        return Slow(clearance, grown / elapsed_s)
+
+    def modelled(self, wear_depth: Array) -> Array:
+        """Return the horizontal clearance of the model and its two points, then the vertical ones, shape (6,) [m]."""
+        middle = clearances(self._scene, wear_depth)
+        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
+        return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
         """Return what the next publication depends on beside the next advance, exactly."""

@@ -15,9 +15,11 @@ from plow_twin.stream.history import History
 from plow_twin.stream.journal import (
     Digest,
     Entry,
+    Estimated,
     Hold,
     Loss,
     Parameter,
+    Pose,
     Reset,
     Sample,
     SetWear,
@@ -141,8 +143,13 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-            case Parameter():
-                # acts through the entries that follow it
+                # what was estimated was of other pads
+                self.outputs.clear_shift()
+            case Estimated(shift=shift):
+                self._on_entry(entry)
+                self.outputs.set_shift(shift)
+            case Parameter() | Pose():
+                # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):
                 self._on_entry(entry)

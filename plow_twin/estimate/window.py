@@ -1,0 +1,105 @@
+"""Windows for the sliding estimate, formed from samples and poses as they come.
+
+Which windows there are follows from the stamps alone: each ends at a multiple of the interval and is formed once the
+newest sample of the load is later by the time that late ones are waited for. So the order of arrival within that time
+changes nothing, and the journal gives the same windows as the live node.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
+
+Array = NDArray[np.float64]
+Row = tuple[int, float, float, float]
+
+#: Longest silence of the load in s within a window: what acts meanwhile is not known.
+LONGEST_GAP_S = 0.5
+#: Share of the window's full length from which on it is worth an estimate.
+LEAST_SHARE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """What was measured in [start_ns, end_ns); times in s count from `start_ns`.
+
+    samples, poses : numbers of rows as they came, before any is left out
+    lost : rows left out
+    """
+
+    start_ns: int
+    end_ns: int
+    load: Load
+    pose: Poses
+    samples: int
+    poses: int
+    lost: int
+
+
+class Windows:
+    """Collect samples and poses, and form a window whenever one is due.
+
+    Parameters
+    ----------
+    length_s, interval_s, wait_s : float
+        Full length of a window, distance of their ends, and how long late data are waited for, in s.
+    """
+
+    def __init__(self, length_s: float, interval_s: float, wait_s: float) -> None:
+        self._length_ns, self._interval_ns = round(length_s * 1e9), round(interval_s * 1e9)
+        self._wait_ns = round(wait_s * 1e9)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget everything: stamps or machine are other ones from now on."""
+        self._loads: list[Row] = []
+        self._poses: list[Row] = []
+        self._newest_ns: int | None = None
+        self._end_ns: int | None = None
+
+    def take_pose(self, stamp_ns: int, q: tuple[float, ...]) -> None:
+        """Take in a measured pose x, y [m], theta [rad]."""
+        self._poses.append((stamp_ns, *q))  # type: ignore[arg-type]
+
+    def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
+        """Take in a sample of the load Fx, Fy [N], M [N m]; return the window that is due now, if one is."""
+        self._loads.append((stamp_ns, *wrench))  # type: ignore[arg-type]
+        if self._newest_ns is not None and stamp_ns <= self._newest_ns:
+            return None
+        self._newest_ns = stamp_ns
+        end_ns = (stamp_ns - self._wait_ns) // self._interval_ns * self._interval_ns
+        if self._end_ns is None:
+            self._end_ns = end_ns
+        if end_ns <= self._end_ns:
+            return None
+        self._end_ns = end_ns
+        return self._form(end_ns)
+
+    def _form(self, end_ns: int) -> Window | None:
+        start_ns = end_ns - self._length_ns
+        # what is older than this window is in none of those to come
+        self._loads = [row for row in self._loads if row[0] >= start_ns]
+        self._poses = [row for row in self._poses if row[0] >= start_ns]
+        stamps = np.sort(np.array([row[0] for row in self._loads if row[0] < end_ns], dtype=np.int64))
+        gaps = np.flatnonzero(np.diff(stamps) > LONGEST_GAP_S * 1e9)
+        if len(gaps):
+            start_ns = int(stamps[gaps[-1] + 1])
+        elif len(stamps):
+            start_ns = max(start_ns, int(stamps[0]))
+        poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
+        if end_ns - start_ns < LEAST_SHARE * self._length_ns or len(poses) < FEWEST_POSES or len(stamps) < 2:
+            return None
+        rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
+        load, lost_load = Load.of(*_table(rows, start_ns))
+        pose, lost_poses = Poses.of(*_table(poses, start_ns))
+        return Window(start_ns, end_ns, load, pose, len(rows), len(poses), lost_load + lost_poses)
+
+
+def _table(rows: list[Row], start_ns: int) -> tuple[Array, Array]:
+    """Return times in s, shape (n,), and values, shape (n, 3)."""
+    stamps = np.array([row[0] for row in rows], dtype=np.int64)
+    return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), np.array([row[1:] for row in rows], dtype=np.float64)

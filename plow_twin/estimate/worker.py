@@ -1,0 +1,197 @@
+"""The sliding estimate in a process of its own, beside whoever takes in the samples and never in his way.
+
+`Worker` is the near side: what it is given it only puts down; a thread hands it on. The far side, `python -m
+plow_twin.estimate.worker`, collects it, estimates each window that is due and sends back what was found. A window that
+became due while another one was computed gives way to a newer one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
+from types import MappingProxyType
+from typing import Any, Final
+
+from plow_twin.estimate.estimate import Guess, estimate_window, warm_up
+from plow_twin.estimate.result import Estimate
+from plow_twin.estimate.window import Window, Windows
+from plow_twin.model.scene import Scene
+
+#: Interval at which what was put down is handed on [s].
+_HAND_ON_S: Final = 0.05
+#: Most that may wait to be handed on: the far side has stopped reading long before [items].
+_MOST_WAITING: Final = 1_000_000
+#: How much the far side gives way to all others (`nice`).
+_NICE: Final = 10
+_STOP_S: Final = 5.0
+
+
+def _view(contents: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(contents)
+
+
+# a scene keeps its marks in a view, which pickle does not know
+ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
+
+
+@dataclass(frozen=True)
+class Found:
+    """An estimate of one window: its bounds [ns], how many rows it had, what it started from, and what came out.
+
+    wall_s : how long it took; skipped : windows before it that gave way; restarts : times that all began anew before it
+    """
+
+    start_ns: int
+    end_ns: int
+    samples: int
+    poses: int
+    guess: Guess
+    estimate: Estimate
+    wall_s: float
+    skipped: int
+    restarts: int
+
+
+class Worker:
+    """A process that estimates; `take_load`, `take_pose` and `restart` return at once, `poll` what has been found.
+
+    Parameters
+    ----------
+    scene : Scene
+        The nominal scene.
+    length_s, interval_s, wait_s : float
+        As of `Windows`.
+    """
+
+    def __init__(self, scene: Scene, length_s: float, interval_s: float, wait_s: float) -> None:
+        near, far = Pipe()
+        command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno())]
+        # one thread of linear algebra: it is to take no more than one core
+        environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
+        self._process = subprocess.Popen(
+            command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment
+        )
+        far.close()
+        self._connection = near
+        self._connection.send((scene, length_s, interval_s, wait_s))
+        self._waiting: deque[tuple[Any, ...]] = deque()
+        self._restarts = 0
+        self._closed = threading.Event()
+        #: why nothing more is estimated; empty: it is
+        self.error = ""
+        self._thread = threading.Thread(target=self._hand_on, name="estimate", daemon=True)
+        self._thread.start()
+
+    def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> None:
+        """Take in a sample of the load."""
+        self._waiting.append((stamp_ns, wrench, True))
+
+    def take_pose(self, stamp_ns: int, q: tuple[float, ...]) -> None:
+        """Take in a measured pose."""
+        self._waiting.append((stamp_ns, q, False))
+
+    def restart(self) -> None:
+        """Let the windows begin anew."""
+        self._restarts += 1
+        self._waiting.append(())
+
+    def poll(self) -> Found | None:
+        """Return what has been found since the last call, if anything; what was before a restart is dropped."""
+        if self.error:
+            return None
+        try:
+            if self._connection.poll():
+                found: Found = self._connection.recv()
+                return found if found.restarts == self._restarts else None
+        except (EOFError, OSError):
+            self.error = f"the estimator ended with code {self._process.wait(_STOP_S)}"
+        return None
+
+    def close(self) -> None:
+        """End the process."""
+        self._closed.set()
+        self._process.terminate()
+        try:
+            self._process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._thread.join(_STOP_S)
+        self._connection.close()
+
+    def _hand_on(self) -> None:
+        while not self._closed.wait(_HAND_ON_S):
+            if len(self._waiting) > _MOST_WAITING:
+                self.error = f"the estimator did not read for {_MOST_WAITING} samples"
+            if self.error:
+                self._waiting.clear()
+                continue
+            waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            if waiting:
+                try:
+                    self._connection.send(waiting)
+                except OSError:  # `poll` says why
+                    return
+
+
+def serve(connection: Connection) -> None:
+    """Estimate what comes until the other side is gone."""
+    scene, length_s, interval_s, wait_s = connection.recv()
+    windows = Windows(length_s, interval_s, wait_s)
+    warm_up(scene)
+    guess: Guess = ()
+    skipped = restarts = 0
+    while True:
+        due: Window | None = None
+        while due is None or connection.poll():
+            for item in connection.recv():
+                if not item:
+                    windows.restart()
+                    due, guess, restarts = None, (), restarts + 1
+                    continue
+                formed = take(windows, item)
+                if formed is not None:
+                    skipped += due is not None
+                    due = formed
+        begin = time.perf_counter()
+        result, following = estimate_window(scene, due.load, due.pose, due.lost, guess)
+        wall_s = time.perf_counter() - begin
+        bounds = (due.start_ns, due.end_ns, due.samples, due.poses)
+        connection.send(Found(*bounds, guess, result, wall_s, skipped, restarts))
+        guess, skipped = following, 0
+
+
+def take(windows: Windows, item: tuple[int, tuple[float, ...], bool]) -> Window | None:
+    """Take in one item as `Worker` sends it; return the window that is due, if one is."""
+    stamp_ns, values, is_load = item
+    if is_load:
+        return windows.take_load(stamp_ns, values)
+    windows.take_pose(stamp_ns, values)
+    return None
+
+
+def main() -> None:
+    """Run the far side; the argument is the descriptor of its end."""
+    # Ctrl-C goes to the whole group: the near side decides when this one ends
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(_NICE)
+    try:
+        serve(Connection(int(sys.argv[1])))
+    except (EOFError, ConnectionError):
+        return
+
+
+if __name__ == "__main__":
+    # what is sent must be of the module as the other side imports it, not of `__main__`
+    from plow_twin.estimate import worker
+
+    worker.main()

@@ -1,0 +1,57 @@
+"""The estimates of a live node, made again from its journal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from plow_twin.estimate.window import Window, Windows
+from plow_twin.record.reader import RunReader
+from plow_twin.stream.journal import Estimated, Pose, Reset, SetWear
+
+
+@dataclass(frozen=True, eq=False)
+class LiveEstimate:
+    """An estimate as the node journalled it, with its window as the journal gives it.
+
+    `window` is None where the journal does not hold all of it: parts were removed, or something was lost.
+    """
+
+    entry: Estimated
+    window: Window | None
+
+
+def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
+    """Yield the estimates of a run in order; windows are formed where the node formed them."""
+    settings = reader.header.parameters
+    if not settings.get("estimate"):
+        return
+    names = ("estimate_window", "estimate_interval", "rollback_span")
+    windows = Windows(*(float(settings[name]) for name in names))
+    formed: dict[int, Window] = {}
+    for batch in reader.batches(outputs=False):
+        entries = batch.entries
+        stamps, wrenches = entries.stamp_ns.tolist(), entries.wrench.tolist()
+        for index, is_sample in enumerate(entries.sample.tolist()):
+            if is_sample:
+                window = windows.take_load(stamps[index], tuple(wrenches[index]))
+                if window is not None:
+                    formed[window.end_ns] = window
+                continue
+            match entries.others[index]:
+                case Pose(stamp_ns, pose):
+                    windows.take_pose(stamp_ns, pose)
+                case Reset() | SetWear():
+                    windows.restart()
+                    formed.clear()
+                case Estimated(end_ns=end_ns) as entry:
+                    yield LiveEstimate(entry, _whole(formed.get(end_ns), entry))
+                    formed = {end: window for end, window in formed.items() if end > end_ns}
+
+
+def _whole(window: Window | None, entry: Estimated) -> Window | None:
+    """Return the window if it is the one that the node had."""
+    if window is None:
+        return None
+    same = (window.start_ns, window.samples, window.poses) == (entry.start_ns, entry.samples, entry.poses)
+    return window if same else None

@@ -1,0 +1,221 @@
+"""The estimate beside the live node: real processes, late data, and the journal that gives it again."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from ros_processes import ROOT, Bench, bench, value
+from scenes import preset
+from sensor_msgs.msg import JointState
+
+from plow_twin import Twin, Wear
+from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.estimate.window import Window, Windows
+from plow_twin.estimate.worker import Found, Worker
+from plow_twin.record.replay import replay
+from plow_twin.ros.estimation import entry_of, message_of
+from plow_twin.ros.messages import set_stamp
+from plow_twin.stream.journal import Sample, SetWear
+from plow_twin.stream.outputs import CLEARANCE_NAMES
+from plow_twin.stream.session import Session
+
+sys.path.insert(0, str(ROOT / "benchmark"))
+from estimate_truths import GROUPS, Truth, draw
+
+#: Stamp of the first sample [ns].
+START_NS = 1_700_000_000_000_000_000
+WINDOW_S, INTERVAL_S, WAIT_S = 10.0, 4.0, 2.0
+
+
+def _windows(loads: list[tuple[int, tuple[float, ...]]], poses: list[tuple[int, tuple[float, ...]]]) -> list[Window]:
+    """Feed a collector with samples and poses, each pose before the sample at its place."""
+    windows, found = Windows(4.0, 1.0, 0.5), []
+    for index, load in enumerate(loads):
+        if index < len(poses):
+            windows.take_pose(*poses[index])
+        formed = windows.take_load(*load)
+        if formed is not None:
+            found.append(formed)
+    return found
+
+
+def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
+    rng = np.random.default_rng(3)
+    stamps = START_NS + np.arange(0, 800) * 10_000_000
+    loads = [(int(stamp), tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
+    poses = [(int(stamp) + 3, tuple(rng.standard_normal(3).tolist())) for stamp in stamps]
+    # each is late by up to 0.4 s, less than what is waited for
+    late = [sorted(rows, key=lambda row: row[0] + int(rng.integers(0, 400_000_000))) for rows in (loads, poses)]
+    ordered, mixed = _windows(loads, poses), _windows(*late)
+    assert [window.end_ns for window in ordered] == [window.end_ns for window in mixed]
+    assert len(ordered) >= 4
+    for one, other in zip(ordered, mixed, strict=True):
+        assert (one.start_ns, one.samples, one.poses, one.lost) == (other.start_ns, other.samples, other.poses, 0)
+        for first, second in (
+            (one.load.t, other.load.t),
+            (one.load.wrench, other.load.wrench),
+            (one.pose.q, other.pose.q),
+        ):
+            assert np.array_equal(first, second)
+
+
+def test_a_window_begins_behind_a_silence_of_the_load() -> None:
+    stamps = np.delete(START_NS + np.arange(0, 1200) * 10_000_000, slice(500, 600))
+    rows = [(int(stamp), (0.0, 0.0, 0.0)) for stamp in stamps]
+    found = _windows(rows, rows)
+    assert found
+    for window in found:
+        assert np.diff(window.load.t).max() < 0.5
+        assert window.end_ns - window.start_ns >= 2_000_000_000
+
+
+def _play(running: Bench, truth: Truth, late: bool) -> None:
+    """Send load and poses of a truth, faster than their stamps say; `late`: some poses come 1 s after their stamp."""
+    probe = running.probe
+    send = probe.excitation()
+    pose = probe.publisher(PoseStamped, "head_pose")
+    rows: list[tuple[float, int, Any]] = [
+        (t, 0, wrench) for t, wrench in zip(truth.load.t, truth.load.wrench, strict=True)
+    ]
+    for index, (t, q) in enumerate(zip(truth.poses.t, truth.poses.q, strict=True)):
+        rows.append((t + (1.0 if late and index % 7 == 3 else 0.0), 1, (t, q)))
+    for index, (t, kind, content) in enumerate(sorted(rows, key=lambda row: row[:2])):
+        if kind == 0:
+            send(START_NS + round(t * 1e9), content)
+        else:
+            stamp, (x, y, theta) = content
+            message = PoseStamped()
+            set_stamp(message.header, START_NS + round(stamp * 1e9))
+            message.pose.position.x, message.pose.position.y = x, y
+            message.pose.orientation.z, message.pose.orientation.w = np.sin(0.5 * theta), np.cos(0.5 * theta)
+            pose.publish(message)
+        probe.pace(index)
+
+
+def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path: Path) -> None:
+    truth = draw(replace(GROUPS["plain"], periods=5.0, rate_hz=50.0), 3)
+    settings = {
+        "estimate": "true",
+        "estimate_window": WINDOW_S,
+        "estimate_interval": INTERVAL_S,
+        "rollback_span": WAIT_S,
+    }
+    run = tmp_path / "run"
+    with bench(tmp_path, record_path=run, **settings) as running:
+        probe = running.probe
+        heard: list[JointState] = probe.listen(JointState, "estimate")
+        clearances: list[JointState] = probe.listen(JointState, "clearance")
+        assert value(probe.status[-1], "horizontal") == "prior"
+        _play(running, truth, late=True)
+        probe.until(lambda: heard, "an estimate", 100.0)
+        probe.until_figure("estimate", "estimates", *map(str, range(1, 9)))
+        probe.until(lambda: value(probe.status[-1], "horizontal") == "estimated", "the flag")
+        found = dict(zip(heard[-1].name, heard[-1].position, strict=True))
+        # what the next slow publication says: the hold policy goes on meanwhile
+        probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
+        last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
+        status: DiagnosticStatus = probe.status[-1]
+        assert running.twin.stop() == 0
+    for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
+        assert found[f"{name}/p05"] < found[name] < found[f"{name}/p95"]
+        assert found[name] == pytest.approx(true, abs=3e-4)
+        assert [last[f"{name}{point}"] for point in ("", "/p05", "/p95")] == pytest.approx(
+            [found[f"{name}{point}"] for point in ("", "/p05", "/p95")], abs=1e-12
+        )
+        assert value(status, name) == "estimated"
+    assert (value(status, "model"), value(status, "sensor")) == ("ok", "ok")
+
+    command = [sys.executable, "-m", "plow_twin", "estimate", str(run), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stderr
+    facts = json.loads(done.stdout)
+    assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
+    assert facts["horizontal"]["mean_m"] == found["horizontal"]
+    report = replay(run)
+    assert (report.exit_code, report.first_divergence) == (0, None)
+    assert report.compared["clearance"] > 0
+
+
+def _found(horizontal: State, vertical: State) -> Found:
+    result = Estimate(
+        0.0, 1.0, Interval(0.02, 0.019, 0.021), Interval(0.03, 0.028, 0.032), horizontal, vertical,
+        stiffness=Interval(1e7, 9e6, 1.1e7),
+    )  # fmt: skip
+    return Found(START_NS, START_NS + 1, 2, 3, (), result, 0.1, 0, 0)
+
+
+def test_what_is_estimated_stays_until_it_is_withdrawn_or_the_pads_are_changed() -> None:
+    wear = Wear(1e-13, 0.015, 2.0, prior_m2_n=(5e-14, 2e-13))
+    scene = replace(preset("paper"), wear=wear)
+    session = Session(Twin(scene, excitation="sampled"), rollback_span_s=2.0)
+
+    def clearance(stamp_s: float) -> dict[str, float]:
+        session.apply(Sample(START_NS + round(stamp_s * 1e9), (5e4, -1e4, 0.0)))
+        publication = session.outputs.take()
+        assert publication is not None and publication.slow is not None
+        return dict(zip(CLEARANCE_NAMES, publication.slow.clearance.tolist(), strict=True))
+
+    assert clearance(0.0)["horizontal"] == 0.025
+    first = entry_of(_found(State.ESTIMATED, State.ESTIMATED), session, None)
+    session.apply(first)
+    now = clearance(0.2)
+    assert [now[f"horizontal{point}"] for point in ("", "/p05", "/p95")] == pytest.approx(
+        [0.02, 0.019, 0.021], abs=1e-6
+    )
+    # a late sample goes back behind the estimate, which stays
+    clearance(0.6)
+    session.apply(Sample(START_NS + 100_000_000, (4e4, -1e4, 0.0)))
+    later = clearance(1.8)
+    assert later["vertical"] == pytest.approx(0.03, abs=1e-6)
+    # and its interval widens as the wear's prior does
+    assert later["horizontal/p95"] - later["horizontal/p05"] > now["horizontal/p95"] - now["horizontal/p05"]
+    second = entry_of(_found(State.NOT_OBSERVABLE, State.WITHDRAWN), session, first)
+    assert second.shift == (*first.shift[:3], 0.0, 0.0, 0.0)
+    assert message_of(_found(State.ESTIMATED, State.WITHDRAWN), "f").name == ()
+    session.apply(SetWear(START_NS + 2_000_000_000, (0.0,) * 8, "new pads"))
+    assert clearance(3.0)["horizontal"] == pytest.approx(0.025, abs=1e-6)
+
+
+def test_a_worker_that_died_is_told_and_stops_nothing() -> None:
+    worker = Worker(preset("paper"), 10.0, 4.0, 1.0)
+    worker._process.kill()
+    give_up = time.monotonic() + 20.0
+    while not worker.error and time.monotonic() < give_up:
+        worker.take_load(START_NS, (0.0, 0.0, 0.0))
+        assert worker.poll() is None
+        time.sleep(0.01)
+    assert worker.error == "the estimator ended with code -9"
+    worker.close()
+
+
+def test_without_an_estimate_none_of_its_code_is_loaded(tmp_path: Path) -> None:
+    program = """
+import sys
+import ros_processes
+from rclpy.context import Context
+from plow_twin.ros.node import TwinNode
+context = Context()
+context.init(args=[])
+node = TwinNode(namespace="/off", context=context)
+assert node.start()
+loaded = [name for name in sys.modules if name.startswith(("plow_twin.estimate", "plow_twin.ros.estimation"))]
+assert not loaded, loaded
+assert node.count_publishers("estimate") == 0
+node.release()
+node.destroy_node()
+context.try_shutdown()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT / "test", capture_output=True, text=True, timeout=110
+    )
+    assert done.returncode == 0, done.stderr
