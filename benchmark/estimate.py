@@ -3,13 +3,14 @@
     python benchmark/estimate.py --truths 10 --seed 1000          # all groups
     python benchmark/estimate.py --group plain --group hard --truths 20
 
-Thresholds of `plow_twin/estimate/verdict.py` were set on seeds below 100; the table of docs/estimate.md is made with
-seeds from 1000 on.
+Each truth is written as soon as it is done, and what the file holds already is not run again: a long benchmark can be
+stopped, and gone on with. Thresholds of `plow_twin/estimate/verdict.py` were set on seeds below 1000; the table of
+docs/estimate.md is made with seeds from 1000 on.
 """
 
 from __future__ import annotations
 
-import csv
+import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -91,28 +92,35 @@ def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines).replace("nan, nan", "-")
 
 
+def load_rows(path: Path) -> list[dict[str, Any]]:
+    """Return the rows that a file holds, numbers as numbers; none without a file."""
+    if not path.exists():
+        return []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line]
+
+
 @click.command()
 @click.option("--group", "groups", multiple=True, type=click.Choice(list(GROUPS)))
 @click.option("--truths", default=10, show_default=True)
 @click.option("--seed", default=1000, show_default=True, help="First seed.")
 @click.option("--periods", type=float, help="Load periods of data; the group's by default.")
-@click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate.csv", show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate.jsonl", show_default=True)
 def main(groups: tuple[str, ...], truths: int, seed: int, periods: float | None, out: Path) -> None:
-    """Run the groups and write one row a truth."""
+    """Run the groups and write one line of JSON a truth."""
     warm_up(draw(type(GROUPS["plain"])("start", periods=1.0), 0).nominal)
-    rows: list[dict[str, Any]] = []
-    summaries = []
-    for name in groups or tuple(GROUPS):
-        own = [run_one(name, seed + index, periods) for index in range(truths)]
-        rows += own
-        summaries.append(summary(name, own))
-        click.echo(as_markdown(summaries[-1:]).splitlines()[-1], err=True)
-    names = list(dict.fromkeys(key for row in rows for key in row))
-    with out.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        writer.writerows(rows)
-    click.echo(as_markdown(summaries))
+    rows = load_rows(out)
+    done = {(row["group"], row["seed"]) for row in rows}
+    names = groups or tuple(GROUPS)
+    seeds = range(seed, seed + truths)
+    # truth by truth: stopped early, all groups are as large
+    for number in seeds:
+        for name in names:
+            if (name, number) not in done:
+                rows.append(run_one(name, number, periods))
+                with out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(rows[-1]) + "\n")
+    asked = [row for row in rows if row["seed"] in seeds]
+    click.echo(as_markdown([summary(name, [row for row in asked if row["group"] == name]) for name in names]))
 
 
 if __name__ == "__main__":
