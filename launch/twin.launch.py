@@ -1,10 +1,13 @@
 """Start the twin: `ros2 launch plow_twin twin.launch.py scene:=paper record_path:=runs/monday`.
 
 With `autostart:=false` the node waits for lifecycle requests (`ros2 lifecycle set /plow_twin configure`).
+With `view:=plow-twin` a process of its own shows the recording on http://127.0.0.1:9090 while it is made. The program
+may stand in another Python environment (`view:=/opt/viewer/bin/plow-twin`): rerun needs numpy 2, ROS 2 Jazzy has 1.26.
 """
 
-from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.actions import DeclareLaunchArgument, ExecuteProcess
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -18,6 +21,7 @@ ARGUMENTS = {
     "record_path": ("", "folder to make for the recording; empty: none"),
     "use_sim_time": ("false", "take the time from /clock"),
     "autostart": ("true", "configure and activate at start"),
+    "view": ("", "program plow-twin of the environment that has rerun; empty: the run is not shown"),
 }
 
 
@@ -41,8 +45,18 @@ def generate_launch_description() -> LaunchDescription:
         sigkill_timeout="6",
         output="screen",
     )
+    # without what a sourced ROS 2 adds: the viewer's environment is its own
+    apart = [
+        "env",
+        *(f"--unset={name}" for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")),
+    ]
+    viewer = ExecuteProcess(
+        cmd=[*apart, given["view"], "view", given["record_path"], "--follow", "--wait", "600", "--web"],
+        condition=IfCondition(PythonExpression(["'", given["view"], "' != ''"])),
+        output="screen",
+    )
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=text)
         for name, (default, text) in ARGUMENTS.items()
     ]
-    return LaunchDescription([*arguments, twin])
+    return LaunchDescription([*arguments, twin, viewer])

@@ -239,7 +239,10 @@ def mutate_many(tmp_path: Path, motion: tuple[np.ndarray, ...], seeds: Iterable[
         kind = seed % 3
         target = tmp_path / f"mutated{files[kind].suffix}"
         target.write_bytes(mutate(contents[kind], rng))
-        read_everything(target, readers[kind])
+        try:
+            read_everything(target, readers[kind])
+        except Exception as error:
+            raise AssertionError(f"seed {seed}: {error!r}") from error
 
 
 def test_mutated_files_give_an_error_or_counted_loss(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
 from PIL import Image
 from rerun.experimental import ViewerClient
 
@@ -60,13 +59,12 @@ def main() -> None:
         port = probe.getsockname()[1]
     with tempfile.TemporaryDirectory() as folder:
         rrd, shot = Path(folder) / "run.rrd", Path(folder) / "shot.png"
-        summary = to_rrd(options.run, rrd)
+        to_rrd(options.run, rrd)
         viewer = start_viewer(port)
         try:
             client = connect(port)
             client.open(str(rrd))
-            at_ns = summary.first_ns + round(1e9 * options.at)
-            client.set_time("ros_time", timestamp=np.datetime64(at_ns, "ns"), play_state="paused")
+            client.set_time("run_time", duration=options.at, play_state="paused")
             time.sleep(8.0)  # lets the plots settle and the greeting go
             client.save_screenshot(str(shot))
         finally:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
-from importlib.util import find_spec
+import time
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, POSITIVE, progress, quiet_option
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, progress, quiet_option
+
+if TYPE_CHECKING:
+    from plow_twin.view.live import Sink
+    from plow_twin.view.rrd import ViewSummary
 
 
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but parts of the recording are missing.")
-@click.argument("recording", type=click.Path(path_type=Path, exists=True))
+@click.argument("recording", type=click.Path(path_type=Path))
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; by default beside the .mcap."
 )
@@ -22,13 +27,29 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, POSITIVE, progre
 @click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="A picture instead; needs no viewer.")
 @click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
 @click.option("--web-port", type=click.IntRange(0, 65535), default=9090, show_default=True, help="Its port.")
+@click.option("--follow", is_flag=True, help="Show a run while it is recorded: in a window, with --web, or into --out.")
+@click.option(
+    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long --follow waits for one [s]."
+)
 @quiet_option
 def view(
-    recording: Path, out: Path | None, exaggerate: float | None, png: Path | None, web: bool, web_port: int, quiet: bool
+    recording: Path,
+    out: Path | None,
+    exaggerate: float | None,
+    png: Path | None,
+    web: bool,
+    web_port: int,
+    follow: bool,
+    wait: float,
+    quiet: bool,
 ) -> int:
     """Make a .rrd of RECORDING: the cross-section in motion, force and clearance curves, the event log."""
     from plow_twin.record.reader import FileStatus, mcap_path
 
+    if not follow and not recording.exists():
+        raise click.BadParameter(f"{recording}: does not exist", param_hint="RECORDING")
+    if follow:
+        return _follow(recording, out, exaggerate, web_port if web else None, wait, quiet)
     if png is not None:
         from plow_twin.view.picture import to_png
 
@@ -43,37 +64,72 @@ def view(
     out = out or mcap_path(recording).with_suffix(".rrd")
     with progress(f"writing {out.name}", quiet) as on_progress:
         summary = to_rrd(recording, out, exaggerate=exaggerate, on_progress=on_progress)
-    if summary.status is not FileStatus.COMPLETE:
+    code = _show(recording, out, summary, quiet)
+    if web:
+        return _serve(out, web_port, quiet)
+    if not quiet:
+        click.echo(f"look at it with: rerun {out}")
+    return code
+
+
+def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:
+    """Say what was drawn and what was missing; return the exit code."""
+    from plow_twin.record.reader import FileStatus
+
+    whole = (FileStatus.COMPLETE, FileStatus.UNREAD)
+    if summary.status not in whole:
         click.echo(f"plow-twin: {recording}: {summary.status.value}", err=True)
     if summary.lost:
         click.echo(f"plow-twin: {recording}: lost {dict(summary.lost)}", err=True)
     if not quiet:
-        click.echo(f"{out}: {summary.curve_rows} force rows, {summary.section_rows} pictures, {summary.events} events")
-        click.echo(f"look at it with: rerun {out}")
-    if web:
-        return _serve(out, web_port, quiet)
-    return DONE if summary.status is FileStatus.COMPLETE and not summary.lost else DONE_WITH_LOSS
+        thinned = "" if summary.curve_rows == summary.rows else f" of {summary.rows} read"
+        click.echo(
+            f"{out}: {summary.curve_rows} force rows{thinned}, {summary.section_rows} pictures, {summary.events} events"
+        )
+    return DONE if summary.status in whole and not summary.lost else DONE_WITH_LOSS
 
 
 def _serve(file: Path, port: int, quiet: bool) -> int:
     """Serve a .rrd with the viewer's own program on the loopback address until it is interrupted."""
-    program = _viewer_program()
-    if program is None:
-        click.echo("plow-twin: the program `rerun` is not installed: pip install 'plow_twin[view]'", err=True)
-        return FAILED
-    command = [program, str(file), "--serve-web", "--bind", "127.0.0.1", "--port", "auto"]
+    from plow_twin.view.viewer import LOOPBACK, viewer_program
+
+    program = viewer_program()
+    command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", "auto"]
     if not quiet:
-        click.echo(f"serving on http://127.0.0.1:{port} until interrupted")
+        click.echo(f"serving on http://{LOOPBACK}:{port} until interrupted")
     sys.stdout.flush()
     # in the place of this process: whoever stops it stops the server
     os.execv(program, [*command, "--web-viewer-port", str(port)])
 
 
-def _viewer_program() -> str | None:
-    """Return rerun's own program, not the wrapper of the same name, which would outlive whoever stops it."""
-    found = find_spec("rerun_cli")
-    if found is not None and found.origin is not None:
-        program = Path(found.origin).with_name("rerun")
-        if program.exists():
-            return str(program)
-    return shutil.which("rerun")
+def _follow(
+    recording: Path, out: Path | None, exaggerate: float | None, web_port: int | None, wait: float, quiet: bool
+) -> int:
+    """Show a run while it is recorded; a viewer that was started ends with the command."""
+    from plow_twin.cli.interruption import interruptible
+    from plow_twin.record.running import find_run
+    from plow_twin.view.live import follow
+    from plow_twin.view.viewer import start_viewer
+
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as opened:
+        viewer = None if out is not None else start_viewer(web_port=web_port)
+        if viewer is not None:
+            opened.callback(viewer.close)
+        stopped = opened.enter_context(interruptible(opened.close if viewer is None else viewer.close))
+        run = find_run(recording, wait, stopped)
+        if not quiet:
+            click.echo(f"following {run}" + (f" on {viewer.page}" if viewer is not None and viewer.page else ""))
+            sys.stdout.flush()
+        sink: Sink = (
+            (lambda stream, blueprint: stream.connect_grpc(viewer.url, default_blueprint=blueprint))
+            if viewer is not None
+            else (lambda stream, blueprint: stream.save(str(out), default_blueprint=blueprint))
+        )
+        summary = follow(run, sink, stopped, exaggerate=exaggerate)
+        code = _show(run, out or run, summary, quiet)
+        sys.stdout.flush()
+        while viewer is not None and viewer.process.poll() is None and not stopped():  # the run has ended: look on
+            time.sleep(0.2)
+    return code

@@ -66,6 +66,11 @@ class Messages:
         columns = (self.channel, self.sequence, self.log_time_ns, self.publish_time_ns, self.start, self.length)
         return Messages(self.buffer, *(column[chosen] for column in columns))
 
+    @classmethod
+    def none(cls) -> Messages:
+        """Return no messages."""
+        return cls(np.zeros(0, np.uint8), *(np.zeros(0, np.int64) for _ in range(6)))
+
     def data(self, index: int) -> bytes:
         """Return the bytes of one message."""
         start = int(self.start[index])
@@ -85,11 +90,15 @@ class ChunkReader:
         The file.
     wanted
         Asked, where a chunk's index can be read, with the channel numbers in it: False leaves the chunk unopened.
+    more
+        Asked at the end of a file that has no end yet, with the stream and the size known: True when it has grown. All
+        that was read is yielded before, and then no messages.
     """
 
     path: Path
     on_metadata: Callable[[str, dict[str, str]], object] = lambda name, record: None
     wanted: Callable[[set[int]], bool] | None = None
+    more: Callable[[IO[bytes], int], bool] | None = None
     channels: dict[int, Channel] = field(default_factory=dict)
     finished: bool = False
     damaged: int = 0
@@ -104,13 +113,23 @@ class ChunkReader:
             size = os.fstat(stream.fileno()).st_size
             stream.seek(len(MAGIC))
             while True:
+                place = stream.tell()
                 head = stream.read(_HEAD.size)
-                if len(head) < _HEAD.size:
+                opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+                begin = place + _HEAD.size
+                if length > RECORD_LIMIT:
                     break
-                opcode, length = _HEAD.unpack(head)
-                begin = stream.tell()
-                if length > RECORD_LIMIT or begin + length > size:
-                    break
+                if begin + length > size:
+                    if self.more is None:
+                        break
+                    yield from self._scan([*opened, *map(_bytes, loose)], schemas)
+                    opened, loose = [], []
+                    yield Messages.none()
+                    if not self.more(stream, size):
+                        break
+                    size = os.fstat(stream.fileno()).st_size
+                    stream.seek(place)
+                    continue
                 self.position = begin + length
                 if opcode == _MESSAGE:
                     loose.append(head + stream.read(length))
@@ -245,6 +264,10 @@ class ChunkReader:
         for channel in summary.channels.values():
             name, text = schemas.get(channel.schema_id, ("", b""))
             self.channels.setdefault(channel.id, Channel(channel.topic, name, channel.message_encoding, text))
+
+
+def _bytes(record: bytes) -> Bytes:
+    return np.frombuffer(record, np.uint8)
 
 
 def decompress(compression: str, data: memoryview, size: int) -> bytes:

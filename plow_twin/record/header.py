@@ -10,6 +10,7 @@ from typing import Any, Final
 from plow_twin.build import build_fingerprint, package_version
 from plow_twin.errors import RecordingError, SceneError
 from plow_twin.model.scene import Scene
+from plow_twin.solve.compiled_scene import TOLERANCE_RANGE
 from plow_twin.stream.journal import ParameterValue
 
 #: Name of the MCAP metadata record that holds the header.
@@ -113,6 +114,7 @@ class RunHeader:
                 values[spec.name] = text if spec.type == "str" else json.loads(text)
             except json.JSONDecodeError as error:
                 raise RecordingError(f"{source}: {spec.name}: got {text!r}, expected JSON ({error})") from error
-        if not isinstance(values["tol"], float) or not 0.0 < values["tol"] < 1.0:
-            raise RecordingError(f"{source}: tol: got {record['tol']}, expected a number between 0 and 1")
+        low, high = TOLERANCE_RANGE
+        if not isinstance(values["tol"], float) or not low <= values["tol"] <= high:
+            raise RecordingError(f"{source}: tol: got {record['tol']}, expected a number from {low:g} to {high:g}")
         return cls(**values)

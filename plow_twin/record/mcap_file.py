@@ -17,6 +17,7 @@ import numpy as np
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, MESSAGE_HEAD, crc32
+from plow_twin.record.follow import claim
 from plow_twin.record.template import Bytes, Indexes, Template, compiled, fill
 
 _INDEX_ENTRY: Final = np.dtype([("time", "<u8"), ("offset", "<u8")])
@@ -297,6 +298,7 @@ class UnbufferedFile:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be made: {error.strerror}") from error
+        claim(self._descriptor)
         self._offset = 0
         self._open = True
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
 from plow_twin.record.chunks import ChunkReader, Messages
+from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message
 from plow_twin.record.messages import MESSAGE_TYPES, Message, WrenchStamped
@@ -175,6 +176,9 @@ class RunReader:
     did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
     has been read, 0..1. `path` is the first file, `parts` are all.
 
+    With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
+    follows each time that all there is has been read.
+
     Raises
     ------
     RecordingError
@@ -182,6 +186,7 @@ class RunReader:
     """
 
     path: Path
+    tail: Tail | None = None
     header: RunHeader = field(init=False)
     parts: list[Path] = field(init=False)
     status: FileStatus = field(default=FileStatus.UNREAD, init=False)
@@ -192,7 +197,8 @@ class RunReader:
     position: float = field(default=0.0, init=False)
 
     def __post_init__(self) -> None:
-        self.parts = run_parts(Path(self.path))
+        self._place = Path(self.path)
+        self.parts = run_parts(self._place)
         self.path = self.parts[0]
         for part in self.parts:
             header = read_header(part)
@@ -211,23 +217,44 @@ class RunReader:
         self.stop_reason = None
         self.counts.clear()
         merger = _Merger(self, outputs)
-        sizes = [part.stat().st_size for part in self.parts]
+        size, before = sum(part.stat().st_size for part in self.parts), 0
         finished = True
-        for number, part in enumerate(self.parts):
-            reader = ChunkReader(part, self._metadata, None if outputs else partial(merger.is_journal, part))
+        for part in self._parts_to_read():
+            reader = ChunkReader(
+                part,
+                self._metadata,
+                None if outputs else partial(merger.is_journal, part),
+                None if self.tail is None else self.tail.more,
+            )
             merger.begin(part, reader)
             for messages in reader:
-                self.position = (sum(sizes[:number]) + reader.position) / max(1, sum(sizes))
+                self.position = min(1.0, (before + reader.position) / max(1, size))
                 yield from merger.add(messages)
+                if self.tail is not None and not len(messages):
+                    yield from merger.finish()
+                    yield Batch(_NO_ENTRIES, [])
+            before += reader.position
             finished = finished and reader.finished
             self.damaged_chunks += reader.damaged
         yield from merger.finish()
+        if self.tail is not None and self.tail.stopped:
+            return
         if not finished:
             self.status = FileStatus.TRUNCATED
         elif self.damaged_chunks:
             self.status = FileStatus.DAMAGED
         else:
             self.status = FileStatus.COMPLETE if self.stop_reason is None else FileStatus.STOPPED_EARLY
+
+    def _parts_to_read(self) -> Iterator[Path]:
+        """Yield the parts in order; with a tail also those that are begun meanwhile."""
+        done: list[Path] = []
+        while left := [part for part in self.parts if part not in done]:
+            done.append(left[0])
+            if self.tail is None or left[0].exists():  # the oldest may have been removed meanwhile
+                yield left[0]
+            if self.tail is not None and not self.tail.stopped:
+                self.parts = run_parts(self._place)
 
     def duration_s(self) -> float:
         """Return the span of the receive times [s] by the index of the parts; a guess by their size without one."""

@@ -23,6 +23,8 @@ _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 #: CSV has no clock; a stamp of 0 would count as missing: it starts there [ns].
 CSV_ORIGIN_NS: Final = 1_000_000_000
 _ROWS: Final = 1000
+#: What a damaged file makes of sqlite3: its own errors, texts of them that are no UTF-8, cells of impossible length.
+_SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,10 +188,11 @@ class SqliteSource:
             try:
                 connection = self._open(part)
                 try:
-                    found |= dict(connection.execute("SELECT name, type FROM topics"))
+                    rows = connection.execute("SELECT name, type FROM topics")
+                    found |= {name: kind for name, kind in rows if isinstance(name, str) and isinstance(kind, str)}
                 finally:
                     connection.close()
-            except sqlite3.Error as error:
+            except _SQLITE_ERRORS as error:
                 raise RecordingError(f"{part}: not a recording of rosbag2: {error}") from error
         return found
 
@@ -199,7 +202,7 @@ class SqliteSource:
         for part in self.parts:
             try:
                 connection = self._open(part)
-            except sqlite3.Error as error:
+            except _SQLITE_ERRORS as error:
                 raise RecordingError(f"{part}: cannot be opened: {error}") from error
             try:
                 rows = connection.execute("SELECT id, name, type FROM topics").fetchall()
@@ -220,7 +223,7 @@ class SqliteSource:
                         content = decoder.decode(data, kind)
                         if content is not None:
                             yield Arrived(name, kind, time_ns, content)
-            except (sqlite3.Error, OverflowError):
+            except (*_SQLITE_ERRORS, OverflowError):
                 self.losses.counts["truncated_files"] += 1
             finally:
                 connection.close()

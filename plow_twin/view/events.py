@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.journal_codec import Dropped
-from plow_twin.record.messages import DiagnosticStatus, JointState
-from plow_twin.stream.journal import Entry, Hold, Loss, Parameter, Reset, Sample, Travel
-from plow_twin.view.columns import Batches
+from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.stream.journal import Entry, Hold, Loss, Parameter, Reset, SetWear, Travel, Unload
+from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
 _LEVELS = ("INFO", "WARN", "ERROR", "WARN")
 
@@ -18,12 +18,13 @@ _LEVELS = ("INFO", "WARN", "ERROR", "WARN")
 class Events:
     """Write the log; `count` is the number of its lines."""
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
+    def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
         self.count = 0
-        self._lines = Batches(stream, "events", rr.TextLog, ("text", "level"))
+        self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._touches: NDArray[np.float64] | None = None
         self._status: tuple[int, str] | None = None
-        self._silent = False
+        #: whether the load is held for want of samples
+        self.silent = False
         self._speed_m_s: float | None = None
 
     def add(self, stamp_ns: int, step: int, text: str, level: str = "INFO") -> None:
@@ -31,23 +32,28 @@ class Events:
         self.count += 1
         self._lines.add(stamp_ns, step, text=[text], level=[level])
 
+    def sample(self, stamp_ns: int, step: int) -> None:
+        """Write that a sample has come after a silence."""
+        if self.silent:
+            self.add(stamp_ns, step, "excitation is back")
+        self.silent = False
+
     def entry(self, stamp_ns: int, step: int, entry: Entry | Dropped, excitation_source: str) -> None:
         """Write what an entry of the journal means, if it is an event."""
         match entry:
-            case Sample():
-                if self._silent:
-                    self.add(stamp_ns, step, "excitation is back")
-                self._silent = False
-            case Hold():
-                if not self._silent and excitation_source != "scene":
-                    self.add(stamp_ns, step, "excitation silent: the last load is held", "WARN")
-                    self._silent = True
+            case Hold() | Unload():
+                if not self.silent and excitation_source != "scene":
+                    what = "the last load is held" if isinstance(entry, Hold) else "the load falls to zero"
+                    self.add(stamp_ns, step, f"excitation silent: {what}", "WARN")
+                    self.silent = True
             case Travel(_, speed):
                 if speed != self._speed_m_s:  # sensors repeat it many times a second
                     self.add(stamp_ns, step, f"travel along the face at {speed:g} m/s")
                 self._speed_m_s = speed
             case Reset(_, reason):
                 self.add(stamp_ns, step, f"reset: {reason}", "WARN")
+            case SetWear(_, _, reason):
+                self.add(stamp_ns, step, f"wear of the pads set: {reason}", "WARN")
             case Parameter(name, value):
                 self.add(stamp_ns, step, f"parameter {name} = {value}")
             case Loss(count):
@@ -55,15 +61,18 @@ class Events:
             case Dropped(topic, count):
                 self.add(stamp_ns, step, f"{count} messages on {topic} were not recorded before this", "ERROR")
 
-    def peaks(self, stamp_ns: int, step: int, message: JointState) -> None:
-        """Write the touches since the message before."""
-        if self._touches is not None:
-            for pair in np.flatnonzero(message.position > self._touches):
-                touches = message.position[pair] - self._touches[pair]
-                times = "" if touches == 1 else f", {touches:.0f} times"
-                text = f"{PAIR_NAMES[pair]} touches{times}, up to {message.effort[pair] / 1e3:.1f} kN"
-                self.add(stamp_ns, step, text)
-        self._touches = message.position
+    def peaks(self, stamps: Indexes, steps: Indexes, makes: Array, peak: Array) -> None:
+        """Write the touches in rows of `contact_peaks`: all makes so far, (n, 8), largest forces [N], (n, 8)."""
+        if not len(stamps):
+            return
+        before = makes[:1] if self._touches is None else self._touches[None]
+        touches = np.diff(np.concatenate((before, makes)), axis=0)
+        self._touches = makes[-1].copy()
+        for row, pair in zip(*np.nonzero(touches > 0.0), strict=True):
+            count = touches[row, pair]
+            times = "" if count == 1 else f", {count:.0f} times"
+            text = f"{PAIR_NAMES[pair]} touches{times}, up to {peak[row, pair] / 1e3:.1f} kN"
+            self.add(int(stamps[row]), int(steps[row]), text)
 
     def status(self, stamp_ns: int, step: int, message: DiagnosticStatus) -> None:
         """Write a status when it differs from the one before."""

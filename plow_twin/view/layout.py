@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import TimelineColumn
 from rerun.components import AggregationPolicy, InterpolationMode
 
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
+from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.view.columns import ROS_TIME, RUN_TIME, STEP
 from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
 
@@ -22,6 +23,9 @@ PENETRATION: Final = tuple(f"penetration/{name}" for name in PAIR_NAMES)
 LOAD: Final = ("load/fx", "load/fy", "load/moment")
 AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
+TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
+GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
+WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
 _LOAD_COLORS: Final = (LOAD_COLOR, (86, 180, 233), (200, 200, 200))
@@ -33,7 +37,7 @@ def blueprint(section: Section, exaggerate: float) -> rrb.Blueprint:
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
         origin="section",
-        name="Cross-section [mm]: the head moves about the fixed frame",
+        name="Cross-section [mm]",
         visual_bounds=rrb.VisualBounds2D(x_range=(-half_x, half_x), y_range=(-half_y, half_y)),
         background=(24, 26, 30),
     )
@@ -43,7 +47,8 @@ def blueprint(section: Section, exaggerate: float) -> rrb.Blueprint:
         visual_bounds=rrb.VisualBounds2D(x_range=(-half_x, half_x), y_range=(-half_y, half_y)),
         background=(24, 26, 30),
     )
-    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    times = [TimelineColumn(visible=name == RUN_TIME, timeline=name) for name in (RUN_TIME, ROS_TIME, STEP)]
+    columns = rrb.TextLogColumns(timeline_columns=times, text_log_columns=["LogLevel", "Body"])
     below = rrb.Tabs(
         rrb.TextLogView(origin="events", name="Events", columns=columns),
         rrb.TextDocumentView(origin="about", name="About this run"),
@@ -66,7 +71,7 @@ def blueprint(section: Section, exaggerate: float) -> rrb.Blueprint:
         rrb.Horizontal(
             rrb.Vertical(rrb.Horizontal(picture, wide), below, row_shares=[5, 3]), curves, column_shares=[6, 5]
         ),
-        rrb.TimePanel(state="collapsed", timeline=ROS_TIME),
+        rrb.TimePanel(state="collapsed", timeline=RUN_TIME),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
@@ -85,11 +90,7 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in (*AGE, *INTERVAL):
         _style(stream, entity, entity.rpartition("/")[2], (200, 200, 200), AggregationPolicy.MinMax)
-
-
-def style_clearances(stream: rr.RecordingStream, entities: Iterable[str]) -> None:
-    """Draw the bounds of an interval thinner than the value that they belong to."""
-    for entity in entities:
+    for entity in (*TOTAL, *GROWTH, *WEAR):  # the bounds of an interval thinner than the value that they belong to
         base, _, bound = entity.partition("/")[2].partition("/")
         pair = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(pair)]

@@ -1,0 +1,49 @@
+"""Ctrl-C and SIGTERM of a verb that may be waiting in another library's code: it ends in bounded time."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Final
+
+#: An interrupted verb has that long to end by itself [s].
+PATIENCE_S: Final = 3.0
+
+
+@contextmanager
+def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[Callable[[], bool]]:
+    """Give a function that tells whether the process was asked to end.
+
+    When the block goes on for longer than `PATIENCE_S` after that, `on_overdue` is called and the process ends with
+    exit code 1: a call into a library that waits for a viewer cannot be interrupted otherwise.
+    """
+    asked, done = threading.Event(), threading.Event()
+    receive, send = os.pipe()
+    os.set_blocking(send, False)
+
+    def watch() -> None:
+        os.read(receive, 1)  # written by the signal itself, whatever the main thread does
+        asked.set()
+        if not done.wait(PATIENCE_S):
+            on_overdue()
+            os._exit(1)
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+    wakeup = signal.set_wakeup_fd(send)
+    thread = threading.Thread(target=watch, daemon=True, name="plow_twin interruption")
+    thread.start()
+    try:
+        yield asked.is_set
+    finally:
+        done.set()
+        signal.set_wakeup_fd(wakeup)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        os.write(send, b"\0")
+        thread.join()
+        os.close(send)
+        os.close(receive)

@@ -1,0 +1,94 @@
+"""The messages of a batch as arrays of numbers: what a view or a table needs, at a fraction of the cost of objects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.messages import JointState, Message, Odometry
+from plow_twin.record.reader import Outputs
+from plow_twin.record.template import Indexes, Template, read_numbers
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Messages on one topic in order: `sequence` and `stamp_ns` (n,), `numbers` (n, k) as in their template."""
+
+    sequence: Indexes
+    stamp_ns: Indexes
+    numbers: Array
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    @classmethod
+    def joined(cls, parts: list[Self]) -> Self:
+        """Return the rows of several chunks as one."""
+        if len(parts) == 1:
+            return parts[0]
+        sequence, stamp_ns, numbers = (
+            np.concatenate([getattr(part, name) for part in parts]) for name in ("sequence", "stamp_ns", "numbers")
+        )
+        return cls(sequence, stamp_ns, numbers)
+
+
+def rows_by_topic(
+    outputs: list[Outputs], topics: Mapping[str, str], templates: Mapping[str, Template]
+) -> dict[str, Rows]:
+    """Return the rows of each topic that has some.
+
+    Parameters
+    ----------
+    outputs
+        As in a batch.
+    topics
+        Base names by topic.
+    templates
+        By base name. A message with other texts than its template (an older name, say) is decoded alone; one that does
+        not have as many numbers is left out.
+    """
+    found: dict[str, list[Rows]] = {}
+    for part in outputs:
+        for channel, (topic, _) in part.topics.items():
+            name = topics.get(topic)
+            if name is None:
+                continue
+            chosen = np.flatnonzero(part.messages.channel == channel)
+            if chosen.size:
+                found.setdefault(name, []).append(_rows(part, chosen, templates[name]))
+    return {name: Rows.joined(parts) for name, parts in found.items()}
+
+
+def _rows(part: Outputs, chosen: Indexes, template: Template) -> Rows:
+    messages, count = part.messages[chosen], len(chosen)
+    stamps, numbers, good = np.zeros(count, np.int64), np.zeros((count, template.count)), np.zeros(count, bool)
+    read_numbers(
+        messages.buffer, messages.start, messages.length, template.data, template.fixed, template.runs, stamps,
+        numbers, good,
+    )  # fmt: skip
+    for index in np.flatnonzero(~good).tolist():
+        try:
+            message = part.record(int(chosen[index])).message()
+        except RecordingError:
+            continue
+        values = _numbers(message)
+        if values.shape == numbers[index].shape and isinstance(message, JointState | Odometry):
+            stamps[index], numbers[index], good[index] = message.stamp_ns, values, True
+    sequence = part.sequence[chosen]
+    return Rows(sequence, stamps, numbers) if good.all() else Rows(sequence[good], stamps[good], numbers[good])
+
+
+def _numbers(message: Message) -> Array:
+    if isinstance(message, JointState):
+        return np.concatenate((message.position, message.velocity, message.effort))
+    if isinstance(message, Odometry):
+        twist = (*message.linear[:2], message.angular[2])
+        return np.array((*message.position[:2], *message.orientation[2:], *twist))
+    return np.zeros(0)

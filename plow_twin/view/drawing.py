@@ -1,0 +1,267 @@
+"""What a recording shows, drawn batch by batch: curves, moments of the cross-section, events."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.scene import Scene
+from plow_twin.record.header import RunHeader
+from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.outputs import publication_templates
+from plow_twin.record.reader import Batch, Entries, FileStatus
+from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.stream.journal import Hold, Unload
+from plow_twin.stream.outputs import CLEARANCE_NAMES
+from plow_twin.view import layout
+from plow_twin.view.columns import Array, Batches, Curves, Indexes, TimeAxis, buffers
+from plow_twin.view.events import Events
+from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
+
+#: Stamps further than that from the recorder's clock [ns] are on another clock: no age is drawn.
+_LARGEST_AGE_NS: Final = 3_600_000_000_000
+_GREY: Final = (150, 155, 165)
+_WHITE: Final = (235, 235, 235)
+_TOUCHING: Final = (240, 140, 40)
+_PADS: Final = np.array([name.startswith("pad_") for name in CLEARANCE_NAMES])
+
+
+class Drawing:
+    """Send what batches of a recording hold to a stream of the viewer.
+
+    Parameters
+    ----------
+    stream
+        Where to.
+    header, scene, source
+        Of the recording, and where it lies.
+    section_hz
+        Rate of the cross-section [Hz].
+    exaggerate
+        How many times as wide the clearance is drawn in the second cross-section.
+    span_ns
+        Span of stamps in which a curve keeps its least and largest value [ns]; 0: it keeps every row.
+    """
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        header: RunHeader,
+        scene: Scene,
+        source: Path,
+        *,
+        section_hz: float,
+        exaggerate: float,
+        span_ns: int,
+    ) -> None:
+        self.stream, self.header, self.section = stream, header, Section.of(scene)
+        self._exaggerate, self.section_hz = exaggerate, section_hz
+        self._axis = axis = TimeAxis()
+        self.force = Curves(stream, axis, layout.FORCE, span_ns)
+        self.force_at_stamp = Curves(stream, axis, layout.FORCE_AT_STAMP, span_ns)
+        self.penetration = Curves(stream, axis, layout.PENETRATION, span_ns)
+        self.load = Curves(stream, axis, layout.LOAD, span_ns)
+        self.age = Curves(stream, axis, layout.AGE, span_ns)
+        self.interval = Curves(stream, axis, layout.INTERVAL, span_ns)
+        self.total = Curves(stream, axis, layout.TOTAL, span_ns)
+        self.growth = Curves(stream, axis, layout.GROWTH, span_ns)
+        self.wear = Curves(stream, axis, layout.WEAR, span_ns)
+        self.head = Batches(stream, axis, "section/head", rr.LineStrips2D, ("strips",))
+        self.corners = Batches(stream, axis, "section/corners", rr.Points2D, ("positions", "radii"))
+        self.arrows = Batches(stream, axis, "section/force", rr.Arrows2D, ("origins", "vectors", "colors", "labels"))
+        self.names = Batches(stream, axis, "section/head/name", rr.Points2D, ("positions",))
+        self.load_arrow = Batches(stream, axis, "section/load", rr.Arrows2D, ("origins", "vectors", "labels"))
+        self.walls = Batches(stream, axis, "exaggerated/head", rr.LineStrips2D, ("strips", "colors"))
+        self.events = Events(stream, axis)
+        self.section_rows = 0
+        #: number of the last advance, and its stamp [ns]
+        self.step, self.stamp_ns = -1, 0
+        self._shown: int | None = None
+        self._sample_ns: int | None = None
+        self._early: list[tuple[int, DiagnosticStatus]] = []
+        self._wrench = np.zeros(3)
+        self._new_m = np.array(
+            [getattr(scene.clearance, f"{name.partition('/')[0]}_m") for name in np.array(CLEARANCE_NAMES)[~_PADS]]
+        )
+        self._templates = publication_templates(header.frame_id, header.child_frame_id)
+        self._topics = {header.topic(name): name for name in self._templates}
+        self._draw_still(scene, source)
+
+    @property
+    def first_ns(self) -> int:
+        """The first stamp; 0 without any."""
+        return self._axis.first_ns or 0
+
+    def _draw_still(self, scene: Scene, source: Path) -> None:
+        """Write what does not change in time."""
+        layout.style_curves(self.stream)
+        outline = self.section.frame_strip()
+        self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
+        self.stream.log("exaggerated/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
+        self.stream.log("exaggerated/head", rr.LineStrips2D.from_fields(radii=[1.5]), static=True)
+        places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.43 * self.section.frame[1]]]))
+        names = (*self.section.labels, "frame (fixed)")
+        labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
+        self.stream.log("section/frame/names", labels, static=True)
+        self.stream.log("section/head", rr.LineStrips2D.from_fields(colors=[_WHITE], radii=[0.9]), static=True)
+        self.stream.log("section/corners", rr.Points2D.from_fields(colors=[_WHITE]), static=True)
+        self.stream.log("section/force", rr.Arrows2D.from_fields(radii=[2.2], show_labels=True), static=True)
+        name = rr.Points2D.from_fields(labels=["head (moves)"], radii=[0.1], colors=[_WHITE], show_labels=True)
+        self.stream.log("section/head/name", name, static=True)
+        load = rr.Arrows2D.from_fields(radii=[2.2], colors=[LOAD_COLOR], show_labels=True)
+        self.stream.log("section/load", load, static=True)
+        document = rr.TextDocument(layout.about(scene, self.header, source), media_type=rr.MediaType.MARKDOWN)
+        self.stream.log("about", document, static=True)
+
+    def add(self, batch: Batch) -> None:
+        """Draw a batch."""
+        entries = batch.entries
+        advance = entries.sample.copy()
+        advance[[index for index, entry in entries.others.items() if isinstance(entry, Hold | Unload)]] = True
+        stamps = entries.stamp_ns.copy()
+        for index, entry in entries.others.items():
+            stamps[index] = getattr(entry, "stamp_ns", 0)
+        steps = self.step + np.cumsum(advance)
+        if self._axis.first_ns is None and advance.any():
+            self._axis.first_ns = int(stamps[np.flatnonzero(advance)[0]])
+        before = (self.step, self._wrench)
+        self._entries(entries, stamps, steps, advance)
+        found = rows_by_topic(batch.outputs, self._topics, self._templates)
+        bounds = np.maximum.accumulate(entries.sequence) if len(entries) else entries.sequence
+
+        def places(rows: Rows) -> Indexes:
+            """Return how many entries come before each message."""
+            return np.asarray(np.searchsorted(bounds, rows.sequence, side="right"), np.int64)
+
+        steps_before = np.concatenate(([before[0]], steps))
+        for name, rows in found.items():
+            self._rows(name, rows, np.maximum(steps_before[places(rows)], 0))
+        contact, head = found.get("contact_forces"), found.get("head_state")
+        if contact is not None and head is not None:
+            samples = np.flatnonzero(entries.sample)
+            loads = np.concatenate((before[1][None], entries.wrench[samples]))
+            at = places(head)
+            self._section(contact, head, steps_before[at], loads[np.searchsorted(samples, at)])
+        self._statuses(batch)
+
+    def _entries(self, entries: Entries, stamps: Indexes, steps: Indexes, advance: NDArray[np.bool_]) -> None:
+        """Draw load, quality and events of the journal."""
+        samples = np.flatnonzero(entries.sample)
+        if samples.size:
+            at, wrench = stamps[samples], entries.wrench[samples]
+            self.load.add(at, steps[samples], wrench / 1e3)
+            age = entries.log_time_ns[samples] - at
+            near = np.abs(age) <= _LARGEST_AGE_NS
+            self.age.add(at[near], steps[samples][near], age[near, None] / 1e6)
+            interval = np.diff(at, prepend=at[0] if self._sample_ns is None else self._sample_ns)
+            known = slice(1 if self._sample_ns is None else 0, None)
+            self.interval.add(at[known], steps[samples][known], interval[known, None] / 1e6)
+            self._sample_ns, self._wrench = int(at[-1]), wrench[-1]
+        for index in sorted(entries.others):
+            self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
+            entry, stamp_ns = entries.others[index], int(stamps[index])
+            if not hasattr(entry, "stamp_ns"):  # at the stamp reached
+                reached = np.flatnonzero(advance[:index])
+                stamp_ns = int(stamps[reached[-1]]) if reached.size else self.stamp_ns
+            self.events.entry(stamp_ns, max(int(steps[index]), 0), entry, self.header.excitation_source)
+            samples = samples[np.searchsorted(samples, index) :]
+        self._back(samples, stamps, steps)
+        reached = np.flatnonzero(advance)
+        if reached.size:
+            self.step, self.stamp_ns = int(steps[-1]), int(stamps[reached[-1]])
+
+    def _back(self, samples: Indexes, stamps: Indexes, steps: Indexes) -> None:
+        if samples.size:
+            self.events.sample(int(stamps[samples[0]]), int(steps[samples[0]]))
+
+    def _rows(self, name: str, rows: Rows, steps: Indexes) -> None:
+        """Draw the curves of one topic."""
+        stamps, numbers = rows.stamp_ns, rows.numbers
+        match name:
+            case "contact_forces":
+                self.penetration.add(stamps, steps, numbers[:, :PAIR_COUNT] * 1e3)
+                self.force_at_stamp.add(stamps, steps, numbers[:, 2 * PAIR_COUNT :] / 1e3)
+            case "contact_peaks":
+                peak = numbers[:, 2 * PAIR_COUNT :]
+                self.force.add(stamps, steps, peak / 1e3)
+                self.events.peaks(stamps, steps, numbers[:, :PAIR_COUNT], peak)
+            case "clearance":
+                total_m = numbers[:, ~_PADS]
+                self.total.add(stamps, steps, 1e3 * total_m)
+                self.growth.add(stamps, steps, 1e6 * (total_m - self._new_m))
+                self.wear.add(stamps, steps, 1e3 * numbers[:, _PADS])
+
+    def _section(self, contact: Rows, head: Rows, steps: Indexes, loads: Array) -> None:
+        """Draw the first moment in each span, where forces and pose of one publication are there."""
+        at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
+        spans = head.stamp_ns // round(1e9 / self.section_hz)
+        for row in np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns).tolist():
+            if spans[row] != self._shown:
+                self._shown = int(spans[row])
+                self._moment(
+                    int(head.stamp_ns[row]), int(steps[row]), head.numbers[row], contact.numbers[at[row]], loads[row]
+                )
+
+    def _moment(self, stamp_ns: int, step: int, head: Array, contact: Array, load: Array) -> None:
+        self.section_rows += 1
+        force = contact[2 * PAIR_COUNT :]
+        pose = (float(head[0]), float(head[1]), 2.0 * math.atan2(head[2], head[3]))
+        self.head.add(stamp_ns, step, strips=list(self.section.head_strips(pose)))
+        self._load(stamp_ns, step, pose, load)
+        self.corners.add(stamp_ns, step, positions=self.section.corners(), radii=self.section.corner_radii(force))
+        origins, vectors, pairs = self.section.arrows(pose[2], force)
+        colors = [PAIR_COLORS[pair] for pair in pairs]
+        labels = [f"{force[pair] / 1e3:.0f} kN" for pair in pairs]
+        self.arrows.add(stamp_ns, step, origins=origins, vectors=vectors, colors=colors, labels=labels)
+        walls, touching = self.section.exaggerated(contact[:PAIR_COUNT], self._exaggerate)
+        shades = [_TOUCHING if touches else _WHITE for touches in touching]
+        self.walls.add(stamp_ns, step, strips=list(walls), colors=shades)
+
+    def _load(self, stamp_ns: int, step: int, pose: tuple[float, float, float], load: Array) -> None:
+        """Draw the head's name and the sampled load at its centre; the scene's own loads are not journalled."""
+        centre, name = self.section.head_points(pose)
+        self.names.add(stamp_ns, step, positions=[name])
+        fx, fy, moment = load.tolist()
+        if self.header.excitation_source != "scene":
+            vector = (ARROW_MM_PER_N * fx, -ARROW_MM_PER_N * fy)
+            label = f"load {math.hypot(fx, fy) / 1e3:.0f} kN, {moment / 1e3:+.0f} kN m"
+            self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
+
+    def _statuses(self, batch: Batch) -> None:
+        """Draw changes of the status; those from before the first sample at its stamp, so that playing starts there."""
+        topic = self.header.topic("status")
+        for part in batch.outputs:
+            for channel in [number for number, (name, _) in part.topics.items() if name == topic]:
+                for index in np.flatnonzero(part.messages.channel == channel).tolist():
+                    record = part.record(index)
+                    message = record.message()
+                    if isinstance(message, DiagnosticStatus):
+                        self._early.append((record.publish_time_ns, message))
+        if self._axis.first_ns is not None:
+            self._write_statuses()
+
+    def _write_statuses(self) -> None:
+        first_ns = self._axis.first_ns
+        for published_ns, message in self._early:
+            stamp_ns = published_ns if first_ns is None else max(first_ns, published_ns)
+            self.events.status(stamp_ns, max(self.step, 0), message)
+        self._early = []
+
+    def flush(self) -> None:
+        """Send what is still collected."""
+        for buffer in buffers(self):
+            buffer.flush()
+        self.events.flush()
+
+    def finish(self, status: FileStatus) -> None:
+        """Draw how the recording ended, and send what is still collected."""
+        self._write_statuses()
+        if status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
+            self.events.add(self.stamp_ns, max(self.step, 0), f"recording {status.value}", "ERROR")
+        self.flush()

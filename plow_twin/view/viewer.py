@@ -1,0 +1,91 @@
+"""rerun's own viewer as a program: found, started on the loopback address, ended with whoever started it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+from plow_twin.errors import RecordingError
+
+LOOPBACK: Final = "127.0.0.1"
+#: Data beyond that are dropped, the oldest first: hours do not fill the machine.
+_MEMORY: Final = "2GB"
+_START_S: Final = 60.0
+
+
+def viewer_program() -> str:
+    """Return rerun's own program, not the wrapper of the same name, which would outlive whoever stops it.
+
+    Raises
+    ------
+    RecordingError
+        It is not installed.
+    """
+    found = find_spec("rerun_cli")
+    beside = Path(found.origin).with_name("rerun") if found is not None and found.origin is not None else None
+    program = str(beside) if beside is not None and beside.exists() else shutil.which("rerun")
+    if program is None:
+        raise RecordingError("the program `rerun` is not installed: pip install 'plow_twin[view]'")
+    return program
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """A viewer that runs; `url` takes data, `page` shows them in a browser (empty: in a window)."""
+
+    process: subprocess.Popen[bytes]
+    url: str
+    page: str
+
+    def close(self) -> None:
+        """End it; one that is stopped too."""
+        self.process.kill()
+        self.process.wait()
+
+
+def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) -> Viewer:
+    """Start a viewer that only this machine can reach: a page on `web_port`, or a window.
+
+    Raises
+    ------
+    RecordingError
+        It is not installed or does not answer.
+    """
+    port = _free_port()
+    command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY, *options]
+    if web_port is not None:
+        command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
+    bound = shutil.which("setpriv")
+    if bound is not None:  # killed with this process
+        command = [bound, "--pdeathsig", "KILL", *command]
+    environment = {"RUST_LOG": "warn", **os.environ}
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)
+    url = f"rerun+http://{LOOPBACK}:{port}/proxy"
+    page = f"http://{LOOPBACK}:{web_port}/?url=rerun%2Bhttp%3A%2F%2F{LOOPBACK}%3A{port}%2Fproxy"
+    viewer = Viewer(process, url, "" if web_port is None else page)
+    deadline = time.monotonic() + _START_S
+    while not _answers(port):
+        if process.poll() is not None or time.monotonic() > deadline:
+            viewer.close()
+            raise RecordingError(f"rerun: got no answer on port {port}, expected a viewer (exit code {process.poll()})")
+        time.sleep(0.1)
+    return viewer
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def _answers(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex((LOOPBACK, port)) == 0

@@ -1,0 +1,77 @@
+"""A recording read while it is written: its parts, its end, a writer that is killed."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import textwrap
+import threading
+from pathlib import Path
+
+import pytest
+from record_support import BASE_NS, STEP_NS, paper_sample, record_run
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.follow import Tail
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.running import find_run
+
+COUNT = 3000
+
+
+def test_a_follower_sees_every_sample_of_every_part_and_ends_with_the_run(tmp_path: Path) -> None:
+    options = {"part_bytes": 100_000, "flush_period_s": 0.05}
+    writer = threading.Thread(
+        target=record_run, args=(tmp_path / "run", map(paper_sample, range(COUNT))), kwargs=options
+    )
+    writer.start()
+    reader = RunReader(find_run(tmp_path / "run", 60.0), Tail())
+    stamps: list[int] = []
+    sent = pauses = 0
+    for batch in reader.batches():
+        stamps += batch.entries.stamp_ns[batch.entries.sample].tolist()
+        sent += sum(map(len, batch.outputs))
+        pauses += not len(batch.entries) and not batch.outputs
+    writer.join()
+    assert stamps == [BASE_NS + index * STEP_NS for index in range(COUNT)]
+    assert len(reader.parts) > 3 and pauses > 1 and reader.status is FileStatus.COMPLETE
+    assert sent == sum(sum(map(len, batch.outputs)) for batch in RunReader(tmp_path / "run").batches()) > 3 * COUNT
+
+
+WRITER = """
+    import sys, time
+    from pathlib import Path
+    sys.path.insert(0, sys.argv[2])
+    from record_support import RunHeader, Recorder, dump_scene, load_scene, paper_sample, scene_path
+    recorder = Recorder(Path(sys.argv[1]), RunHeader(dump_scene(load_scene(scene_path("paper")))), flush_period_s=0.05)
+    for index in range(10**9):
+        recorder.journal(paper_sample(index))
+        time.sleep(0.002)
+"""
+
+
+def test_a_follower_ends_when_the_writer_is_killed(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", textwrap.dedent(WRITER), str(tmp_path / "run"), str(Path(__file__).parent)]
+    with subprocess.Popen(command) as process:
+        reader = RunReader(find_run(tmp_path / "run", 60.0), Tail())
+        samples = 0
+        for batch in reader.batches():
+            samples += int(batch.entries.sample.sum())
+            if samples > 50 and process.returncode is None:
+                process.send_signal(signal.SIGKILL)
+                process.wait()
+    assert samples > 50 and reader.status is FileStatus.TRUNCATED
+
+
+def test_the_run_that_is_written_is_found_beside_an_earlier_one(tmp_path: Path) -> None:
+    record_run(tmp_path / "run", map(paper_sample, range(10)))
+    writer = threading.Thread(target=record_run, args=(tmp_path / "run_2", map(paper_sample, range(COUNT))))
+    writer.start()
+    found = find_run(tmp_path / "run", 60.0)
+    asked = RunReader(found, Tail(stop=lambda: True))
+    assert found == tmp_path / "run_2" and [*asked.batches()] and asked.status is FileStatus.UNREAD
+    writer.join()
+    assert find_run(tmp_path / "run", 0.0) == tmp_path / "run"
+    with pytest.raises(RecordingError, match="expected one that is being written"):
+        find_run(tmp_path / "none", 0.0)
