@@ -95,7 +95,7 @@ def prepare_bare(scene: Scene, output_dt: float, tol: float, t_end: float = T_EN
         if code != Status.OK:
             raise SolverError(f"at t = {motion.state.step_start:.9g} s: {Status(code).text}")
         state = motion.state
-        return Sample(wall, motion.q, int(state.steps), int(state.evaluations), int(motion.log.length[0]))
+        return Sample(wall, motion.q, int(state.steps), int(state.evaluations), int(motion.totals.logged))
 
     # compiles
     nothing = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))

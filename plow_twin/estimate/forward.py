@@ -13,7 +13,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import compile_scene, inertias
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.restarts import run_restarts
-from plow_twin.solve.state import SEGMENT, STATE, TOTALS, Parts, Status, new_log, new_records, new_work
+from plow_twin.solve.state import EVENT, SEGMENT, STATE, TOTALS, Parts, Status, new_records, new_work
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class Forward:
         pieces = Pieces.through(load.t, load.wrench)
         self._start, self._slope = pieces.start / inertias(scene), pieces.slope / inertias(scene)
         self._knots = pieces.knots
-        self._work, self._log = new_work(), new_log(_LOG_SIZE)
+        self._work, self._log = new_work(), np.zeros(_LOG_SIZE, EVENT)
         #: work done so far, in steps of the series
         self.work = 0
 

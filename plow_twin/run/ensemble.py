@@ -121,7 +121,7 @@ def _run_member(scene: Scene, index: int, t_end: float, tol: float, work: Work, 
     totals = motion.totals
     ensemble.peak[index], ensemble.impulse[index] = totals.peak, totals.impulse
     ensemble.time_in_contact[index], ensemble.makes[index] = totals.time_in_contact, totals.makes
-    ensemble.set_time[index], ensemble.events[index] = totals.set_time, motion.log.length[0]
+    ensemble.set_time[index], ensemble.events[index] = totals.set_time, totals.logged
     ensemble.wear_depth[index] = motion.state.wear_depth
     ensemble.steps[index], ensemble.status[index] = motion.state.steps, Status(status)
 

@@ -14,7 +14,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve import fixed_step, loop
 from plow_twin.solve.compiled_scene import CompiledScene
 from plow_twin.solve.energy_balance import BalanceSums
-from plow_twin.solve.state import TOTALS, Log, State, Status, Totals, Work, new_log, new_record
+from plow_twin.solve.state import EVENT, TOTALS, Log, State, Status, Totals, Work, new_record
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class Motion:
         """Start at the scene's initial state; rows go to q and v, shape (n, 3) each, pair outputs to new arrays."""
         eight = (len(q), PAIR_COUNT)
         pairs = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
-        return Motion(compiled.initial_state(), new_record(TOTALS), new_log(_FIRST_LOG), q, v, *pairs)
+        return Motion(compiled.initial_state(), new_record(TOTALS), np.zeros(_FIRST_LOG, EVENT), q, v, *pairs)
 
 
 def run_events(
@@ -83,7 +83,7 @@ def run_events(
             motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
         )  # fmt: skip
         if code == Status.LOG_FULL:
-            motion.log = _grown(motion.log)
+            motion.log = np.concatenate([motion.log, np.zeros_like(motion.log)])
         elif code == Status.BUDGET and allowed < budget and look is not None:
             look(motion)
             size = _next_slice(size, _time.perf_counter() - begin)
@@ -117,7 +117,7 @@ def run_fixed(
         ))  # fmt: skip
         motion.fixed_time, motion.first[0] = float(done[0]) * dt, int(done[0]) // stride + 1
         if code == Status.LOG_FULL:
-            motion.log = _grown(motion.log)
+            motion.log = np.concatenate([motion.log, np.zeros_like(motion.log)])
         elif code == Status.OK and allowed < steps:
             if allowed == budget:
                 return int(Status.BUDGET)
@@ -126,11 +126,3 @@ def run_fixed(
             size = _next_slice(size, _time.perf_counter() - begin)
         else:
             return code
-
-
-def _grown(log: Log) -> Log:
-    larger = new_log(2 * log.time.size)
-    for new, old in zip(larger[:-1], log[:-1], strict=True):
-        new[: old.size] = old
-    larger.length[0] = log.length[0]
-    return larger

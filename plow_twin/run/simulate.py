@@ -19,13 +19,13 @@ from plow_twin.run.motion import BUDGET, Motion, run_events, run_fixed
 from plow_twin.run.sensitivity import Sensitivity, sensitivity_of
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.energy_balance import new_balance
-from plow_twin.solve.state import OFF, Status, Totals, new_work
+from plow_twin.solve.state import EVENT, OFF, Status, Totals, new_work
 
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
 
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
-EVENT_DTYPE: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
+EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
 #: Seconds after which a run gives up with a named error, unless its caller says otherwise.
 MOST_SECONDS: Final = 3600.0
@@ -277,10 +277,7 @@ def _result(
 ) -> Result:
     scene, log, state = compiled.scene, motion.log, motion.state
     assert motion.force is not None and motion.penetration is not None
-    size = int(log.length[0])
-    events = np.zeros(size, EVENT_DTYPE)
-    for name in EVENT_DTYPE.names or ():
-        events[name] = getattr(log, name)[:size]
+    size = int(motion.totals.logged)
     setting = {"tol": tol} if method == "events" else {"dt": dt}
     solver = {
         "method": method, **setting, "steps": int(state.steps), "evaluations": int(state.evaluations),
@@ -288,7 +285,7 @@ def _result(
     }  # fmt: skip
     return Result(
         t=times[:rows], q=motion.q[:rows], v=motion.v[:rows], force=motion.force[:rows],
-        penetration=motion.penetration[:rows], events=events, statistics=statistics_of(motion.totals, time),
+        penetration=motion.penetration[:rows], events=log[:size].copy(), statistics=statistics_of(motion.totals, time),
         contact_sets=contact_sets_of(scene, motion.totals), solver=solver, wear_depth=motion.state.wear_depth.copy(),
         wall_s=wall_s, compile_s=compile_s,
         energy_balance=energy_balance_of(compiled, motion.state, motion.sums) if motion.sums is not None else None,

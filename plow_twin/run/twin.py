@@ -19,6 +19,7 @@ from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, per_mas
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
 from plow_twin.solve.state import (
+    BOUND,
     PARAMS,
     ROW,
     STATE,
@@ -28,6 +29,7 @@ from plow_twin.solve.state import (
     State,
     Status,
     first_of,
+    new_record,
     new_records,
     new_work,
 )
@@ -353,4 +355,6 @@ def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None
         raise ArgumentError(f"max_evaluations: got {max_evaluations!r}, expected an integer >= {LEAST_EVALUATIONS}")
     coarse = max(LEAST_EVALUATIONS // 4, max_evaluations // 16)
     budget = (int(max_evaluations) - 4 * coarse) // (order + PARTING_ORDER + AT_REST)
-    return budget, Bound(coarse, np.zeros(1), np.zeros((6, 6)), np.zeros(3), np.zeros((4, PAIR_COUNT)))
+    bound: Bound = new_record(BOUND)
+    bound.steps = coarse
+    return budget, bound

@@ -8,7 +8,7 @@ the trapezoidal rule over fixed steps. Kinetic energy and momentum come from the
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from plow_twin.solve.dense_output import evaluate, pair_outputs, time_along, wea
 from plow_twin.solve.dynamics import about_mass, push
 from plow_twin.solve.kinematics import to_world_axes
 from plow_twin.solve.loads import load_at
-from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Array, new_record
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, new_record
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
 _NODES = 24
@@ -42,26 +42,28 @@ SUMS = np.dtype(
 )
 
 
-class BalanceSums(NamedTuple):
-    """Quadrature and sums; `None` in its place leaves the balance out of the compiled code."""
-
-    nodes: Array
-    weights: Array
-    now: Array  #: (SIZE,) powers and forces at one instant
-    before: Array  #: (SIZE,) the same a step before
-    body: Array  #: (8,) body coordinates at a node
-    wear_depth: Array  #: (8,) wear depth at a node
-    pairs: Array  #: (3, 8) penetration, rate, force
-    sums: np.record
+#: Quadrature and sums; `None` in its place leaves the balance out of the compiled code.
+BALANCE = np.dtype(
+    [
+        ("nodes", "f8", (_NODES,)),
+        ("weights", "f8", (_NODES,)),
+        ("now", "f8", (SIZE,)),  # powers and forces at one instant
+        ("before", "f8", (SIZE,)),  # the same a step before
+        ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
+        ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node
+        ("pairs", "f8", (3, PAIR_COUNT)),  # penetration, rate, force
+        ("sums", SUMS),
+    ]
+)
+BalanceSums: TypeAlias = np.record
 
 
 def new_balance() -> BalanceSums:
     """Return a balance that has seen nothing."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    return BalanceSums(
-        0.5 * (nodes + 1.0), 0.5 * weights, np.zeros(SIZE), np.zeros(SIZE), np.zeros(STATE_SIZE), np.zeros(8),
-        np.zeros((3, 8)), new_record(SUMS),
-    )  # fmt: skip
+    balance = new_record(BALANCE)
+    balance.nodes[:], balance.weights[:] = 0.5 * (nodes + 1.0), 0.5 * weights
+    return balance
 
 
 @kernel()

@@ -34,7 +34,7 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:
             touch(p, state, pair)
             totals.makes[pair] += 1
         if log is not None:
-            log_event(log, time, pair, state.mode[pair], mode, rate[pair])
+            log_event(log, totals, time, pair, state.mode[pair], mode, rate[pair])
         state.mode[pair] = mode
         state.events += 1
 
@@ -90,7 +90,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
         for j in range(3):
             radius = p.radius if j == 2 else 1.0
             off, drift = abs(k[1, j] - k[2, j]), abs(k[1, 3 + j] - k[2, 3 + j])
-            bound.error[0] += radius * dt / 3.0 * (off + (left + dt) * drift)
+            bound.error += radius * dt / 3.0 * (off + (left + dt) * drift)
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.steps += 1
@@ -104,7 +104,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
         for pair in range(PAIR_COUNT):
             if (before[pair] > 0.0) != (now[pair] > 0.0):
                 doubt = 0.5 * dt * (before[pair] + now[pair]) * p.inverse_mass
-                bound.error[0] += doubt * p.position_tolerance / p.velocity_tolerance
+                bound.error += doubt * p.position_tolerance / p.velocity_tolerance
         _add_to_totals(state, before, now, dt, totals)
         if not within_range(p, state, y):
             return _RANGE
@@ -145,7 +145,7 @@ def integrate_fixed(
                 pair_outputs(p, state, state.wear_depth, y, penetration[row], rate, force[row])
         if n >= steps:
             return _OK
-        if log.length[0] + 8 > log.time.size:
+        if totals.logged + PAIR_COUNT > log.size:
             return _LOG_FULL
         t = n * dt
         if euler:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from plow_twin.kernel.arrays import unowned
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
 from plow_twin.model.pairs import PAIR_COUNT
@@ -14,12 +15,18 @@ from plow_twin.solve.kinematics import pose_of
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.method.rest import write_rest
 from plow_twin.solve.modes import within_range
-from plow_twin.solve.state import STATE, Status
+from plow_twin.solve.state import STATE, Parts, Status
 from plow_twin.solve.step import complete_step, lay_out_step
 from plow_twin.solve.totals import add_to_totals
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
+
+
+@kernel(inline=True)
+def _unowned_loads(parts):
+    """Return the parts with loads that the caller keeps alive."""
+    return Parts(parts.terms, unowned(parts.harmonics), unowned(parts.segments), parts.implicit)
 
 
 @kernel(inline=True)
@@ -122,7 +129,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
     before = state.steps
     code = _proceed(p, parts, state, w, totals, target, stop_time, before + budget)
     if bound is not None:
-        bound.error[0] = 0.0
+        bound.error = 0.0
         if code == _BUDGET:
             code = end_coarsely(p, parts, state, totals, target, bound)
     steps = state.steps - before
@@ -152,7 +159,7 @@ def _advance_row(p, parts, states, index, saved, w, totals, target, stop_time, b
     """Proceed to `target` and write all that a `ROW` tells of it."""
     out.status, out.steps = _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound)
     if bound is not None:
-        out.error_estimate = bound.error[0]
+        out.error_estimate = bound.error
     _read_row(p, parts, states[index], w, totals, out)
 
 
@@ -170,6 +177,7 @@ def _follow_line(piece, start, time, before, sample) -> None:
 def advance_times(p, parts, states, w, totals, times, budget, rows, bound) -> None:
     """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
     saved = np.empty(1, STATE)
+    parts, states = _unowned_loads(parts), unowned(states)
     for i in range(times.size):
         _advance_row(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound, rows[i])
 
@@ -181,6 +189,7 @@ def advance_batch(params, parts, states, work, totals, first, last, times, wrenc
     A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
     bits alone. `work` and `totals` are arrays of one.
     """
+    parts, states = _unowned_loads(parts), unowned(states)
     w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, STATE)
     for m in range(first, last):
         p, state = params[m], states[m]
@@ -197,6 +206,7 @@ def advance_marked(params, parts, states, work, totals, times, wrench, budget, m
     `marks` are numbers of advances, rising; `snapshots` has room for as many states. `rows` may be None: then nothing
     is read out.
     """
+    parts, states = _unowned_loads(parts), unowned(states)
     w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, STATE)
     p, state = params[0], states[0]
     state.piece = 0
@@ -272,6 +282,8 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
 
     `penetration`, `force` and `balance` may be None. The rows' times do not change the steps.
     """
+    parts, log = _unowned_loads(parts), unowned(log)
+    q, v, pair_penetration, pair_force = unowned(q), unowned(v), unowned(penetration), unowned(force)
     rate, y, wear_depth, wear = np.empty(8), np.empty(8), np.empty(8), parts.terms.wear
     i = first[0]
     if balance is not None and state.steps == 0:
@@ -279,7 +291,7 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
     while True:
         if state.step_start >= t_end:
             break
-        if log.length[0] + 8 > log.time.size:
+        if totals.logged + PAIR_COUNT > log.size:
             return _LOG_FULL
         code = _next(p, parts, state, w, t_end, budget)
         if code != _OK:
@@ -294,7 +306,7 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
             pose_of(p, y, parts.terms.offset, q[i], v[i])
             if force is not None:
                 _worn_at(state, w, wear, sigma, wear_depth)
-                pair_outputs(p, state, wear_depth, y, penetration[i], rate, force[i])
+                pair_outputs(p, state, wear_depth, y, pair_penetration[i], rate, pair_force[i])
             i += 1
         first[0] = i
         add_to_totals(state, w, 0.0, sigma_at(state, state.step_size), totals)
@@ -306,7 +318,7 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
     while i < t.size:
         pose_of(p, state.y, parts.terms.offset, q[i], v[i])
         if force is not None:
-            pair_outputs(p, state, state.wear_depth, state.y, penetration[i], rate, force[i])
+            pair_outputs(p, state, state.wear_depth, state.y, pair_penetration[i], rate, pair_force[i])
         i += 1
     first[0] = i
     return _OK

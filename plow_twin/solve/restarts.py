@@ -28,7 +28,7 @@ def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> i
         first[0] = 0
         code = _LOG_FULL
         while code == _LOG_FULL:
-            log.length[0] = 0
+            totals[m].logged = 0
             code = integrate(
                 p, parts, states[m], w, totals[m], log, t[high - 1], budgets[m], first, t[low:high], q[low:high],
                 v[low:high], None, None, None,

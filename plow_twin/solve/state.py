@@ -232,6 +232,7 @@ TOTALS: Final = np.dtype(
         ("time_in_contact", "f8", (PAIR_COUNT,)),
         ("makes", "i8", (PAIR_COUNT,)),
         ("set_time", "f8", (2, 16)),  # time in each set of corners, counter-clockwise and clockwise pairs
+        ("logged", "i8"),  # events in the log
     ]
 )
 
@@ -253,6 +254,7 @@ Params: TypeAlias = np.record
 State: TypeAlias = np.record
 Work: TypeAlias = np.record
 Totals: TypeAlias = np.record
+Implicit: TypeAlias = np.record
 
 
 #: Harmonic loads, per mass and inertia, sine and cosine amplitudes: forces S1 and S2 along `direction`, moment M.
@@ -288,27 +290,8 @@ class Terms(NamedTuple):
     rest: int | None  #: rest can be recognised (`solve.method.rest`)
 
 
-class Implicit(NamedTuple):
-    """Nodes, weights and scratch space of an implicit step with s stages (`solve.method.implicit`)."""
-
-    nodes: Array  #: (s,)
-    weights: Array  #: (s, s)
-    from_values: Array  #: (s + 1, s + 1) coefficients from values at the start and at the nodes
-    from_stages: Array  #: (s, s) the same from values at the nodes
-    z: Array  #: (s + 1, 6) state at the start and at the nodes
-    rate: Array  #: (2, 6) rates for a difference
-    accelerations: Array  #: (s, 3)
-    jacobians: Array  #: (s, 2, 3, 3) of the accelerations, by place and by velocity
-    matrix: Array  #: (3 s, 3 s)
-    residual: Array  #: (3 s,)
-    body: Array  #: (s + 1, 8) body coordinates
-    pairs: Array  #: (3, s, 8) force, the law's force (of clipped pairs too), rate of penetration at the nodes
-    wear_depth: Array  #: (s + 1, 8) at the start and at the nodes
-    load: Array  #: (3,)
-
-
 class Parts(NamedTuple):
-    """What a scene may lack: terms of the equations, and the data of those whose size differs from scene to scene."""
+    """What a scene may lack: terms of the equations, loads whose number differs, nodes and space of implicit steps."""
 
     terms: Terms
     harmonics: Harmonics | None
@@ -316,25 +299,22 @@ class Parts(NamedTuple):
     implicit: Implicit | None
 
 
-class Bound(NamedTuple):
-    """What bounds the work of an advance, and scratch space for its coarse end."""
+#: What bounds the work of an advance, and scratch space for its coarse end.
+BOUND: Final = np.dtype(
+    [
+        ("steps", "i8"),  # Runge-Kutta steps that are kept for the end
+        ("error", "f8"),  # estimate in m of the advance, 0 while the bound does not bite
+        ("z", "f8", (6, 6)),  # state, trial state, four stages
+        ("load", "f8", (3,)),
+        ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, force before
+    ]
+)
 
-    steps: int  #: Runge-Kutta steps that are kept for the end
-    error: Array  #: (1,) error estimate in m of the advance, 0 while the bound does not bite
-    z: Array  #: (6, 6) state, trial state, four stages
-    load: Array  #: (3,)
-    pairs: Array  #: (4, 8) penetration, rate, force, force before
+#: One change of contact: time in s, pair, modes before and after, rate of penetration in m/s.
+EVENT: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
 
-
-class Log(NamedTuple):
-    """Contact events in order of time."""
-
-    time: Array
-    pair: IntArray
-    mode_from: IntArray
-    mode_to: IntArray
-    rate: Array
-    length: IntArray  #: (1,)
+Bound: TypeAlias = np.record
+Log: TypeAlias = NDArray[np.void]
 
 
 def new_record(dtype: np.dtype[np.void]) -> np.record:
@@ -371,11 +351,3 @@ def new_work() -> Work:
     work.inverse[1:] = 1.0 / np.arange(1, _ROWS + 2)
     work.binomial[:] = _inverse_binomials()
     return work
-
-
-def new_log(size: int) -> Log:
-    """Return an event log with room for `size` events."""
-    return Log(
-        np.zeros(size), np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size),
-        np.zeros(1, np.int64),
-    )  # fmt: skip

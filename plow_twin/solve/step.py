@@ -155,4 +155,4 @@ def _switch(p, state, pair, new, totals, log, fraction) -> None:
     # to the outside a released pair is on
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:
-        log_event(log, state.step_start, pair, old, new, penetration_and_rate(p, state, pair)[1])
+        log_event(log, totals, state.step_start, pair, old, new, penetration_and_rate(p, state, pair)[1])

@@ -78,12 +78,12 @@ def add_set_times(totals, carrying, elapsed) -> None:
 
 
 @kernel()
-def log_event(log, time, pair, mode_from, mode_to, rate) -> None:
+def log_event(log, totals, time, pair, mode_from, mode_to, rate) -> None:
     """Write one change of contact to the event log, which has room for it."""
-    i = log.length[0]
-    log.time[i], log.pair[i], log.rate[i] = time, pair, rate
-    log.mode_from[i], log.mode_to[i] = mode_from, mode_to
-    log.length[0] = i + 1
+    event = log[totals.logged]
+    event.time, event.pair, event.rate = time, pair, rate
+    event.mode_from, event.mode_to = mode_from, mode_to
+    totals.logged += 1
 
 
 @kernel()

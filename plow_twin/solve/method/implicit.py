@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,12 @@ from scipy.special import roots_jacobi
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
+from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
-from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y
+from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y, new_record
 
 #: Stages: the polynomials' degree. The order is 2 s - 1.
 STAGES = 9
@@ -69,16 +71,33 @@ def _rule() -> tuple[NDArray[np.float64], ...]:
     return tuple(table.astype(np.float64) for table in (nodes, weights, from_values, from_stages))
 
 
+#: Nodes, weights and scratch space of an implicit step with s stages.
+IMPLICIT: Final = np.dtype(
+    [
+        ("nodes", "f8", (STAGES,)),
+        ("weights", "f8", (STAGES, STAGES)),
+        ("from_values", "f8", (STAGES + 1, STAGES + 1)),  # coefficients from values at the start and at the nodes
+        ("from_stages", "f8", (STAGES, STAGES)),  # the same from values at the nodes
+        ("z", "f8", (STAGES + 1, 6)),  # state at the start and at the nodes
+        ("rate", "f8", (2, 6)),  # rates for a difference
+        ("accelerations", "f8", (STAGES, 3)),
+        ("jacobians", "f8", (STAGES, 2, 3, 3)),  # of the accelerations, by place and by velocity
+        ("matrix", "f8", (3 * STAGES, 3 * STAGES)),
+        ("residual", "f8", (3 * STAGES,)),
+        ("body", "f8", (STAGES + 1, STATE_SIZE)),  # body coordinates
+        ("pairs", "f8", (3, STAGES, PAIR_COUNT)),  # force, the law's force (of clipped pairs too), rate, at the nodes
+        ("wear_depth", "f8", (STAGES + 1, PAIR_COUNT)),  # at the start and at the nodes
+        ("load", "f8", (3,)),
+    ]
+)
+
+
 def new_implicit() -> Implicit:
     """Return nodes, weights and scratch space."""
-    nodes, weights, from_values, from_stages = _rule()
-    size = 3 * STAGES
-    return Implicit(
-        nodes, weights, from_values, from_stages,
-        np.zeros((STAGES + 1, 6)), np.zeros((2, 6)), np.zeros((STAGES, 3)), np.zeros((STAGES, 2, 3, 3)),
-        np.zeros((size, size)), np.zeros(size), np.zeros((STAGES + 1, 8)), np.zeros((3, STAGES, 8)),
-        np.zeros((STAGES + 1, 8)), np.zeros(3),
-    )  # fmt: skip
+    implicit = new_record(IMPLICIT)
+    for name, table in zip(("nodes", "weights", "from_values", "from_stages"), _rule(), strict=True):
+        implicit[name] = table
+    return implicit
 
 
 @kernel()
