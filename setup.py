@@ -16,12 +16,13 @@ EXTRAS = {
     ],
     # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
     "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18", "lz4>=4.3", "zstandard>=0.22", "isal>=1.6"],
+    "mqtt": ["paho-mqtt>=2.0"],
     "view": ["rerun-sdk>=0.41", "matplotlib>=3.8"],
     "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1", "rainflow>=3.2"],
     "dask": ["distributed>=2024.1"],
     "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9"],
     "docs": ["mkdocs>=1.6,<2", "mkdocstrings[python]>=0.26"],
-    "test": ["pytest>=8", "pytest-cov", "pytest-timeout", "pytest-xdist", "hypothesis"],
+    "test": ["pytest>=8", "pytest-cov", "pytest-timeout", "pytest-xdist", "hypothesis", "amqtt>=0.11"],
 }
 EXTRAS["dev"] = [
     *EXTRAS["docs"],

@@ -22,8 +22,8 @@ from plow_twin import Twin, Wear
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.estimate.worker import Found, Worker
+from plow_twin.live.estimation import entry_of, message_of
 from plow_twin.record.replay import replay
-from plow_twin.ros.estimation import entry_of, message_of
 from plow_twin.ros.messages import set_stamp
 from plow_twin.stream.journal import Sample, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
@@ -208,7 +208,7 @@ context = Context()
 context.init(args=[])
 node = TwinNode(namespace="/off", context=context)
 assert node.start()
-loaded = [name for name in sys.modules if name.startswith(("plow_twin.estimate", "plow_twin.ros.estimation"))]
+loaded = [name for name in sys.modules if name.startswith(("plow_twin.estimate", "plow_twin.live.estimation"))]
 assert not loaded, loaded
 assert node.count_publishers("estimate") == 0
 node.release()

@@ -32,8 +32,9 @@ ROOMS = {
     "record": CORE | {"build", "scene_file", "stream", "estimate"},
     "view": CORE | {"scene_file", "stream", "record"},
     "study": CORE | {"build", "scene_file", "stream", "record", "view"},
-    "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},
-    "cli": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "ros"},
+    "live": CORE | {"scene_file", "stream", "estimate", "record"},
+    "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "live"},
+    "cli": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros"},
     "__init__": CORE | {"scene_file"},
     "__main__": {"cli"},
 }
@@ -60,6 +61,7 @@ LIBRARIES = {
         "rerun",
         "rainflow",
     },
+    "live": {"yaml", "paho"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", "rich", *MESSAGES},
     "cli": {"click", "rich"},
 }
@@ -145,6 +147,7 @@ def _imported_names(path: Path) -> set[str]:
         ("import plow_twin", {"jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"}),
         ("import plow_twin.stream.session", {"jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"}),
         ("import plow_twin.cli, plow_twin.record.replay", {"mcap", "rosbags", "rerun", "rclpy"}),
+        ("import plow_twin.cli.live, plow_twin.live.front", {"mcap", "rosbags", "rerun", "rclpy", "paho"}),
         ("import plow_twin.cli, plow_twin.study", {"matplotlib", "pyarrow", "distributed", "jinja2", "rerun"}),
     ],
 )

@@ -16,8 +16,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_processes import Bench, Process, bench, value
 from sensor_msgs.msg import JointState
 
+from plow_twin.live.parameters import SPECS, Effect
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.ros.parameters import SPECS, Effect
 
 T0 = 1_795_000_000_000_000_000
 

@@ -23,12 +23,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from plow_twin.live.diagnostics import KEYS, STATUS_KEYS
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene, Wear
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
-from plow_twin.ros.diagnostics import KEYS, STATUS_KEYS
 from plow_twin.ros.messages import stamp_ns
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
@@ -73,8 +73,8 @@ def test_outputs_equal_an_offline_twin_on_the_same_samples_bit_for_bit(tmp_path:
         assert json.loads(publisher.output().splitlines()[-1])["sent"] == 2000
         for name, heard in (("forces", forces), ("peaks", peaks), ("heads", heads)):
             probe.until(lambda heard=heard: len(heard) == 2000, f"2000 {name}")
-        figures = probe.figures("input")
-        assert (figures["samples_used"], figures["samples_missing"]) == ("2000", "0")
+        probe.until_figure("input", "samples_used", "2000")
+        assert probe.figures("input")["samples_missing"] == "0"
 
     stamps = [stamp_ns(message.header) for message in forces]
     assert (np.diff(stamps) == MS).all()
@@ -594,8 +594,8 @@ def test_two_twins_in_two_namespaces_do_not_meet(tmp_path: Path) -> None:
 
 
 def test_the_documentation_names_every_topic_parameter_and_key() -> None:
-    from plow_twin.ros.diagnostics import markdown_tables
-    from plow_twin.ros.parameters import markdown_table, yaml_text
+    from plow_twin.live.diagnostics import markdown_tables
+    from plow_twin.live.parameters import markdown_table, yaml_text
 
     text = (ROOT / "docs" / "node.md").read_text(encoding="utf-8")
     assert markdown_table() in text

@@ -20,10 +20,9 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import JointState
 
+from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
-from plow_twin.ros.messages import ToolForces
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -89,7 +88,9 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             message = PoseStamped()
             message.header.stamp.sec = number
             message.pose.orientation.z, message.pose.orientation.w = sign * math.sin(5e-3), sign * math.cos(5e-3)
-            node.runtime.inputs._measured_pose(message)
+            front = node._front
+            assert front is not None
+            front.subscriptions._measured_pose(message)
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
             found.append(residual[2])
@@ -101,10 +102,10 @@ def test_loads_without_a_direction_may_be_named_and_count_nothing() -> None:
     table = Table(name="cut", t=(0.0, 1.0), wrench=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
     tools = ToolForces(replace(PAPER, loads=(*PAPER.loads, bias, table)))
     required = [load.name for load in PAPER.loads]
-    plain = tools.wrench(JointState(name=required, effort=[2.0] * len(required)))
+    plain = tools.wrench(required, [2.0] * len(required))
     assert plain is not None
     every = [*required, "bias", "cut"]
-    assert tools.wrench(JointState(name=every, effort=[*[2.0] * len(required), 7.0, math.nan])) == plain
+    assert tools.wrench(every, [*[2.0] * len(required), 7.0, math.nan]) == plain
     for wrong in (every[1:], [*every, "cut"], [*every, "drum"], []):
-        assert tools.wrench(JointState(name=wrong, effort=[1.0] * len(wrong))) is None
-    assert tools.wrench(JointState(name=every, effort=[1.0])) is None
+        assert tools.wrench(wrong, [1.0] * len(wrong)) is None
+    assert tools.wrench(every, [1.0]) is None

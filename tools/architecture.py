@@ -14,7 +14,7 @@ HOUSE = 470
 #: From the top down; a room imports only from rows below it.
 ROOMS = (
     (("ros", "the node"), ("cli", "plow-twin")),
-    (("study", "paper, calibration, sweep"),),
+    (("study", "paper, calibration, sweep"), ("live", "runtime, bridges")),
     (("record", "MCAP, replay"), ("view", "rerun")),
     (("stream", "intake, session, outputs"), ("estimate", "from measurements")),
     (("run", "simulate, Twin, TwinBatch, ensemble"),),
@@ -25,7 +25,7 @@ ROOMS = (
 CORE = {"kernel", "model", "solve", "run"}
 SAMPLE = (
     ("message", "WrenchStamped, 1 kHz"),
-    ("ros/input_queue, inputs", "to stamp and wrench; loss counted"),
+    ("ros/subscriptions | live/bridge", "to stamp and wrench; loss counted"),
     ("stream/intake", "used, or dropped by a counted reason"),
     ("stream/driver, session", "journal, then apply"),
     ("run/twin, solve/loop", "steps from event to event up to the stamp"),

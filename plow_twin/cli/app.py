@@ -17,6 +17,7 @@ from plow_twin.cli.doctor import doctor
 from plow_twin.cli.estimate import estimate
 from plow_twin.cli.forecast import forecast
 from plow_twin.cli.info import info
+from plow_twin.cli.live import live
 from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
@@ -38,6 +39,7 @@ EXTRA_OF_MODULE: Final = {
     "std_srvs": "ros",
     "mcap": "record",
     "rosbags": "record",
+    "paho": "mqtt",
     "rerun": "view",
     "rainflow": "study",
     "matplotlib": "study",
@@ -56,7 +58,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, estimate, forecast, replay, analyse, doctor, view, info, study):
+for _verb in (simulate, demo, live, estimate, forecast, replay, analyse, doctor, view, info, study):
     commands.add_command(_verb)
 
 

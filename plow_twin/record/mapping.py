@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,6 +45,8 @@ _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("forces", "sensor_msgs/msg/JointState"): {name: f"effort[{name}]" for name in PAIR_NAMES},
     ("gaps", "sensor_msgs/msg/JointState"): {name: f"position[{name}]" for name in PAIR_NAMES},
 }
+_NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 #: Topics by which a role is recognised without a mapping.
 _NAMES: Final = {
     "excitation": ("excitation", "load", "wrench"),
@@ -52,14 +55,44 @@ _NAMES: Final = {
     "forces": ("measured_forces", "forces"),
     "gaps": ("gaps",),
 }
-_KEYS: Final = ("topic", "type", "fields", "scale", "offset", "stamp")
+_KEYS: Final = (
+    *("topic", "type", "fields", "scale", "offset", "unit", "limits"),
+    *("stamp", "stamp_unit", "clock_offset", "sequence"),
+)
+#: Units in SI, by what they measure.
+UNITS: Final[dict[str, dict[str, float]]] = {
+    "force": {"N": 1.0, "kN": 1e3, "MN": 1e6},
+    "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0},
+    "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
+}
+_QUANTITIES: Final = {
+    **{("excitation", name): "force" for name in ("fx", "fy")},
+    ("excitation", "m"): "moment",
+    **{("head_pose", name): "length" for name in ("x", "y")},
+    ("head_pose", "theta"): "angle",
+    ("travel", "speed"): "speed",
+    **{("gaps", name): "length" for name in PAIR_NAMES},
+    **{("forces", name): "force" for name in PAIR_NAMES},
+}
+_STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+#: Columns and keys that hold the time where the mapping names none.
+TIMES: Final = ("t", "time")
+#: Times below this are no times of the epoch, but count from some start [s]: they are moved away from 0, which stands
+#: for a missing stamp.
+_EPOCH_S: Final = 1e9
+_ORIGIN_NS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class Role:
     """One line of a mapping.
 
-    The numbers are `scale` times the field plus `offset`; `stamp` is `header`, `log`, or for CSV a column of times.
+    The numbers are `scale` times the field plus `offset`, in a unit that `factor` takes to SI; `limits` are the
+    smallest and largest that are used, in SI. `stamp` is `header`, `log`, or for CSV and JSON where the time stands (a
+    number in `stamp_unit`, or a text after ISO 8601); `clock_offset_ns` is added to it. `sequence` is where the
+    sender's own number of the message stands; empty: it has none.
     A field is a path of names; `[3]` or `[name]` picks from an array, the name being looked up in the message's `name`.
     A path that leads to a quaternion gives the angle about z.
     """
@@ -70,6 +103,11 @@ class Role:
     scale: Mapping[str, float] = field(default_factory=dict)
     offset: Mapping[str, float] = field(default_factory=dict)
     stamp: str = "header"
+    factor: Mapping[str, float] = field(default_factory=dict)
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    stamp_unit: str = "s"
+    clock_offset_ns: int = 0
+    sequence: str = ""
 
     def read(self, arrived: Arrived) -> tuple[int, dict[str, float]] | None:
         """Return stamp [ns] and numbers (NaN where the field is empty), or None when the message does not fit."""
@@ -78,28 +116,109 @@ class Role:
             value = _follow(arrived.content, path)
             if value is None:
                 return None
-            values[name] = value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)
+            value = value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)
+            values[name] = value * self.factor.get(name, 1.0)
         stamp_ns = self._stamp_ns(arrived)
-        return None if stamp_ns is None else (stamp_ns, values)
+        return None if stamp_ns is None else (stamp_ns + self.clock_offset_ns, values)
+
+    def plausible(self, values: Mapping[str, float]) -> bool:
+        """Tell whether no number is outside its limits; one that is not there is none."""
+        return not any(
+            values[name] < low or values[name] > high for name, (low, high) in self.limits.items() if name in values
+        )
+
+    def empty(self, arrived: Arrived) -> bool:
+        """Tell whether a message says nothing in this role: its fields are there and hold nothing."""
+        content = arrived.content
+        return isinstance(content, Mapping) and all(_at(content, path) in (None, "") for path in self.fields.values())
+
+    def number(self, arrived: Arrived) -> int | None:
+        """Return the sender's own number of the message, or None when there is none."""
+        value = _follow(arrived.content, self.sequence)
+        return int(value) if value is not None and math.isfinite(value) and value == int(value) >= 0 else None
 
     def _stamp_ns(self, arrived: Arrived) -> int | None:
         content = arrived.content
         if self.stamp == "log":
             return arrived.log_time_ns
         if isinstance(content, Mapping):
-            if self.stamp == "header" or self.stamp not in content:
-                return arrived.log_time_ns
-            time = content[self.stamp]
-            return None if not math.isfinite(time) else round(time * 1e9) + 1_000_000_000
+            if self.stamp == "header":
+                name = next((name for name in TIMES if name in content), None)
+                return arrived.log_time_ns if name is None else time_ns(content[name], self.stamp_unit)
+            time = _at(content, self.stamp)
+            return arrived.log_time_ns if time is None else time_ns(time, self.stamp_unit)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
         # a type without a header has only its receive time
         return arrived.log_time_ns if stamp is None else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
+def time_ns(value: Any, unit: str = "s") -> int | None:
+    """Return the stamp [ns] that a number, or a text after ISO 8601 (UTC unless it says otherwise), stands for.
+
+    None when it stands for none.
+    """
+    if isinstance(value, str):
+        value = value.strip()
+        # a number first: 20260102 would be a date too
+        if value.isascii() and value.isdigit() and len(value) < 20:
+            value = int(value)
+        elif _NUMBER.fullmatch(value):
+            value = float(value)
+        else:
+            return _date_ns(value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
+        return None
+    scale = _STAMP_UNITS[unit]
+    # integers keep their nanoseconds; a float of today's date holds some 0.2 us
+    stamp_ns = value * scale if isinstance(value, int) else round(value * scale)
+    if abs(stamp_ns) > 4e18:
+        return None
+    return stamp_ns if stamp_ns >= _EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
+
+
+def _date_ns(text: str) -> int | None:
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    time = time if time.tzinfo else time.replace(tzinfo=UTC)
+    return (time - _EPOCH) // timedelta(microseconds=1) * 1000
+
+
+def _at(content: Mapping[str, Any], path: str) -> Any | None:
+    """Return what stands at a path of keys and indexes, or None."""
+    if path in content:
+        return content[path]
+    value: Any = content
+    for part in re.findall(r"[^.\[\]]+", path):
+        if isinstance(value, Mapping):
+            value = value.get(part)
+        elif isinstance(value, list) and part.isdigit() and int(part) < len(value):
+            value = value[int(part)]
+        else:
+            return None
+    return value
+
+
+def _plain_number(value: Any) -> float | None:
+    """Return a number as a sender wrote it, NaN for an empty cell, or None for anything else."""
+    if isinstance(value, str):
+        if not value.strip():
+            return math.nan
+        if not _NUMBER.fullmatch(value.strip()):
+            return None
+    elif isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
 def _follow(content: Any, path: str) -> float | None:
     """Return the number at a path, or None when there is none."""
     if isinstance(content, Mapping):
-        return content.get(path)
+        return _plain_number(_at(content, path))
     value = content
     for part in path.split("."):
         name, *picks = re.split(r"[\[\]]+", part.rstrip("]"))
@@ -119,8 +238,10 @@ def _follow(content: Any, path: str) -> float | None:
         return None
 
 
-def read_map(path: Path | None, topics: Mapping[str, str]) -> dict[str, Role]:
+def read_map(path: Path | None, topics: Mapping[str, str] | None) -> dict[str, Role]:
     """Return the roles of a recording's topics: as the YAML file says, else as names and types tell.
+
+    `topics` are types by topic; None when they are not known beforehand: JSON on any topic that the file names.
 
     Raises
     ------
@@ -128,6 +249,7 @@ def read_map(path: Path | None, topics: Mapping[str, str]) -> dict[str, Role]:
         The file cannot be used; the message names key, value got and value expected.
     """
     if path is None:
+        topics = topics or {}
         return {role: found for role in ROLES if (found := _guess(role, topics)) is not None}
     import yaml
 
@@ -141,7 +263,7 @@ def read_map(path: Path | None, topics: Mapping[str, str]) -> dict[str, Role]:
     return {str(role): _role(path, str(role), entry, topics) for role, entry in given.items()}
 
 
-def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str]) -> Role:
+def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str] | None) -> Role:
     if role not in ROLES:
         raise RecordingError(f"{path}: got {role!r}, expected one of {', '.join(ROLES)}")
     if not isinstance(entry, dict) or not isinstance(entry.get("topic"), str):
@@ -149,6 +271,29 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str]) -> Role:
     unknown = sorted(set(map(str, entry)) - set(_KEYS))
     if unknown:
         raise RecordingError(f"{path}: {role}: got {', '.join(unknown)}, expected keys among {', '.join(_KEYS)}")
+    topic, kind = _topic(path, role, entry, topics)
+    fields = entry.get("fields") or _default_fields(role, kind)
+    if not fields:
+        raise RecordingError(f"{path}: {role}: fields are missing, and there are no default ones for {kind}")
+    return Role(
+        topic,
+        kind,
+        _named(path, role, "fields", fields, str),
+        _named(path, role, "scale", entry.get("scale") or {}, float),
+        _named(path, role, "offset", entry.get("offset") or {}, float),
+        str(entry.get("stamp", "header")),
+        _factors(path, role, entry.get("unit") or {}),
+        _limits(path, role, entry.get("limits") or {}),
+        _choice(path, role, "stamp_unit", entry.get("stamp_unit", "s"), _STAMP_UNITS),
+        round(_clock_offset(path, role, entry.get("clock_offset", 0.0)) * 1e9),
+        str(entry.get("sequence", "")),
+    )
+
+
+def _topic(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, str] | None) -> tuple[str, str]:
+    """Return name and type of a role's topic."""
+    if topics is None:
+        return entry["topic"], str(entry.get("type", "json"))
     topic = entry["topic"].removesuffix(".csv")
     topic = (
         topic if topic in topics else next((name for name in topics if name.lstrip("/") == topic.lstrip("/")), topic)
@@ -160,17 +305,44 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str]) -> Role:
         kind = topics[topic]
     elif kind != topics[topic]:
         raise RecordingError(f"{path}: {role}: type: got {kind!r}, but {topic} is of type {topics[topic]!r}")
-    fields = entry.get("fields") or _default_fields(role, kind)
-    if not fields:
-        raise RecordingError(f"{path}: {role}: fields are missing, and there are no default ones for {kind}")
-    return Role(
-        topic,
-        kind,
-        _named(path, role, "fields", fields, str),
-        _named(path, role, "scale", entry.get("scale") or {}, float),
-        _named(path, role, "offset", entry.get("offset") or {}, float),
-        str(entry.get("stamp", "header")),
-    )
+    return topic, kind
+
+
+def _factors(path: Path, role: str, given: Any) -> dict[str, float]:
+    """Return what takes each number to SI."""
+    if isinstance(given, str):
+        given = dict.fromkeys(ROLES[role], given)
+    units = _named(path, role, "unit", given, str)
+    return {
+        name: UNITS[_QUANTITIES[role, name]][_choice(path, role, "unit", unit, UNITS[_QUANTITIES[role, name]])]
+        for name, unit in units.items()
+    }
+
+
+def _limits(path: Path, role: str, given: Any) -> dict[str, tuple[float, float]]:
+    """Return smallest and largest of each number; one number given stands for both signs."""
+    if isinstance(given, list):
+        given = dict.fromkeys(ROLES[role], given)
+
+    def pair(value: Any) -> tuple[float, float]:
+        low, high = value if isinstance(value, list) else (-float(value), float(value))
+        if not float(low) < float(high):
+            raise ValueError(value)
+        return float(low), float(high)
+
+    return _named(path, role, "limits", given, pair)
+
+
+def _choice(path: Path, role: str, key: str, given: Any, known: Mapping[str, Any]) -> str:
+    if given not in known:
+        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected one of {', '.join(known)}")
+    return str(given)
+
+
+def _clock_offset(path: Path, role: str, given: Any) -> float:
+    if isinstance(given, bool) or not isinstance(given, int | float) or not abs(given) < 1e9:
+        raise RecordingError(f"{path}: {role}: clock_offset: got {given!r}, expected a number of seconds")
+    return float(given)
 
 
 def _named(path: Path, role: str, key: str, given: Any, kind: Callable[[Any], Any]) -> dict[str, Any]:
@@ -182,7 +354,8 @@ def _named(path: Path, role: str, key: str, given: Any, kind: Callable[[Any], An
     try:
         values = {str(name): kind(value) for name, value in given.items()}
     except (TypeError, ValueError) as error:
-        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected {kind.__name__} values") from error
+        expected = "numbers, or pairs of smallest and largest" if key == "limits" else f"{kind.__name__} values"
+        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected {expected}") from error
     if any(isinstance(value, float) and not math.isfinite(value) for value in values.values()):
         raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected finite numbers")
     if key == "fields" and role == "excitation" and set(values) != set(names):
@@ -194,6 +367,8 @@ def _default_fields(role: str, kind: str) -> dict[str, str]:
     if kind.startswith("csv:"):
         columns = kind.removeprefix("csv:").split(",")
         return {name: name for name in ROLES[role] if name in columns}
+    if kind == "json":
+        return {name: name for name in ROLES[role]}
     return _FIELDS.get((role, kind), {})
 
 

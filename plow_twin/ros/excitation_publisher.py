@@ -27,8 +27,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from plow_twin.errors import SceneError
+from plow_twin.live.stop import StopRequested, StopSignals
 from plow_twin.model.loads import compile_loads
-from plow_twin.ros.main import StopRequested, StopSignals, make_executor
+from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import set_stamp
 from plow_twin.ros.qos import LATCHED, sensor_input
 from plow_twin.scene_file import load_scene

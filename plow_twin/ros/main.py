@@ -2,37 +2,17 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Sequence
-from types import FrameType
 from typing import TYPE_CHECKING, Final
+
+from plow_twin.live.stop import StopRequested, StopSignals
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
 #: Longest wait for an event [s]: an unbounded wait of the events executor does not end at shutdown.
 _SPIN_S: Final = 0.1
-
-
-class StopRequested(BaseException):
-    """The process was asked to stop while it could not look at a flag."""
-
-
-class StopSignals:
-    """SIGINT and SIGTERM as a flag; while `interrupt` is set (a long start), as `StopRequested`."""
-
-    def __init__(self) -> None:
-        self.stopped = False
-        self.interrupt = True
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        self.stopped = True
-        if self.interrupt:
-            self.interrupt = False
-            raise StopRequested
 
 
 def make_executor() -> Executor:
@@ -60,9 +40,9 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
     import rclpy.utilities
     from rclpy.signals import SignalHandlerOptions
 
+    from plow_twin.live.parameters import ParameterError
+    from plow_twin.live.solver_start import leave
     from plow_twin.ros.node import TwinNode
-    from plow_twin.ros.parameters import ParameterError
-    from plow_twin.ros.solver_start import leave
 
     rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     node = None

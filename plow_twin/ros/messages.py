@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -14,8 +13,6 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from plow_twin.model.loads import load_direction
-from plow_twin.model.scene import Constant, Harmonic, Scene
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
@@ -50,41 +47,6 @@ def read_wrench(data: bytes) -> tuple[int, Wrench, bool] | None:
     except (struct.error, IndexError):
         return None
     return seconds * NS_PER_S + nanoseconds, (fx, fy, mz), fz != 0.0 or mx != 0.0 or my != 0.0
-
-
-class ToolForces:
-    """The wrench of measured forces along the directions of the scene's loads.
-
-    1 N along a load's own direction, at its point of action, gives a fixed wrench about the centre; a pure moment
-    counts in N m. A table, or a constant of zero, has no direction of its own and cannot be measured in this way: it
-    may be named, and its effort is ignored.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        self._directions: Mapping[str, NDArray[np.float64]] = {
-            load.name: load_direction(load)
-            for load in scene.loads
-            if isinstance(load, Harmonic | Constant) and np.any(load_direction(load))
-        }
-        self._known = frozenset(load.name for load in scene.loads)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The loads that each message must name."""
-        return tuple(self._directions)
-
-    def wrench(self, message: JointState) -> Wrench | None:
-        """Return the total wrench, or None when the message does not give each measurable load exactly once."""
-        named = set(message.name)
-        if len(message.effort) != len(message.name) or len(named) != len(message.name):
-            return None
-        if not self._directions.keys() <= named <= self._known:
-            return None
-        total = np.zeros(3)
-        for name, effort in zip(message.name, message.effort, strict=True):
-            if name in self._directions:
-                total += effort * self._directions[name]
-        return (float(total[0]), float(total[1]), float(total[2]))
 
 
 def ros_status(status: plain.DiagnosticStatus) -> DiagnosticStatus:

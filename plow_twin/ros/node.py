@@ -1,4 +1,4 @@
-"""The lifecycle node `plow_twin`: transitions, status and diagnostics; the work is in `runtime`."""
+"""The lifecycle node `plow_twin`: transitions, status and diagnostics; the work is in `front`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.live import diagnostics
+from plow_twin.live.runtime import Runtime
+from plow_twin.live.solver_start import Preparation, key
 from plow_twin.record import messages as plain
-from plow_twin.ros import diagnostics
+from plow_twin.ros.front import RosFront
+from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
-from plow_twin.ros.runtime import Runtime
-from plow_twin.ros.solver_start import Preparation, key
 
 
 class TwinNode(LifecycleNode):
@@ -41,7 +43,7 @@ class TwinNode(LifecycleNode):
     ) -> None:
         super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
         self._stop_asked = stop_asked
-        self.runtime: Runtime | None = None
+        self._front: RosFront | None = None
         self.lifecycle = "unconfigured"
         #: why the last configure failed
         self.reason = ""
@@ -57,6 +59,11 @@ class TwinNode(LifecycleNode):
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._refuse_invalid_transitions()
         self._publish_status()
+
+    @property
+    def runtime(self) -> Runtime | None:
+        """The live twin, None while unconfigured."""
+        return None if self._front is None else self._front.runtime
 
     @property
     def autostart(self) -> bool:
@@ -91,13 +98,13 @@ class TwinNode(LifecycleNode):
         try:
             self.prepare()
             prepared = self._take_preparation().result(self._stop_asked)
-            self.runtime = Runtime(self, settings, self._publish_status, prepared, self._kept_wear)
+            self._front = RosFront(self, settings, self._publish_status, prepared, self._kept_wear)
         except (PlowTwinError, OSError, ModuleNotFoundError) as error:
             self.reason = f"scene {settings.scene!r}, record_path {settings.record_path!r}: {error}"
         except Exception:  # rclpy would swallow it
             self.reason = traceback.format_exc()
         else:
-            self.get_logger().info(f"scene {settings.scene}: solver ready in {self.runtime.compile_s:.2f} s")
+            self.get_logger().info(f"scene {settings.scene}: solver ready in {prepared.compile_s:.2f} s")
             return self._entered("inactive")
         self.get_logger().error(f"not configured: {self.reason}")
         self._publish_status()
@@ -109,14 +116,14 @@ class TwinNode(LifecycleNode):
         # what lives now lives long: the collector need not walk it while samples arrive
         gc.collect()
         gc.freeze()
-        self._running().activate()
+        self._configured().activate()
         return self._entered("active")
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take no samples; the state of the model is kept."""
         super().on_deactivate(state)
         gc.unfreeze()
-        self._running().deactivate()
+        self._configured().deactivate()
         return self._entered("inactive")
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -138,17 +145,18 @@ class TwinNode(LifecycleNode):
         """Give back everything and close the recording; can be called at any time."""
         # a frozen runtime, being part of cycles, would never be given back
         gc.unfreeze()
-        runtime, self.runtime = self.runtime, None
-        if runtime is None:
+        front, self._front = self._front, None
+        if front is None:
             return
+        runtime = front.runtime
         self._kept_wear[runtime.identity] = tuple(runtime.driver.session.wear_depth.tolist())
-        for lost in runtime.close():
+        for lost in front.close():
             self.get_logger().error(lost)
 
-    def _running(self) -> Runtime:
-        if self.runtime is None:
+    def _configured(self) -> RosFront:
+        if self._front is None:
             raise RuntimeError(f"lifecycle: got {self.lifecycle}, expected a configured node")
-        return self.runtime
+        return self._front
 
     def _entered(self, lifecycle: str) -> TransitionCallbackReturn:
         self.lifecycle = lifecycle
@@ -184,28 +192,23 @@ class TwinNode(LifecycleNode):
         self._published_status = report
         level, message, values = report
         name, head = self.get_fully_qualified_name(), self._table.settings.hardware_id
-        self._status.publish(diagnostics.status(name, head, level, message, values.items()))
+        status = plain.DiagnosticStatus(level, name, message, head, tuple(values.items()))
+        self._status.publish(ros_status(status))
         if self.runtime is not None:
-            self.runtime.record_status(plain.DiagnosticStatus(level[0], name, message, head, tuple(values.items())))
+            self.runtime.record_status(status)
 
     def _publish_diagnostics(self) -> None:
-        runtime = self.runtime
-        if runtime is not None:
-            runtime.inputs.look_for_senders()
+        if self._front is not None:
+            self._front.subscriptions.look_for_senders()
         elif self.lifecycle == "unconfigured" and not self.reason:
             # a manager that configures later, perhaps another scene, need not wait for the compiler then
             self.prepare()
-        parts = {"state": self._health.state(self.lifecycle, self.reason, runtime, time.monotonic_ns())}
-        if runtime is not None:
-            parts["input"] = self._health.input(runtime)
-            parts["output"] = self._health.output(runtime)
-            parts["estimate"] = self._health.estimate(runtime)
-            parts["recorder"] = self._health.recorder(runtime)
+        parts = self._health.parts(self.lifecycle, self.reason, self.runtime, time.monotonic_ns())
         array = DiagnosticArray()
         array.header.stamp = self.get_clock().now().to_msg()
-        head = self._table.settings.hardware_id
+        name, head = self.get_fully_qualified_name(), self._table.settings.hardware_id
         array.status = [
-            diagnostics.status(f"{self.get_fully_qualified_name()}: {part}", head, level, message, values.items())
+            ros_status(plain.DiagnosticStatus(level, f"{name}: {part}", message, head, tuple(values.items())))
             for part, (level, message, values) in parts.items()
         ]
         self._diagnostics.publish(array)

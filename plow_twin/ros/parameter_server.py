@@ -10,8 +10,8 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from plow_twin.ros import parameters
-from plow_twin.ros.parameters import SPECS, Effect, Settings
+from plow_twin.live import parameters
+from plow_twin.live.parameters import SPECS, Effect, Settings
 
 
 def descriptor(spec: Field[Any]) -> ParameterDescriptor:

@@ -9,12 +9,12 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
+from plow_twin.live.runtime import QUALITY
 from plow_twin.record import messages as plain
 from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.ros.messages import JointStateWriter, OdometryWriter
 from plow_twin.ros.qos import KEPT_OUTPUT, OUTPUT
 
-QUALITY: Final = "quality"
 #: Output topics that follow from the motion, with their types.
 TOPICS: Final[dict[str, type]] = {
     topic: Odometry if topic == "head_state" else JointState for topic in (*PUBLICATION_TOPICS, QUALITY)
@@ -32,7 +32,6 @@ class OutputPublishers:
             for topic, kind in TOPICS.items()
         }
         self._writers: dict[str, JointStateWriter | OdometryWriter] = {}
-        self.published = 0
 
     def publish(self, messages: Mapping[str, plain.Message], forces_sent: Callable[[], None]) -> None:
         """Publish the messages of a publication in their order; `forces_sent` is called right after the forces."""
@@ -44,7 +43,6 @@ class OutputPublishers:
             self._publishers[topic].publish(writer.write(message))
             if topic == "contact_forces":
                 forces_sent()
-        self.published += 1
 
     def close(self) -> None:
         """Take the publishers off the node."""

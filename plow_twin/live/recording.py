@@ -8,12 +8,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
+from plow_twin.live.parameters import Settings
 from plow_twin.model.scene import Scene
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
-from plow_twin.ros.parameters import Settings
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Publication

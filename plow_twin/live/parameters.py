@@ -1,6 +1,6 @@
 """The node's parameters: one table, from which come defaults, checks, ROS descriptors, config/twin.yaml and the docs.
 
-`python -m plow_twin.ros.parameters yaml` prints config/twin.yaml, `... markdown` the table of docs/node.md.
+`python -m plow_twin.live.parameters yaml` prints config/twin.yaml, `... markdown` the table of docs/node.md.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
+from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import PlowTwinError, Problem
@@ -265,6 +266,38 @@ def settings(values: Mapping[str, Any]) -> Settings:
     if found:
         raise ParameterError(found)
     return Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the parameters in a YAML file: as of a ROS node, `ros__parameters` under any name, or plain names.
+
+    Raises
+    ------
+    ParameterError
+        The file holds no mapping.
+    """
+    import yaml
+
+    try:
+        given: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ParameterError([Problem("file", str(error), "YAML")], str(path)) from error
+    nodes = [given] if isinstance(given, dict) else []
+    nodes += [node for node in nodes[0].values() if isinstance(node, dict)] if nodes else []
+    found = next((node["ros__parameters"] for node in nodes if "ros__parameters" in node), given)
+    if not isinstance(found, dict):
+        raise ParameterError([Problem("file", type(found).__name__, "a mapping of names to values")], str(path))
+    return {str(name): value for name, value in found.items()}
+
+
+def read_value(text: str) -> Any:
+    """Return a value as YAML has it; what is no YAML stays a text."""
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
 
 
 def unknown(names: Iterable[str]) -> dict[str, str]:

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.live.parameters import Settings
 from plow_twin.model.scene import Scene
-from plow_twin.ros.parameters import Settings
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path

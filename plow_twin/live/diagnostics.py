@@ -5,22 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-
-from plow_twin.ros.inputs import TOPICS
-from plow_twin.ros.part import Part
+from plow_twin.live.inputs import TOPICS
+from plow_twin.live.part import Part
 from plow_twin.stream.driver import StreamState, counters
 from plow_twin.stream.intake import Verdict
 
 if TYPE_CHECKING:
-    from plow_twin.ros.runtime import Runtime
+    from plow_twin.live.runtime import Runtime
 
-OK, WARN, ERROR, STALE = (
-    DiagnosticStatus.OK,
-    DiagnosticStatus.WARN,
-    DiagnosticStatus.ERROR,
-    DiagnosticStatus.STALE,
-)
+OK, WARN, ERROR = 0, 1, 2
 
 #: Parts of /diagnostics with their keys and what each means.
 KEYS: Final[dict[str, dict[str, str]]] = {
@@ -137,14 +130,6 @@ _LEVELS: Final = {
 }
 
 
-def status(
-    name: str, hardware_id: str, level: bytes, message: str, values: Iterable[tuple[str, str]]
-) -> DiagnosticStatus:
-    """Return one part of the health report."""
-    pairs = [KeyValue(key=key, value=value) for key, value in values]
-    return DiagnosticStatus(level=level, name=name, message=message, hardware_id=hardware_id, values=pairs)
-
-
 def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: bool = False) -> Part:
     """Return level, message and values of `status`."""
     values = dict.fromkeys(STATUS_KEYS, "")
@@ -196,6 +181,16 @@ class Health:
 
     def __init__(self) -> None:
         self._before: dict[str, int] = {}
+
+    def parts(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> dict[str, Part]:
+        """Return all parts by name; `now_ns` is a steady time."""
+        parts = {"state": self.state(lifecycle, reason, runtime, now_ns)}
+        if runtime is not None:
+            parts["input"] = self.input(runtime)
+            parts["output"] = self.output(runtime)
+            parts["estimate"] = self.estimate(runtime)
+            parts["recorder"] = self.recorder(runtime)
+        return parts
 
     def state(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> Part:
         """Return lifecycle, stream and solver."""

@@ -1,4 +1,4 @@
-"""Between the node and the estimate beside it; imported only where an estimate is wanted."""
+"""Between a live twin and the estimate beside it; imported only where an estimate is wanted."""
 
 from __future__ import annotations
 
@@ -6,37 +6,31 @@ import json
 from typing import Final
 
 import numpy as np
-from rclpy.node import Node
-from sensor_msgs.msg import JointState
 
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.worker import Found, Worker
+from plow_twin.live.parameters import Settings
 from plow_twin.model.scene import Scene
 from plow_twin.record import messages as plain
-from plow_twin.ros.messages import JointStateWriter
-from plow_twin.ros.parameters import Settings
-from plow_twin.ros.qos import LATCHED
 from plow_twin.stream.journal import Entry, Estimated, Pose, Reset, Sample, SetWear
 from plow_twin.stream.session import Session
 
-TOPIC: Final = "estimate"
 #: Base names of what `estimate` tells; each has its points `<name>/p05` and `<name>/p95` too.
 NAMES: Final = (
     "horizontal", "vertical", "stiffness", "damping", "gain_fx", "gain_fy", "gain_m", "bias_x", "bias_y", "bias_theta",
     "delay",
 )  # fmt: skip
-#: How often the node looks whether an estimate has come [Hz].
+#: How often one looks whether an estimate has come [Hz].
 RATE_HZ: Final = 10.0
 
 
 class Estimation:
-    """The estimate of one configured node: what goes into it, and what becomes of what comes out."""
+    """The estimate of one live twin: what goes into it, and what becomes of what comes out."""
 
-    def __init__(self, node: Node, settings: Settings, scene: Scene) -> None:
-        self._node, self._frame_id = node, settings.frame_id
+    def __init__(self, settings: Settings, scene: Scene) -> None:
+        self._frame_id = settings.frame_id
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         self._worker = Worker(scene, *span)
-        self._publisher = node.create_publisher(JointState, TOPIC, LATCHED)
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
@@ -68,7 +62,7 @@ class Estimation:
                 self._worker.restart()
 
     def poll(self, session: Session) -> plain.JointState | None:
-        """Hand an estimate that has come to the session and publish it; return its message, if there is one."""
+        """Hand an estimate that has come to the session; return its message, if there is one."""
         found = self._worker.poll()
         if found is None:
             return None
@@ -81,14 +75,11 @@ class Estimation:
         self.reasons = result.reasons
         self.entry = entry_of(found, session, self.entry)
         session.apply(self.entry)
-        message = message_of(found, self._frame_id)
-        self._publisher.publish(JointStateWriter(message).write(message))
-        return message
+        return message_of(found, self._frame_id)
 
     def close(self) -> None:
-        """End the process and take the publisher off the node."""
+        """End the process."""
         self._worker.close()
-        self._node.destroy_publisher(self._publisher)
 
 
 def entry_of(found: Found, session: Session, before: Estimated | None) -> Estimated:

@@ -1,0 +1,152 @@
+"""`plow-twin live`: the live twin without ROS."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import (
+    DONE,
+    DONE_WITH_LOSS,
+    POSITIVE,
+    busy,
+    error_console,
+    json_option,
+    output_console,
+    quiet_option,
+    show_facts,
+)
+
+if TYPE_CHECKING:
+    from plow_twin.live.bridge.source import Bridge
+    from plow_twin.live.parameters import Settings
+
+_LEVELS = ("OK", "WARN", "ERROR")
+#: Counters that say that something of the input was not used.
+_LOST = ("dropped_", "samples_lost", "messages_lost")
+_FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
+
+
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.")
+@click.argument("source")
+@click.option("--scene", help="Scene file or preset; else the parameter scene.")
+@click.option("--map", "mapping", type=_FILE, help="YAML that says where load, travel and pose stand, with units.")
+@click.option("--params", type=_FILE, help="YAML file of parameters, as of the node.")
+@click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="One parameter; may be given many times.")
+@click.option("--record", type=click.Path(path_type=Path, file_okay=False), help="Folder for the recording.")
+@click.option("--follow", is_flag=True, help="Go on with what is appended to the files.")
+@click.option("--seconds", type=POSITIVE, default=None, help="Stop after so long [s].")
+@click.option("--user", default="", help="User at the broker; password: PLOW_TWIN_MQTT_PASSWORD, or a file.")
+@click.option("--password-file", type=_FILE, help="File whose first line is the password.")
+@click.option("--tls-ca", type=_FILE, help="Authority that the broker's certificate is checked against.")
+@click.option("--tls-cert", type=_FILE, help="Certificate of this client.")
+@click.option("--tls-key", type=_FILE, help="Key of that certificate.")
+@click.option("--client-id", default="plow_twin", show_default=True, help="Name under which the broker keeps messages.")
+@click.option("--plain", is_flag=True, help="Allow a broker on another machine without TLS.")
+@click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
+@json_option
+@quiet_option
+def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
+    """Run the twin on SOURCE: CSV files (a folder, or one file), - for standard input, or mqtt[s]://HOST:PORT."""
+    from plow_twin.live.front import BridgeFront
+    from plow_twin.live.solver_start import Preparation, leave
+    from plow_twin.live.stop import StopRequested, StopSignals
+
+    stop = StopSignals()
+    try:
+        settings = _settings(options)
+        bridge = _bridge(source, options)
+        with busy("preparing the solver", quiet or not error_console().is_terminal):
+            prepared = Preparation(settings).result(lambda: stop.stopped)
+
+        def say(name: str, part: tuple[int, str, dict[str, str]]) -> None:
+            level, message, values = part
+            if lines:
+                click.echo(json.dumps({"topic": name, "level": level, "message": message, "values": values}))
+                sys.stdout.flush()
+            elif name in ("status", "alarms") and not quiet:
+                click.echo(f"{_LEVELS[level]} {name}: {message}", err=True)
+
+        def on_error(text: str) -> None:
+            click.echo(f"plow-twin: {text}", err=True)
+
+        front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error)
+        stop.interrupt = False
+        lost = front.run(lambda: stop.stopped, seconds or float("inf"))
+    except StopRequested:
+        return leave(DONE)
+    parts = front.parts()
+    facts = {name: values for name, (_, _, values) in parts.items()}
+    for text in lost:
+        on_error(text)
+    if as_json:
+        click.echo(json.dumps(facts, indent=2))
+    elif not quiet and not lines:
+        show_facts(output_console(), {"input": {key: facts["input"][key] for key in _shown(facts["input"])}})
+    unused = any(int(facts["input"][key]) for key in facts["input"] if key.startswith(_LOST))
+    return leave(DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE)
+
+
+def _shown(values: dict[str, str]) -> list[str]:
+    return [key for key, value in values.items() if value not in ("", "0") or key == "samples_used"]
+
+
+def _settings(options: dict[str, Any]) -> Settings:
+    """Return the parameters: of the file, then those given one by one, then those that have options of their own."""
+    from plow_twin.live import parameters
+
+    values = parameters.read_yaml(options["params"]) if options["params"] else {}
+    for text in options["given"]:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise click.BadParameter(f"got {text!r}, expected NAME=VALUE", param_hint="--set")
+        values[name.strip()] = parameters.read_value(value)
+    for name, nearest in parameters.unknown(values).items():
+        hint = f"; did you mean {nearest}?" if nearest else ""
+        raise click.BadParameter(f"unknown parameter {name}{hint}", param_hint="--set or --params")
+    try:
+        settings = parameters.settings(values)
+    except parameters.ParameterError as error:
+        raise click.UsageError(str(error)) from error
+    scene, record = options["scene"] or settings.scene, options["record"] or settings.record_path
+    return replace(settings, scene=scene, record_path=str(record))
+
+
+def _bridge(source: str, options: dict[str, Any]) -> Bridge:
+    from plow_twin.live.bridge.files import Files, StandardInput
+    from plow_twin.live.bridge.source import BridgeError
+
+    if "://" in source:
+        from plow_twin.live.bridge.mqtt import Access, Mqtt
+
+        return Mqtt(
+            Access(
+                source,
+                user=options["user"],
+                password=_password(options["password_file"]),
+                ca=options["tls_ca"],
+                certificate=options["tls_cert"],
+                key=options["tls_key"],
+                plain=options["plain"],
+                client_id=options["client_id"],
+            )
+        )
+    if source == "-":
+        return StandardInput()
+    path = Path(source)
+    paths = sorted(path.glob("*.csv")) if path.is_dir() else [path]
+    if not paths:
+        raise BridgeError(f"{path}: got a folder without .csv, expected some")
+    return Files(paths, follow=options["follow"])
+
+
+def _password(path: Path | None) -> str:
+    if path is None:
+        return os.environ.get("PLOW_TWIN_MQTT_PASSWORD", "")
+    return path.read_text(encoding="utf-8").partition("\n")[0]

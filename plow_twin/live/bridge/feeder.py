@@ -1,0 +1,103 @@
+"""From messages of a bridge to the inputs of a live twin, by the mapping."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from plow_twin.live.runtime import Runtime
+from plow_twin.record.mapping import Role
+from plow_twin.record.sources import Arrived
+from plow_twin.stream.driver import Arrival
+from plow_twin.stream.intake import Intake, Verdict
+
+#: A number that falls by more than this is that of a sender that has begun anew.
+_RESTART = 1000
+
+
+class Feeder:
+    """Read messages by their roles and hand them to a runtime.
+
+    Parameters
+    ----------
+    roles
+        The mapping; roles that the twin does not take are passed over.
+    runtime
+        The live twin.
+    """
+
+    def __init__(self, roles: Mapping[str, Role], runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._by_topic: dict[str, list[tuple[str, Role]]] = {}
+        for name, role in roles.items():
+            self._by_topic.setdefault(role.topic, []).append((name, role))
+        #: stamp of the newest sample handed over [ns]
+        self.newest_ns = 0
+        self._number = 0
+        self._sender = 0
+        inputs = runtime.inputs
+        self._optional: dict[str, Intake] = {"travel": inputs.travel, "head_pose": inputs.head_pose}
+        inputs.senders.start([self._name])
+        inputs.senders.alive([self._name])
+
+    def take(self, messages: list[Arrived]) -> None:
+        """Take messages in order of arrival."""
+        samples: list[Arrival] = []
+        for arrived in messages:
+            roles = self._by_topic.get(arrived.topic, ())
+            for name, role in roles:
+                if len(roles) > 1 and role.empty(arrived):
+                    continue  # another role's row
+                if name == "excitation":
+                    samples += self._sample(role, arrived)
+                elif name in self._optional:
+                    self._measured(name, role, arrived)
+        if samples:
+            self.newest_ns = max(self.newest_ns, *(stamp_ns for stamp_ns, _ in samples))
+            self._runtime.samples(samples)
+
+    @property
+    def _name(self) -> bytes:
+        return b"%d" % self._sender
+
+    def _sample(self, role: Role, arrived: Arrived) -> list[Arrival]:
+        sender, number, again = self._numbered(role, arrived)
+        intake = self._runtime.driver.intake
+        if again:
+            intake.refuse(Verdict.DUPLICATE)
+            return []
+        if not self._runtime.inputs.wanted(sender, number):
+            return []
+        found = role.read(arrived)
+        if found is None:
+            intake.refuse(Verdict.MALFORMED)
+            return []
+        stamp_ns, values = found
+        if not role.plausible(values):
+            intake.refuse(Verdict.IMPLAUSIBLE)
+            return []
+        return [(stamp_ns, (values["fx"], values["fy"], values["m"]))]
+
+    def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
+        """Return the sender, its number of the message (one without is counted here), and whether it came before."""
+        number = role.number(arrived) if role.sequence else None
+        if number is None:
+            # unreadable, or not numbered: it is the one that follows
+            number = self._number + 1
+        elif number < self._number - _RESTART or (number <= 1 < self._number):
+            self._sender += 1
+            self._runtime.inputs.senders.alive([self._name])
+        again, self._number = number == self._number, number
+        return self._name, number, again
+
+    def _measured(self, name: str, role: Role, arrived: Arrived) -> None:
+        found, intake, inputs = role.read(arrived), self._optional[name], self._runtime.inputs
+        if found is None:
+            intake.refuse(Verdict.MALFORMED)
+        elif not role.plausible(found[1]):
+            intake.refuse(Verdict.IMPLAUSIBLE)
+        elif name == "travel":
+            inputs.take_travel(found[0], found[1]["speed"])
+        else:
+            values = found[1]
+            inputs.take_pose(found[0], (values["x"], values.get("y", math.nan), values.get("theta", math.nan)))

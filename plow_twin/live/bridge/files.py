@@ -1,0 +1,209 @@
+"""CSV or JSON lines from files, read once or followed while they grow, and from standard input."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import select
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from plow_twin.live.bridge.source import BridgeError, Lines, Rows
+from plow_twin.record.mapping import TIMES, time_ns
+from plow_twin.record.sources import Arrived
+
+#: Most bytes read from a source at once.
+_BLOCK: Final = 1 << 18
+#: Most messages handed over at once.
+_BATCH: Final = 256
+#: A followed file is looked at that often [s].
+_LOOK_S: Final = 0.02
+STDIN_TOPIC: Final = "stdin"
+
+
+@dataclass
+class _Tail:
+    """One file, read as far as it goes; a file that was cut or replaced is read from its beginning again."""
+
+    path: Path
+    lines: Lines = field(default_factory=Lines)
+    rows: Rows = field(default_factory=Rows)
+    _file: Any = None
+    _inode: int = 0
+    #: read further, past a last line without newline
+    whole: bool = False
+
+    @property
+    def topic(self) -> str:
+        return self.path.stem
+
+    def read(self) -> list[Arrived]:
+        """Return the messages of the next block."""
+        data = self._block()
+        if not data and not self.whole:
+            return []
+        lines = self.lines.add(data) if data else self.lines.end()
+        return messages(self.topic, lines, self.rows)
+
+    def _block(self) -> bytes:
+        try:
+            found = os.stat(self.path)
+        except FileNotFoundError:
+            return b""
+        if self._file is None or found.st_ino != self._inode or found.st_size < self._file.tell():
+            rest = b"" if self._file is None or found.st_size < self._file.tell() else self._file.read(_BLOCK)
+            if rest:  # what the writer left in the one that was moved away
+                return bytes(rest)
+            self.close()
+            self._file, self._inode = self.path.open("rb"), found.st_ino
+            self.lines, self.rows = Lines(), Rows()
+        return bytes(self._file.read(_BLOCK))
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file = None
+
+
+def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]:
+    """Return the messages of whole lines, received now."""
+    now_ns = time.time_ns()
+    found = []
+    for line in lines:
+        content = rows.read(line)
+        if content is not False:
+            found.append(Arrived(topic, "csv", now_ns, content))
+    return found
+
+
+class Files:
+    """Files, each a topic under its name without ending.
+
+    Parameters
+    ----------
+    paths
+        The files; when they are read once, their messages are put in order by the times in them.
+    follow
+        Go on when the end is reached: what is appended later is read then.
+
+    Raises
+    ------
+    BridgeError
+        A file cannot be read.
+    """
+
+    def __init__(self, paths: list[Path], *, follow: bool) -> None:
+        self.ends = not follow
+        self.finished = False
+        self.connected = True
+        self.lost = 0
+        self._tails = [_Tail(path, whole=not follow) for path in paths]
+        for tail in self._tails:
+            if not tail.path.is_file():
+                raise BridgeError(f"{tail.path}: no such file")
+        self._merged: Iterator[Arrived] | None = None
+
+    def topics(self) -> dict[str, str]:
+        """Return columns by topic, by the first line of each file."""
+        found = {}
+        for tail in self._tails:
+            rows = Rows()
+            with tail.path.open("rb") as stream:
+                while rows.columns is None and (line := stream.readline(_BLOCK)):
+                    rows.read(line)
+            found[tail.topic] = "csv:" + ",".join(rows.columns or ())
+        return found
+
+    def start(self, topics: list[str]) -> None:
+        """Begin to read the files of these topics."""
+        self._tails = [tail for tail in self._tails if tail.topic in topics]
+        if self.ends:
+            streams = [_all(tail) for tail in self._tails]
+            self._merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=_InOrder())
+
+    def poll(self, timeout_s: float) -> list[Arrived]:
+        """Return the next messages."""
+        if self._merged is not None:
+            found = list(islice(self._merged, _BATCH))
+            self.finished = not found
+            return found
+        give_up = time.monotonic() + timeout_s
+        while True:
+            found = [arrived for tail in self._tails for arrived in tail.read()]
+            left_s = give_up - time.monotonic()
+            if found or left_s <= 0.0:
+                return found
+            time.sleep(min(_LOOK_S, left_s))
+
+    def close(self) -> None:
+        """Close the files."""
+        for tail in self._tails:
+            tail.close()
+
+
+def _all(tail: _Tail) -> Iterator[Arrived]:
+    """Yield all messages of a file that is read once."""
+    while True:
+        data = tail._block()
+        yield from messages(tail.topic, tail.lines.add(data) if data else tail.lines.end(), tail.rows)
+        if not data:
+            return
+
+
+class _InOrder:
+    """Key of a message by the time in it; one without a time stays where it is in its file."""
+
+    def __init__(self) -> None:
+        self._before: dict[str, int] = {}
+
+    def __call__(self, arrived: Arrived) -> int:
+        content = arrived.content or {}
+        name = next((name for name in TIMES if name in content), None)
+        stamp_ns = None if name is None else time_ns(content[name])
+        self._before[arrived.topic] = max(self._before.get(arrived.topic, 0), stamp_ns or 0)
+        return self._before[arrived.topic]
+
+
+class StandardInput:
+    """Lines on standard input, or on another descriptor; they end with it."""
+
+    def __init__(self, descriptor: int = 0) -> None:
+        self.ends = False
+        self.finished = False
+        self.connected = True
+        self.lost = 0
+        self._descriptor = descriptor
+        self._lines, self._rows = Lines(), Rows()
+        self._first: list[Arrived] = []
+
+    def topics(self) -> dict[str, str]:
+        """Wait for the first line, and return its columns."""
+        while self._rows.columns is None and not self.finished:
+            self._first += self._read(1.0)
+        return {STDIN_TOPIC: "csv:" + ",".join(self._rows.columns or ())}
+
+    def start(self, topics: list[str]) -> None:
+        """Take note of nothing: there is one topic."""
+
+    def poll(self, timeout_s: float) -> list[Arrived]:
+        """Return what has come."""
+        if self._first:
+            first, self._first = self._first, []
+            return first
+        return self._read(timeout_s)
+
+    def _read(self, timeout_s: float) -> list[Arrived]:
+        ready, _, _ = select.select([self._descriptor], [], [], timeout_s)
+        if not ready:
+            return []
+        data = os.read(self._descriptor, _BLOCK)
+        self.finished = not data
+        lines = self._lines.add(data) if data else self._lines.end()
+        return messages(STDIN_TOPIC, lines, self._rows)
+
+    def close(self) -> None:
+        """Leave the descriptor to its owner."""

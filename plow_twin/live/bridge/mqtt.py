@@ -1,0 +1,163 @@
+"""JSON payloads from an MQTT broker."""
+
+from __future__ import annotations
+
+import ssl
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from plow_twin.live.bridge.source import BridgeError, read_json
+from plow_twin.record.sources import Arrived
+
+#: Messages that wait to be read; what comes when so many wait is counted as lost.
+_QUEUE: Final = 100_000
+_PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
+
+
+@dataclass(frozen=True)
+class Access:
+    """How a broker is reached.
+
+    `url` is `mqtt://HOST:PORT`, or `mqtts://` with TLS; without a host it is this machine. `user` and `password` may be
+    empty. `ca`, `certificate` and `key` are PEM files; without `ca` those of the system are trusted. `plain` allows a
+    connection to another machine without TLS.
+    """
+
+    url: str
+    user: str = ""
+    password: str = ""
+    ca: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    plain: bool = False
+    client_id: str = "plow_twin"
+
+
+class Mqtt:
+    """A session with a broker that outlives a broken connection: what is sent meanwhile with QoS 1 comes later.
+
+    Parameters
+    ----------
+    access
+        The broker.
+    connect_s
+        Longest wait for its answer [s].
+
+    Raises
+    ------
+    BridgeError
+        The address cannot be used, or nobody answers there, or the broker refuses.
+    """
+
+    def __init__(self, access: Access, connect_s: float = 10.0) -> None:
+        self.ends = False
+        self.finished = False
+        self.connected = False
+        self.lost = 0
+        self._access, self._connect_s = access, connect_s
+        self.host, self.port, tls = _address(access)
+        self._topics: list[str] = []
+        self._queue: deque[tuple[str, bytes, int]] = deque()
+        self._arrived = threading.Event()
+        self._answer = threading.Event()
+        self._refusal = ""
+        self._client = self._make_client(tls)
+
+    def topics(self) -> None:
+        """Return None: any topic of the broker can be named."""
+        return
+
+    def start(self, topics: list[str]) -> None:
+        """Connect and subscribe."""
+        self._topics = topics
+        try:
+            self._client.connect(self.host, self.port)
+        except (OSError, ValueError) as error:
+            raise BridgeError(f"{self._access.url}: no broker at {self.host}:{self.port}: {error}") from error
+        self._client.loop_start()
+        if not self._answer.wait(self._connect_s) or self._refusal:
+            self.close()
+            raise BridgeError(f"{self._access.url}: {self._refusal or f'no answer within {self._connect_s:g} s'}")
+
+    def poll(self, timeout_s: float) -> list[Arrived]:
+        """Return what has arrived."""
+        if not self._queue:
+            self._arrived.wait(timeout_s)
+        self._arrived.clear()
+        taken = [self._queue.popleft() for _ in range(len(self._queue))]
+        return [Arrived(topic, "json", time_ns, read_json(payload)) for topic, payload, time_ns in taken]
+
+    def close(self) -> None:
+        """Leave the broker, which forgets nothing."""
+        self._client.disconnect()
+        self._client.loop_stop()
+
+    def _make_client(self, tls: bool) -> Any:
+        from paho.mqtt.client import Client, MQTTv311
+        from paho.mqtt.enums import CallbackAPIVersion
+
+        access = self._access
+        client = Client(CallbackAPIVersion.VERSION2, access.client_id, clean_session=False, protocol=MQTTv311)
+        client.reconnect_delay_set(1, 30)
+        if access.user:
+            client.username_pw_set(access.user, access.password or None)
+        if tls:
+            try:
+                ca, certificate, key = (
+                    None if path is None else str(path) for path in (access.ca, access.certificate, access.key)
+                )
+                client.tls_set(ca, certificate, key, cert_reqs=ssl.CERT_REQUIRED)
+            except (OSError, ValueError) as error:
+                raise BridgeError(f"{access.url}: the files of TLS cannot be used: {error}") from error
+        client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
+        client.on_message = self._on_message
+        return client
+
+    def _on_connect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
+        if reason.is_failure:
+            self._refusal = f"refused: {reason}"
+        else:
+            self.connected = True
+            client.subscribe([(topic, 1) for topic in self._topics])
+        self._answer.set()
+
+    def _on_disconnect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
+        self.connected = False
+
+    def _on_message(self, client: Any, data: Any, message: Any) -> None:
+        if len(self._queue) >= _QUEUE:
+            self.lost += 1
+            return
+        self._queue.append((message.topic, message.payload, time.time_ns()))
+        self._arrived.set()
+
+
+def _address(access: Access) -> tuple[str, int, bool]:
+    """Return host, port and whether TLS is used."""
+    expected = "mqtt://HOST:PORT or mqtts://HOST:PORT"
+    try:
+        parts = urlsplit(access.url)
+        host, port = parts.hostname or "localhost", parts.port or _PORTS[parts.scheme]
+    except (ValueError, KeyError) as error:
+        raise BridgeError(f"{access.url}: expected {expected}") from error
+    if parts.username or parts.password or parts.path.strip("/"):
+        raise BridgeError(f"{parts.scheme}://...{parts.path}: expected {expected}, user and topics stand elsewhere")
+    tls = parts.scheme == "mqtts"
+    if not tls and not access.plain and not _is_loopback(host):
+        raise BridgeError(f"{access.url}: got another machine without TLS, expected mqtts:// or this machine")
+    return host, port, tls
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False

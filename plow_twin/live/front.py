@@ -1,0 +1,173 @@
+"""The live twin without ROS: a bridge feeds it, and what it has to say goes to one function."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from plow_twin.live import diagnostics
+from plow_twin.live.bridge.feeder import Feeder
+from plow_twin.live.bridge.source import Bridge, BridgeError
+from plow_twin.live.parameters import Settings
+from plow_twin.live.part import Part
+from plow_twin.live.runtime import ESTIMATE, QUALITY, Runtime
+from plow_twin.live.solver_start import Prepared
+from plow_twin.record.mapping import Role, read_map
+from plow_twin.record.messages import DiagnosticStatus, JointState, Message
+from plow_twin.record.outputs import PUBLICATION_TOPICS
+
+NAME: Final = "/plow_twin"
+#: Longest wait for a message [s]: a request to stop is seen within it.
+_POLL_S: Final = 0.1
+_REPORT_S: Final = 1.0
+
+#: Receives `status`, `alarms` or a part of the diagnostics by name, with level, message and values.
+Say = Callable[[str, Part], None]
+
+
+class BridgeFront:
+    """A live twin fed by a bridge.
+
+    Parameters
+    ----------
+    bridge
+        Where samples come from.
+    mapping
+        YAML file of the mapping, or None: by what is there.
+    settings, prepared
+        As of `Runtime`.
+    say
+        Receives status and alarms on change, and the diagnostics once a second.
+    on_error
+        Receives errors in words; may be called from another thread.
+
+    Raises
+    ------
+    BridgeError
+        The source cannot be used, or the mapping gives no load.
+    RecordingError, WearStateError, OSError
+        The mapping, the recording or the saved wear cannot be used.
+    """
+
+    def __init__(
+        self,
+        bridge: Bridge,
+        mapping: Path | None,
+        settings: Settings,
+        prepared: Prepared,
+        say: Say,
+        on_error: Callable[[str], None],
+    ) -> None:
+        self.name = NAME
+        self.topics: Mapping[str, str] = {
+            topic: f"/{topic}" for topic in (*PUBLICATION_TOPICS, QUALITY, "status", "alarms", ESTIMATE)
+        }
+        self.follows_samples = bridge.ends
+        self._bridge, self._settings, self._say = bridge, settings, say
+        self.say_error = on_error
+        self._said: Part | None = None
+        self.roles = _roles(bridge, mapping, settings.excitation_source)
+        self.runtime = Runtime(self, settings, prepared)
+        self._feeder = Feeder(self.roles, self.runtime)
+        self._health = diagnostics.Health()
+
+    def now_ns(self) -> int:
+        """Return the system's time, or that of the samples where they bring their own [ns]."""
+        return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
+
+    def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:
+        """Send nothing: the recording holds the messages."""
+        forces_sent()
+
+    def publish_alarms(self, status: DiagnosticStatus) -> None:
+        """Say the alarms."""
+        self._say("alarms", (status.level, status.message, dict(status.values)))
+
+    def publish_estimate(self, message: JointState) -> None:
+        """Say an estimate."""
+        values = zip(message.name, message.position.tolist(), strict=True)
+        self._say(ESTIMATE, (0, "", {name: repr(value) for name, value in values}))
+
+    def changed(self) -> None:
+        """Say the status when it is another one."""
+        level, message, values = diagnostics.summary("active", "", self.runtime)
+        if (level, message, values) == self._said:
+            return
+        self._said = level, message, values
+        self._say("status", self._said)
+        head = self._settings.hardware_id
+        self.runtime.record_status(DiagnosticStatus(level, self.name, message, head, tuple(values.items())))
+
+    def run(self, stop_asked: Callable[[], bool], seconds: float = float("inf")) -> list[str]:
+        """Feed the twin until the source ends, a stop is asked for, or time is up; return what was lost, in words."""
+        runtime, bridge = self.runtime, self._bridge
+        lost: list[str] = []
+        try:
+            bridge.start([role.topic for role in self.roles.values()])
+            runtime.start()
+            runtime.activate()
+            self._loop(stop_asked, time.monotonic() + seconds)
+        finally:
+            bridge.close()
+            lost = runtime.close()
+        return lost
+
+    def parts(self) -> dict[str, Part]:
+        """Return the diagnostics by part."""
+        return self._health.parts("active", "", self.runtime, time.monotonic_ns())
+
+    def _loop(self, stop_asked: Callable[[], bool], give_up: float) -> None:
+        inputs, bridge = self.runtime.inputs, self._bridge
+        periodic = [_Timer(1.0 / rate, do) for rate, do in self.runtime.periodic()] + [_Timer(_REPORT_S, self._report)]
+        while not (stop_asked() or bridge.finished) and time.monotonic() < give_up:
+            next_due = min(timer.due for timer in periodic)
+            messages = bridge.poll(max(0.0, min(_POLL_S, next_due - time.monotonic())))
+            inputs.lost = bridge.lost
+            inputs.publishers |= dict.fromkeys(inputs.publishers.keys() & self.roles.keys(), int(bridge.connected))
+            if messages:
+                if not bridge.ends:
+                    inputs.waited(len(messages), (time.time_ns() - messages[0].log_time_ns) * 1e-9)
+                self._feeder.take(messages)
+            for timer in periodic:
+                timer.look()
+        if self._settings.publish_mode == "fixed_rate":
+            self.runtime.publish_due()
+        self.changed()
+
+    def _report(self) -> None:
+        self.changed()
+        for name, part in self.parts().items():
+            self._say(name, part)
+
+
+class _Timer:
+    """Something done at intervals of a steady clock; what is missed is left out."""
+
+    def __init__(self, period_s: float, do: Callable[[], None]) -> None:
+        self._period_s, self._do = period_s, do
+        self.due = time.monotonic() + period_s
+
+    def look(self) -> None:
+        now = time.monotonic()
+        if now >= self.due:
+            self.due += self._period_s * (1 + (now - self.due) // self._period_s)
+            self._do()
+
+
+def _roles(bridge: Bridge, mapping: Path | None, source: str) -> dict[str, Role]:
+    """Return the roles that the twin takes."""
+    if source == "tool_forces":
+        raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")
+    topics: Any = bridge.topics()
+    if topics is None and mapping is None:
+        raise BridgeError("mapping: got none, expected one that names the topics")
+    roles = {name: role for name, role in read_map(mapping, topics).items() if name in _TAKEN}
+    if source == "excitation" and "excitation" not in roles:
+        there = "; ".join(f"{topic} ({kind.partition(':')[2]})" for topic, kind in (topics or {}).items())
+        raise BridgeError(f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m")
+    return roles
+
+
+_TAKEN: Final = ("excitation", "travel", "head_pose")

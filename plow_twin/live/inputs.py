@@ -1,0 +1,143 @@
+"""What arrives on the inputs, whoever brings it: senders followed, messages counted, optional inputs checked."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+from numpy.typing import NDArray
+
+from plow_twin.stream.history import RecentStamps
+from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.limits import Limits
+from plow_twin.stream.senders import Senders
+
+#: The inputs, as topics are named.
+TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose")
+#: Another sender counts as there for so long after its last sample [ns].
+_OTHER_SENDER_NS: Final = 3_000_000_000
+#: An optional input that has been heard counts as silent after so long [ns].
+_SILENT_NS: Final = 10_000_000_000
+
+
+class Inputs:
+    """The inputs of a live twin, without their transport.
+
+    Parameters
+    ----------
+    intake
+        Where samples that go no further are counted.
+    on_travel
+        Receives stamp [ns] and speed along the face [m/s].
+    depth
+        Length of the queue of the excitation.
+    on_pose
+        Receives stamp [ns] and x, y [m], theta [rad] of measured poses, late ones up to `pose_span_s` too; None: only
+        the newest is kept.
+    """
+
+    def __init__(
+        self,
+        intake: Intake,
+        on_travel: Callable[[int, float], None],
+        depth: int,
+        on_pose: Callable[[int, tuple[float, float, float]], None] | None = None,
+        pose_span_s: float = 0.0,
+    ) -> None:
+        self._intake = intake
+        self._on_pose = on_pose
+        self._poses = None if on_pose is None else RecentStamps(pose_span_s)
+        self._on_travel = on_travel
+        self.depth = depth
+        #: whether samples are taken
+        self.active = False
+        #: senders of the selected source
+        self.senders = Senders()
+        #: called when it may be that the followed sender has gone
+        self.look_for_senders: Callable[[], None] = lambda: None
+        self._queue_peak = (0, 0.0)
+        self._heard_ns: dict[str, int] = {}
+        self._other_heard_ns = -_OTHER_SENDER_NS
+        #: messages that the transport reports as lost before they could be read
+        self.lost = 0
+        self.travel = Intake()
+        self.head_pose = Intake()
+        #: newest measured pose x, y [m], theta [rad]
+        self.measured: tuple[float, float, float] | None = None
+        self.refused_publishers = 0
+        #: senders that each input is connected to
+        self.publishers = dict.fromkeys(TOPICS, 0)
+
+    def set_limits(self, travel_m_s: float, pose_m: float) -> None:
+        """Set the largest speed along the face [m/s] and the largest displacement of the head [m] that are used."""
+        self.travel.limits = Limits((travel_m_s,), (math.inf,))
+        self.head_pose.limits = Limits((pose_m, pose_m, math.pi), (math.inf,) * 3)
+
+    @property
+    def other_sender(self) -> bool:
+        """Whether another sender than the one followed sends on the selected source."""
+        return time.monotonic_ns() - self._other_heard_ns < _OTHER_SENDER_NS
+
+    def silent(self) -> list[str]:
+        """Return the optional inputs that have been heard and are silent now."""
+        now_ns = time.monotonic_ns()
+        return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
+
+    def waited(self, messages: int, longest_s: float) -> None:
+        """Take note of how many messages waited in the queue, and how long the first of them [s]."""
+        self._queue_peak = (max(self._queue_peak[0], messages), max(self._queue_peak[1], longest_s))
+
+    def take_queue_peak(self) -> tuple[int, float]:
+        """Return the most messages that waited in the queue, and their longest wait [s], since the last call."""
+        peak, self._queue_peak = self._queue_peak, (0, 0.0)
+        return peak
+
+    def wanted(self, sender: bytes, number: int) -> bool:
+        """Take in that message `number` (from 1) of a sender has come; False, and counted, when it is not used."""
+        if not self.senders.hear(sender, number):
+            if not self.other_sender:
+                self.look_for_senders()
+            self._other_heard_ns = time.monotonic_ns()
+            return False
+        if not self.active:
+            self._intake.refuse(Verdict.INACTIVE)
+        return self.active
+
+    def take_travel(self, stamp_ns: int, speed_m_s: float) -> None:
+        """Take in a speed along the face."""
+        if self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used:
+            self._on_travel(stamp_ns, speed_m_s)
+
+    def take_pose(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
+        """Take in a measured pose: x, y [m], theta [rad]."""
+        verdict = self._judged("head_pose", self.head_pose, stamp_ns, pose, self._poses)
+        if not verdict.used:
+            return
+        if verdict is not Verdict.WORKED_IN:
+            self.measured = pose
+        if self._on_pose is not None and self._poses is not None:
+            if verdict.resets:
+                self._poses.clear()
+            self._poses.add(stamp_ns)
+            self._on_pose(stamp_ns, pose)
+
+    def _judged(
+        self, topic: str, intake: Intake, stamp_ns: int, values: tuple[float, ...], history: RecentStamps | None = None
+    ) -> Verdict:
+        if not self.active:
+            intake.refuse(Verdict.INACTIVE)
+            return Verdict.INACTIVE
+        verdict = intake.judge(stamp_ns, values, history=history)
+        if verdict.used:
+            self._heard_ns[topic] = time.monotonic_ns()
+        return verdict
+
+    def residual(self, q: NDArray[Any]) -> tuple[float, float, float] | None:
+        """Return model minus measured pose, or None without a measurement."""
+        if self.measured is None:
+            return None
+        x, y, theta = (float(model) - data for model, data in zip(q, self.measured, strict=True))
+        # a quaternion and its negative are the same turn
+        return x, y, math.remainder(theta, 2.0 * math.pi)

@@ -1,0 +1,146 @@
+"""The live twin on ROS 2: topics, timers and services around a runtime."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from types import MappingProxyType
+from typing import Any, Final
+
+from diagnostic_msgs.msg import DiagnosticStatus as RosDiagnosticStatus
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from sensor_msgs.msg import JointState as RosJointState
+from std_srvs.srv import Trigger
+
+from plow_twin.live.parameters import Settings
+from plow_twin.live.runtime import ESTIMATE, Runtime
+from plow_twin.live.solver_start import Prepared
+from plow_twin.record.messages import DiagnosticStatus, JointState, Message
+from plow_twin.ros.messages import JointStateWriter, ros_status
+from plow_twin.ros.publishers import TOPICS, OutputPublishers
+from plow_twin.ros.qos import LATCHED
+from plow_twin.ros.subscriptions import Subscriptions
+
+#: Services by name, each a method of the runtime.
+SERVICES: Final = ("reset", "switch_publisher", "set_wear", "acknowledge_alarms")
+
+
+class RosFront:
+    """Everything on the node that is made on configure and released on cleanup, with the runtime in its middle.
+
+    Parameters
+    ----------
+    node
+        The node.
+    settings
+        Its parameters.
+    changed
+        Called when the state of the stream may have changed.
+    prepared, kept_wear
+        As of `Runtime`.
+
+    Raises
+    ------
+    RecordingError, WearStateError, OSError
+        As `Runtime`.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        settings: Settings,
+        changed: Callable[[], None],
+        prepared: Prepared,
+        kept_wear: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
+    ) -> None:
+        self._node = node
+        self.name: str = node.get_fully_qualified_name()
+        self.topics: Mapping[str, str] = {
+            topic: node.resolve_topic_name(topic) for topic in (*TOPICS, "status", "alarms", ESTIMATE)
+        }
+        self.follows_samples: bool = node.get_parameter("use_sim_time").value
+        self.changed = changed
+        self._timers: list[Any] = []
+        self._lost: list[str] = []
+        with ExitStack() as made:
+            self._make(settings, prepared, kept_wear, made)
+            self._made = made.pop_all()
+
+    def _make(
+        self, settings: Settings, prepared: Prepared, kept_wear: Mapping[str, tuple[float, ...]], made: ExitStack
+    ) -> None:
+        """Make everything on the node; what is made is noted to be undone, on an error too."""
+        node = self._node
+        self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
+        made.callback(lambda: self._lost.extend(runtime.close()))
+        self._publishers = OutputPublishers(node)
+        made.callback(self._publishers.close)
+        self._alarms = node.create_publisher(RosDiagnosticStatus, "alarms", LATCHED)
+        made.callback(node.destroy_publisher, self._alarms)
+        self._estimates: Any = None
+        if settings.estimate:
+            self._estimates = node.create_publisher(RosJointState, ESTIMATE, LATCHED)
+            made.callback(node.destroy_publisher, self._estimates)
+        self.subscriptions = Subscriptions(node, runtime, self.changed)
+        made.callback(self.subscriptions.close)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        for rate_hz, callback in runtime.periodic():
+            # steady: steps of the system's clock and a paused /clock do not touch it
+            timer = node.create_timer(1.0 / rate_hz, callback, clock=steady)
+            timer.cancel()
+            self._timers.append(timer)
+            made.callback(node.destroy_timer, timer)
+        for name in SERVICES:
+            service = node.create_service(Trigger, f"~/{name}", _answer(getattr(runtime, name)))
+            made.callback(node.destroy_service, service)
+        runtime.start()
+
+    def now_ns(self) -> int:
+        """Return the node's time [ns]."""
+        return int(self._node.get_clock().now().nanoseconds)
+
+    def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:
+        """Publish the messages of a publication."""
+        self._publishers.publish(messages, forces_sent)
+
+    def publish_alarms(self, status: DiagnosticStatus) -> None:
+        """Publish the alarms."""
+        self._alarms.publish(ros_status(status))
+
+    def publish_estimate(self, message: JointState) -> None:
+        """Publish an estimate."""
+        self._estimates.publish(JointStateWriter(message).write(message))
+
+    def say_error(self, text: str) -> None:
+        """Log an error."""
+        self._node.get_logger().error(text)
+
+    def activate(self) -> None:
+        """Start taking samples."""
+        self.runtime.activate()
+        for timer in self._timers:
+            timer.reset()
+
+    def deactivate(self) -> None:
+        """Stop taking samples."""
+        self.runtime.deactivate()
+        for timer in self._timers:
+            timer.cancel()
+
+    def close(self) -> list[str]:
+        """Release everything, last things first; return what was lost, in words."""
+        self.deactivate()
+        self._made.close()
+        return self._lost
+
+
+def _answer(
+    do: Callable[[], tuple[bool, str]],
+) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+    def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = do()
+        return response
+
+    return answer

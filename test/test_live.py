@@ -1,0 +1,361 @@
+"""The live twin without ROS: files, standard input and MQTT end in the same session, counters and recording."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import paho.mqtt.client as paho
+import pytest
+from paho.mqtt.enums import CallbackAPIVersion
+from pwdlib import PasswordHash
+from record_support import PAPER_AMPLITUDE
+
+from plow_twin.cli.app import run as run_cli
+from plow_twin.errors import RecordingError
+from plow_twin.live import parameters
+from plow_twin.live.bridge.files import Files
+from plow_twin.live.bridge.mqtt import Access, Mqtt
+from plow_twin.live.bridge.source import BridgeError
+from plow_twin.live.front import BridgeFront
+from plow_twin.live.part import Part
+from plow_twin.live.solver_start import Preparation
+from plow_twin.record.mapping import read_map, time_ns
+from plow_twin.record.replay import replay
+from plow_twin.record.sources import Arrived
+
+ROOT = Path(__file__).resolve().parent.parent
+START_S = 200.0
+
+
+def _row(index: int) -> tuple[float, ...]:
+    phase = float(np.sin(2e-3 * index))
+    return (index * 1e-3, *(phase * amplitude for amplitude in PAPER_AMPLITUDE))
+
+
+def _csv(path: Path, count: int, more: str = "") -> Path:
+    rows = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(count))
+    path.write_text(f"t,fx,fy,m\n{rows}{more}", encoding="utf-8")
+    return path
+
+
+def _run(path: Path, mapping: Path | None = None, **values: Any) -> dict[str, Part]:
+    """Feed a twin from a file and return its diagnostics."""
+    settings = parameters.settings(values)
+    said: list[str] = []
+    prepared = Preparation(settings).result(lambda: False)
+    front = BridgeFront(
+        Files([path], follow=False), mapping, settings, prepared, lambda name, _: said.append(name), said.append
+    )
+    assert front.run(lambda: False) == []
+    return front.parts()
+
+
+def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(tmp_path: Path) -> None:
+    bad = "no numbers at all\n1.1,1e9,0,0\n1.2,nan,0,0\n1.3,1,2\n0.5,1,2,3\n1.4,true,0,0\n1.5,1_0,0,0\n"
+    bad += "x" * 70000 + "\n"
+    path = _csv(tmp_path / "load.csv", 1000, bad)
+    values = _run(path, record_path=str(tmp_path / "run"), alarm_force=[1e3, 1e9])["input"][2]
+    dropped = {key: count for key, count in values.items() if key.startswith("dropped_") and count != "0"}
+    assert (values["samples_in"], values["samples_used"]) == ("1008", "1000")
+    assert dropped == {
+        "dropped_malformed": "5",
+        "dropped_implausible": "1",
+        "dropped_non_finite": "1",
+        "dropped_duplicate": "1",
+    }
+    report = replay(tmp_path / "run")
+    assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
+    assert report.compared["contact_forces"] == 1000
+
+
+def test_the_senders_own_numbers_tell_loss_repetition_and_a_new_start(tmp_path: Path) -> None:
+    numbers = [*range(7, 100), 99, *range(110, 200), *range(1, 50), *range(52, 60)]
+    lines = [
+        json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
+    ]
+    path = tmp_path / "plough.csv"
+    path.write_text("\n".join([*lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text(
+        "excitation: {topic: plough, fields: {fx: 'load.f[0]', fy: 'load.f[1]', m: 'load.f[2]'}, sequence: n,\n"
+        "  stamp: time, stamp_unit: ms, unit: {fx: kN}, limits: {fx: [-1, 1e6]}}\n"
+    )
+    values = _run(path, mapping, limit_force=1e9, limit_force_rate=1e12)["input"][2]
+    # 10 between 99 and 110, 2 between 49 and 52
+    assert (values["samples_lost"], values["dropped_duplicate"], values["dropped_malformed"]) == ("12", "1", "1")
+    assert int(values["samples_used"]) == len(numbers) - 1
+
+
+def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: Path) -> None:
+    path = tmp_path / "map.yaml"
+
+    def read(text: str, **content: Any) -> tuple[int, dict[str, float]] | None:
+        path.write_text(text)
+        return read_map(path, None)["head_pose"].read(Arrived("p", "json", 5, content))
+
+    pose = "head_pose: {topic: p, fields: {x: a, y: b.c, theta: turn}, clock_offset: -0.5, "
+    pose += "unit: {x: mm, y: cm, theta: deg}, "
+    found = read(
+        pose + "offset: {x: 1}, scale: {x: 2}, stamp: at}", a=3, b={"c": 4}, turn=180, at="2026-01-02T03:04:05.25Z"
+    )
+    assert found is not None
+    assert found[1] == pytest.approx({"x": 7e-3, "y": 4e-2, "theta": np.pi})
+    assert found[0] == 1_767_323_044_750_000_000
+    assert read(pose + "stamp: at}", a="", b={"c": 4}, turn="x", at=1) is None
+    for wrong in (True, [1], {}, None, 10**400):
+        assert read(pose + "stamp: at}", a=wrong, b={"c": 4}, turn=1, at=1) is None
+    assert time_ns(1_767_323_045_123_456_789, "ns") == 1_767_323_045_123_456_789
+    assert time_ns(0.5) == 1_500_000_000  # counts from some start: 0 would be no stamp
+    assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
+    assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
+    for text, said in (
+        ("unit: {x: N}", "unit: got 'N', expected one of m, cm, mm, um"),
+        ("limits: {x: [2, 1]}", "limits"),
+        ("clock_offset: soon", "clock_offset: got 'soon'"),
+        ("stamp_unit: h", "stamp_unit: got 'h'"),
+        ("gain: 2", "got gain"),
+    ):
+        path.write_text(f"head_pose: {{topic: p, {text}}}")
+        with pytest.raises(RecordingError, match="head_pose") as caught:
+            read_map(path, None)
+        assert said in str(caught.value)
+
+
+class Live:
+    """`plow-twin live --lines` in a process of its own."""
+
+    def __init__(self, *arguments: str, **options: Any) -> None:
+        environment = os.environ | {"PYTHONPATH": str(ROOT), **options.pop("environment", {})}
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "plow_twin", "live", *arguments, "--lines"],
+            env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
+        )  # fmt: skip
+        self.heard: dict[str, dict[str, Any]] = {}
+
+    def until(self, reached: Callable[[dict[str, dict[str, Any]]], bool], what: str) -> dict[str, str]:
+        """Read what it says until something is true; return the values of its input part."""
+        give_up = time.monotonic() + START_S
+        assert self.process.stdout is not None
+        while not ("input" in self.heard and reached(self.heard)):
+            assert time.monotonic() < give_up, f"{what}: {self.heard}"
+            line = self.process.stdout.readline()
+            assert line, f"{what}: ended: {self.process.communicate()[1].decode()}; {self.heard}"
+            said = json.loads(line)
+            self.heard[said["topic"]] = said
+        return dict(self.heard["input"]["values"])
+
+    def until_count(self, key: str, count: int) -> dict[str, str]:
+        return self.until(lambda heard: int(heard["input"]["values"][key]) >= count, f"{count} {key}")
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGTERM)
+        self.process.communicate(timeout=60.0)
+        return self.process.returncode
+
+
+@contextmanager
+def _live(*arguments: str, **options: Any) -> Iterator[Live]:
+    live = Live(*arguments, **options)
+    try:
+        yield live
+    finally:
+        live.process.kill()
+        live.process.communicate()
+
+
+def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Path) -> None:
+    path, run = tmp_path / "load.csv", tmp_path / "run"
+    _csv(path, 100)
+    with _live(str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600") as live:
+        live.until_count("samples_used", 100)
+        text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
+        with path.open("a") as stream:
+            stream.write(text[:1234])  # in the middle of a number
+            stream.flush()
+            live.until_count("samples_used", 105)
+            stream.write(text[1234:])
+        live.until_count("samples_used", 200)
+        path.rename(tmp_path / "load.csv.1")
+        path.write_text("t,fx,fy,m\n" + "".join(",".join(map(repr, _row(index))) + "\n" for index in range(200, 300)))
+        values = live.until_count("samples_used", 300)
+        assert values["samples_in"] == "300"
+        assert live.stop() == 0
+    report = replay(run)
+    assert (report.samples, report.exit_code) == (300, 0)
+
+
+def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -> None:
+    arguments = ("-", "--record", str(tmp_path / "run"), "--set", "excitation_timeout=0.05")
+    with _live(*arguments, stdin=subprocess.PIPE) as live:
+        assert live.process.stdin is not None
+        for index in range(100):
+            t, fx, fy, m = _row(index)
+            live.process.stdin.write(json.dumps({"t": t, "fx": fx, "fy": fy, "m": m}).encode() + b"\n")
+        live.process.stdin.write(b'{"t": NaN}\n[1, 2]\n')
+        live.process.stdin.flush()
+        values = live.until(lambda heard: int(heard["input"]["values"]["holds"]) > 0, "a hold")
+        live.process.stdin.close()
+        assert (values["samples_used"], values["dropped_malformed"]) == ("100", "2")
+        live.process.stdin = None
+        live.process.communicate(timeout=60.0)
+        assert live.process.returncode == 3  # two lines were not used
+    report = replay(tmp_path / "run")
+    assert (report.samples, report.exit_code) == (100, 0)
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Access]:
+    """A broker with TLS and one user, whose messages it keeps while he is away."""
+    certificate, key = tmp_path / "broker.pem", tmp_path / "broker.key"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-keyout", str(key),
+         "-out", str(certificate)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    (tmp_path / "users").write_text(f"plough:{PasswordHash.recommended().hash('s3cret')}\n")
+    port = _free_port()
+    tls = {"ssl": True, "certfile": str(certificate), "keyfile": str(key)}
+    config = {
+        "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}", **tls}},
+        "plugins": {"amqtt.plugins.authentication.FileAuthPlugin": {"password_file": str(tmp_path / "users")}},
+    }
+    (tmp_path / "broker.yaml").write_text(json.dumps(config))
+    with (tmp_path / "broker.log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / "test" / "mqtt_broker.py"), str(tmp_path / "broker.yaml")],
+            stdout=subprocess.PIPE,
+            stderr=log,
+        )
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n", (tmp_path / "broker.log").read_text()
+        yield Access(f"mqtts://localhost:{port}", user="plough", password="s3cret", ca=certificate)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def _free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+class Sender:
+    """A telemetry box: numbered samples to the broker."""
+
+    def __init__(self, access: Access) -> None:
+        self.client = paho.Client(CallbackAPIVersion.VERSION2)
+        self.client.username_pw_set(access.user, access.password)
+        self.client.tls_set(str(access.ca))
+        self.client.connect("localhost", urlsplit(access.url).port or 0)
+        self.client.loop_start()
+        self.number = 0
+
+    def send(self, count: int) -> None:
+        for _ in range(count):
+            t, fx, fy, m = _row(self.number)
+            self.number += 1
+            payload = {"t": t, "force": {"x": fx / 1e3, "y": fy / 1e3}, "moment": m, "n": self.number}
+            self.raw(json.dumps(payload).encode())
+
+    def raw(self, payload: bytes) -> None:
+        self.client.publish("plough/load", payload, qos=1).wait_for_publish(30.0)
+
+    def close(self) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+MAP = """
+excitation: {topic: plough/load, fields: {fx: force.x, fy: force.y, m: moment}, unit: {fx: kN, fy: kN}, sequence: n}
+"""
+
+
+def test_a_broker_keeps_what_comes_while_the_twin_is_away_and_garbage_is_counted(
+    broker: Access, tmp_path: Path
+) -> None:
+    (tmp_path / "map.yaml").write_text(MAP)
+    (tmp_path / "password").write_text(broker.password + "\n")
+    arguments = (
+        *(broker.url, "--map", str(tmp_path / "map.yaml"), "--set", "excitation_timeout=3600"),
+        *("--user", broker.user, "--password-file", str(tmp_path / "password"), "--tls-ca", str(broker.ca)),
+    )
+    sender = Sender(broker)
+    with _live(*arguments) as live:
+        live.until(lambda heard: True, "a report")
+        sender.send(50)
+        for payload in (b"{nonsense", b"\xff\xfe", b"[" * 60000, b'{"n": 51}', b"x" * 100000):
+            sender.raw(payload)
+        values = live.until_count("samples_in", 55)
+        assert (values["samples_used"], values["dropped_malformed"]) == ("50", "5")
+        assert live.stop() == 3
+    sender.send(50)
+    with _live(*arguments) as live:
+        values = live.until_count("samples_used", 50)
+        assert values["samples_lost"] == "0"
+        assert live.stop() == 0
+    sender.close()
+
+
+# paho leaves the socket of a failed handshake to the collector
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_refused(broker: Access) -> None:
+    for wrong, said in (
+        ({"password": "guess"}, "refused"),
+        ({"ca": None}, "certificate verify failed"),
+        ({"url": broker.url.replace("mqtts", "mqtt")}, "no answer"),
+    ):
+        bridge = Mqtt(replace(broker, **wrong), connect_s=2.0)
+        with pytest.raises(BridgeError, match=said):
+            bridge.start(["plough/load"])
+        assert not bridge.connected
+
+
+@pytest.mark.parametrize(
+    "url", ["mqtt://plough.example:1883", "http://localhost", "mqtt://user:secret@localhost", "mqtt://localhost/topic"]
+)
+def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(url: str) -> None:
+    with pytest.raises(BridgeError) as caught:
+        Mqtt(Access(url))
+    assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["nowhere.csv"], 1, "no such file"),
+        (["load.csv", "--set", "excitation_timeot=1"], 2, "did you mean excitation_timeout"),
+        (["load.csv", "--set", "excitation_timeout=-1"], 2, "a number from 0.01"),
+        (["load.csv", "--set", "excitation_source=tool_forces"], 1, "expected 'excitation' or 'scene'"),
+        (["other.csv"], 1, "expected the columns fx, fy, m"),
+        (["mqtt://localhost:1"], 1, "expected one that names the topics"),
+    ],
+)
+def test_a_wrong_call_says_what_was_expected(
+    arguments: list[str],
+    code: int,
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _csv(tmp_path / "load.csv", 3)
+    (tmp_path / "other.csv").write_text("t,a,b\n1,2,3\n")
+    assert run_cli(["live", *arguments, "--quiet"]) == code
+    assert said in " ".join(capfd.readouterr().err.split())
