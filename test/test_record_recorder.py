@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import json
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,23 +14,29 @@ import textwrap
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
-from record_support import BASE_NS, STEP_NS
+from record_support import BASE_NS, STEP_NS, paper_sample
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
+from plow_twin.record.mcap_file import UnbufferedFile
 from plow_twin.record.messages import JointState
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
 from plow_twin.record.recorder import JOURNAL, Recorder
+from plow_twin.record.replay import replay
 from plow_twin.record.writer import RunWriter
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Loss, Sample, Snapshot
+from plow_twin.stream.session import Session
 
 HEADER = RunHeader("version: 1")
 TOPIC = "/contact_forces"
@@ -179,6 +187,99 @@ def test_little_free_space_ends_a_recording_that_can_be_read(tmp_path: Path) -> 
     assert reader.stop_reason is not None and reader.stop_reason in errors[0]
     bag = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert bag["custom_data"]["plow_twin_stopped_early"] == reader.stop_reason
+
+
+def record_around_a_pause(folder: Path, stop: Callable[[], object], go_on: Callable[[], object]) -> Recorder:
+    """Record a twin; let the disk fail half way and get well again."""
+    scene = load_scene(scene_path("paper"))
+    recorder = Recorder(folder, RunHeader(dump_scene(scene)), flush_period_s=0.02, min_free_bytes=1)
+    session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
+    session.start()
+
+    def go(begin: int, until: Callable[[], bool]) -> int:
+        deadline, index = time.monotonic() + 30, begin
+        while not until() and time.monotonic() < deadline:
+            session.apply(paper_sample(index))
+            publication = session.outputs.take()
+            assert publication is not None
+            recorder.publication(publication)
+            if recorder.snapshot_wanted:
+                recorder.journal(session.snapshot())
+            index += 1
+            time.sleep(0.0005)
+        assert until()
+        return index
+
+    index = go(0, lambda: recorder.counters.written > 500)
+    stop()
+    index = go(index, lambda: recorder.counters.error is not None)
+    index = go(index + 1, lambda: recorder.counters.lost.get("/contact_peaks", 0) > 50)
+    go_on()
+    index = go(index, lambda: recorder.counters.error is None and not recorder.snapshot_wanted)
+    written = recorder.counters.written
+    go(index, lambda: recorder.counters.written > written + 2000)
+    session.close()
+    return recorder
+
+
+@pytest.mark.parametrize("kind", ["little space", "no space"])
+def test_a_recording_goes_on_when_the_disk_has_room_again(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = threading.Event()
+    write, usage = UnbufferedFile.write, shutil.disk_usage
+
+    def write_half(file: UnbufferedFile, data: bytes) -> None:
+        write(file, data[: len(data) // 2] if full.is_set() else data)
+        if full.is_set():
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    if kind == "no space":
+        monkeypatch.setattr(UnbufferedFile, "write", write_half)
+    else:
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(path)._replace(free=0 if full.is_set() else 9))
+    loss = record_around_a_pause(tmp_path / "run", full.set, full.clear).close()
+    assert loss.closed and loss.error is None and loss.lost[JOURNAL] > 50
+    report = replay(tmp_path / "run")
+    assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.COMPLETE, 0)
+    assert report.lost[JOURNAL] == loss.lost[JOURNAL] and report.compared["contact_peaks"] > 500
+
+
+def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(tmp_path: Path) -> None:
+    scene = load_scene(scene_path("paper"))
+    folder = tmp_path / "runs" / "ring"
+    recorder = Recorder(folder, RunHeader(dump_scene(scene)), flush_period_s=0.01, ring_s=0.4)
+    session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
+    session.start()
+    marked: list[Path | None] = []
+    index = 0
+    for marks in (0, 1, 2):
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end or recorder.counters.marks < marks:
+            session.apply(paper_sample(index))
+            publication = session.outputs.take()
+            assert publication is not None
+            recorder.publication(publication)
+            if recorder.snapshot_wanted:
+                recorder.journal(session.renew())
+            index += 1
+            time.sleep(0.001)
+        assert folder.exists() == (marks > 0)
+        if marks < 2:
+            marked.append(recorder.mark())
+            assert recorder.mark() == marked[-1]
+    loss = recorder.close()
+    assert loss.complete and marked == [folder, folder.with_name("ring_2")]
+    for path in (folder, folder.with_name("ring_2")):
+        report = replay(path)
+        assert (report.exit_code, report.divergences) == (0, 0) and report.digests_compared
+        assert 0.1 < report.span_s < 0.7 * index * 1e-3
+    # what lies between the two is in neither, or in one
+    stamps = [
+        {int(stamp) for batch in RunReader(path).batches() for stamp in batch.entries.stamp_ns[batch.entries.sample]}
+        for path in (folder, folder.with_name("ring_2"))
+    ]
+    assert stamps[0].isdisjoint(stamps[1])
 
 
 def test_what_callers_lose_while_the_file_is_closed_does_not_disturb_it(

@@ -18,6 +18,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from plow_twin.errors import RecordingError
+from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
@@ -110,6 +111,7 @@ def test_a_bag_shows_bias_and_lag_of_the_sensor_and_becomes_a_run(
     found = analyse(bag, scene=PAPER, mapping=tmp_path / "map.yaml", out=tmp_path / "out")
     check(found)
     assert found.input == {"samples_in": COUNT, "samples_used": COUNT} and not found.lossy
+    assert RunReader(tmp_path / "out" / "run").duration_s() == pytest.approx(COUNT * 1e-3, abs=0.01)
     report = replay(tmp_path / "out" / "run")
     assert (report.exit_code, report.samples, report.digests_compared) == (0, COUNT, COUNT // 100 + 1)
     assert report.compared["contact_forces"] == COUNT

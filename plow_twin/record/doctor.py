@@ -16,7 +16,7 @@ from plow_twin.record.cdr import type_hash
 from plow_twin.record.chunks import ChunkReader, Messages
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
 from plow_twin.record.journal_codec import Dropped
-from plow_twin.record.mcap_file import ChunkBuilder, McapFile
+from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
 from plow_twin.record.reader import FileStatus, RunReader
@@ -193,7 +193,7 @@ def _rewrite(part: Path) -> None:
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)
     loss: dict[str, str] = {}
-    file = McapFile(target, "plow_twin doctor")
+    file = McapFile(UnbufferedFile(target), "plow_twin doctor")
 
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:

@@ -18,7 +18,7 @@ from plow_twin.record.mapping import Role
 from plow_twin.record.sources import Arrived
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Digest, Entry, Reset, Travel
+from plow_twin.stream.journal import Digest, Entry, Reset, Snapshot, Travel
 from plow_twin.stream.outputs import Publications
 from plow_twin.stream.session import DIGEST_INTERVAL, Session
 
@@ -70,10 +70,18 @@ class Walker:
         #: called after each reset
         self.on_reset: Callable[[], object] = lambda: None
         self.speed_m_s = 0.0
-        if writer is not None:
-            self._entry(session.snapshot())
+        self._opening: Snapshot | None = session.snapshot()
+
+    def _open(self, log_time_ns: int) -> None:
+        """Begin the journal with the state at the start, received with what comes first."""
+        opening, self._opening = self._opening, None
+        if opening is not None:
+            self._sequence += 1
+            if self._writer is not None:
+                self._writer.write_entry(self._sequence, log_time_ns, opening)
 
     def _entry(self, entry: Entry) -> None:
+        self._open(self._log_time_ns)
         self._sequence += 1
         if self._writer is not None:
             self._writer.write_entry(self._sequence, self._log_time_ns, entry)
@@ -119,6 +127,7 @@ class Walker:
         good: NDArray[np.int64],
     ) -> None:
         assert self._writer is not None
+        self._open(int(log_ns[0]))
         sequence = (
             self._sequence + 1 + np.arange(len(stamp_ns)) + np.searchsorted(marks, np.arange(len(stamp_ns)), "right")
         )

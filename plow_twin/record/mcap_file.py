@@ -11,7 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -68,6 +68,10 @@ class ChunkBuilder:
             self._buffer = larger
         return place
 
+    def clear(self) -> None:
+        """Forget what has been laid in."""
+        self.size, self._channels, self._times, self._offsets = 0, [], [], []
+
     def _note(self, channel: Indexes, time_ns: Indexes, offset: Indexes) -> None:
         self._channels.append(channel)
         self._times.append(time_ns)
@@ -84,7 +88,7 @@ class ChunkBuilder:
             entries["time"], entries["offset"] = times[chosen], offsets[chosen]
             index[channel] = entries
         content = self._buffer[: self.size]
-        self.size, self._channels, self._times, self._offsets = 0, [], [], []
+        self.clear()
         return content, index
 
 
@@ -104,16 +108,39 @@ def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  #
             head[11 + i] = (sequence[n] >> (8 * i)) & 0xFF
 
 
+class ByteFile(Protocol):
+    """Where a recording's bytes go: a file, or memory."""
+
+    def write(self, data: bytes) -> None:
+        """Write all of it."""
+
+    def tell(self) -> int:
+        """Return the bytes written so far."""
+
+    def truncate(self, size: int) -> None:
+        """Go back to a size."""
+
+    def sync(self) -> None:
+        """Wait for the disk."""
+
+    def is_linked(self) -> bool:
+        """Tell whether the path still leads to this file."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
 class McapFile:
     """An MCAP file that is being written.
 
-    Every method may raise `OSError` (disk full); after that only `close` may be called.
+    Every method may raise `OSError` (disk full). What `chunk` had begun to write is taken back then, and its messages
+    are lost; after any other method only `close` may be called.
     """
 
-    def __init__(self, path: Path, library: str) -> None:
+    def __init__(self, out: ByteFile, library: str) -> None:
         from mcap.records import Header
 
-        self._file = UnbufferedFile(path)
+        self.out = self._file = out
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
@@ -177,18 +204,25 @@ class McapFile:
 
     def chunk(self, builder: ChunkBuilder) -> None:
         """Write a chunk and its index; an empty one is left out."""
-        from mcap.records import ChunkIndex
-
         if not builder.size:
             return
+        content, index = builder.take()
+        whole = self.size
+        try:
+            self._chunk(builder.compression, content, index)
+        except OSError:
+            self._file.truncate(whole)
+            raise
+
+    def _chunk(self, compression: str, content: Bytes, index: dict[int, Any]) -> None:
+        from mcap.records import ChunkIndex
+
         for record in self._undeclared:
             self._write(record)
-        self._undeclared = []
-        content, index = builder.take()
         first = min(int(entries["time"][0]) for entries in index.values())
         last = max(int(entries["time"][-1]) for entries in index.values())
-        name = builder.compression.encode()
-        data = _compress(builder.compression, content)
+        name = compression.encode()
+        data = _compress(compression, content)
         start = self.size
         crc = crc32(content)
         head = struct.pack("<QQQII", first, last, len(content), crc, len(name)) + name + struct.pack("<Q", len(data))
@@ -199,8 +233,10 @@ class McapFile:
             raw = entries.tobytes()
             parts.append(struct.pack("<BQHI", 7, 6 + len(raw), channel, len(raw)) + raw)
             place += len(parts[-1])
-            self._counts[channel] += len(entries)
         self._file.write(b"".join(parts))  # with its index in one go
+        self._undeclared = []
+        for channel, entries in index.items():
+            self._counts[channel] += len(entries)
         self._times += [first, last]
         if len(self._times) > 64:
             self._times = [min(self._times), max(self._times)]
@@ -208,7 +244,7 @@ class McapFile:
             ChunkIndex(
                 chunk_length=len(record),
                 chunk_start_offset=start,
-                compression=builder.compression,
+                compression=compression,
                 compressed_size=len(data),
                 message_end_time=last,
                 message_index_length=place - start - len(record),
@@ -313,6 +349,12 @@ class UnbufferedFile:
     def tell(self) -> int:
         """Return the bytes written so far."""
         return self._offset
+
+    def truncate(self, size: int) -> None:
+        """Go back to a size."""
+        os.ftruncate(self._descriptor, size)
+        os.lseek(self._descriptor, size, os.SEEK_SET)
+        self._offset = size
 
     def sync(self) -> None:
         """Wait for the disk."""

@@ -8,6 +8,7 @@ what does not fit in the queue is dropped, counted by topic, and noted in the fi
 from __future__ import annotations
 
 import atexit
+import errno
 import threading
 import time
 from collections import Counter, deque
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 
+from plow_twin.errors import RecordingError
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
@@ -27,12 +29,15 @@ from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
 from plow_twin.stream.outputs import Publication, Publications
 
 if TYPE_CHECKING:
+    from plow_twin.record.ring import RingWriter
     from plow_twin.record.writer import RunWriter
 
 #: Key of the journal in the loss counters.
 JOURNAL: Final = "journal"
 #: The thread looks at the queue that often [s].
 _POLL_S: Final = 0.05
+#: Errors of a disk that is full: it may have room again.
+_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 #: So many items are put together in one go, some 0.2 ms of Python; then the thread sleeps, so that a caller that waits
 #: for the interpreter gets it. Releasing it without sleep does not do: the thread would take it back at once.
 _BURST: Final = 64
@@ -40,13 +45,17 @@ _BURST: Final = 64
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """How a recorder is doing. `lost` counts by topic what did not reach the file; its journal is under `journal`."""
+    """How a recorder is doing. `lost` counts by topic what did not reach the file; its journal is under `journal`.
+
+    `error` says why it has stopped; it is None again when it goes on. `marks` counts the rings that were written.
+    """
 
     written: int
     queued: int
     bytes_written: int
     lost: Mapping[str, int]
     error: str | None
+    marks: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,11 +88,13 @@ class Recorder:
     chunk_size
         Bytes [B] in one compressed chunk.
     min_free_bytes
-        Recording stops when the disk has less free space [B].
+        Recording stops when the disk has less free space [B], and goes on when it has it again.
     part_bytes, part_s
         A part of the recording is ended when it has that size [B] or spans that time [s]; 0: never.
     keep_bytes
         The oldest parts are removed when the ended ones are larger together [B]; 0: all are kept.
+    ring_s
+        Nothing is written but the last so many seconds, kept in memory, at each `mark` [s]; 0: everything is written.
     sync
         Whether each flush waits for the disk (`fdatasync`): for a loss of power.
     now_ns
@@ -109,6 +120,7 @@ class Recorder:
         part_bytes: int = 0,
         part_s: float = 0.0,
         keep_bytes: int = 0,
+        ring_s: float = 0.0,
         sync: bool = False,
         now_ns: Callable[[], int] = time.time_ns,
         on_error: Callable[[str], None] | None = None,
@@ -116,8 +128,17 @@ class Recorder:
         from plow_twin.record.writer import RunWriter, warm_up_writer
 
         warm_up_writer(header)
-        self._writer = RunWriter(Path(path), header, chunk_size, min_free_bytes, sync=sync)
+        self._folder = Path(path)
+        self._ring: RingWriter | None = None
+        if ring_s:
+            from plow_twin.record.ring import PARTS, RingWriter
+
+            self._ring = RingWriter(self._folder, header, chunk_size, min_free_bytes, ring_s)
+            part_bytes, part_s, keep_bytes = 0, ring_s / PARTS, 0
+        self._writer = self._ring or RunWriter(self._folder, header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
+        self._mark: Path | None = None  # where the ring is to be written
+        self._marks = 0
         self._publication_topics = {name: header.topic(name) for name in PUBLICATION_TOPICS}
         self._limits = (part_bytes, part_s, keep_bytes)
         self._split_due = False
@@ -136,6 +157,7 @@ class Recorder:
         self._unflushed: Counter[str] = Counter()  # written, but not yet safe
         self._written = 0
         self._error: str | None = None
+        self._paused: str | None = None  # why nothing is taken in just now
         self._closed = False
         self._accepting = True
         self._stopping = threading.Event()
@@ -147,14 +169,30 @@ class Recorder:
     def snapshot_wanted(self) -> bool:
         """Something was lost and there is room again, or a part ends: journal a `Snapshot` now to go on from."""
         due = self._snapshot_due or self._split_due
-        return due and self._accepting and len(self._queue) < self._queue_size // 2
+        return due and self._accepting and not self._paused and len(self._queue) < self._queue_size // 2
 
     @property
     def counters(self) -> RecorderCounters:
         """Counters as of now."""
         with self._lock:
             lost = dict(self._lost)
-        return RecorderCounters(self._written, len(self._queue), self._writer.bytes_written, lost, self._error)
+            error = self._error
+        return RecorderCounters(self._written, len(self._queue), self._writer.bytes_written, lost, error, self._marks)
+
+    def mark(self) -> Path | None:
+        """Have the ring written, once the next `Snapshot` is journalled or the recorder closed.
+
+        Returns the folder that it goes to, or None: without a ring everything is written anyway. Marks before it has
+        been written are one.
+        """
+        from plow_twin.record.writer import free_folder
+
+        if self._ring is None:
+            return None
+        with self._lock:
+            if self._mark is None:
+                self._mark, self._split_due = free_folder(self._folder), True
+            return self._mark
 
     def journal(self, entry: Entry) -> bool:
         """Take a journal entry; False when it was lost.
@@ -164,10 +202,14 @@ class Recorder:
         now = self._now_ns()
         with self._lock:
             snapshot = isinstance(entry, Snapshot)
-            if (self._journal_gap == 0 or snapshot) and self._room(2 if self._journal_gap else 1, self._queue_size):
+            notes = len(self._output_gaps) if snapshot else 0
+            room = self._room(notes + (2 if self._journal_gap else 1), self._queue_size)
+            if (self._journal_gap == 0 or snapshot) and room:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
+                if snapshot:  # what was lost is told before it: all that follows can be compared
+                    self._push_notes(now)
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot
                 self._split_due = self._split_due and not snapshot
@@ -217,11 +259,16 @@ class Recorder:
             return False
 
     def _room(self, items: int, limit: int) -> bool:
-        return self._accepting and len(self._queue) + items <= limit
+        return self._accepting and not self._paused and len(self._queue) + items <= limit
 
     def _push_entry(self, now: int, entry: Entry | Dropped) -> None:
         self._sequence += 1
         self._queue.append(_EntryItem(self._sequence, now, entry))
+
+    def _push_notes(self, now: int) -> None:
+        for topic, count in self._output_gaps.items():
+            self._push_entry(now, Dropped(topic, count))
+        self._output_gaps.clear()
 
     def close(self, timeout_s: float = 5.0) -> LossReport:
         """Write what is queued, close the file and say what was lost; waits at most `timeout_s` [s].
@@ -233,8 +280,7 @@ class Recorder:
             if self._accepting:
                 now = self._now_ns()
                 self._accepting = False
-                for topic, count in self._output_gaps.items():
-                    self._push_entry(now, Dropped(topic, count))
+                self._push_notes(now)
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
         self._stopping.set()
@@ -260,15 +306,22 @@ class Recorder:
             stopping = False
             while not stopping and reason is None:
                 stopping = self._stopping.wait(_POLL_S)
-                self._drain()
-                if time.monotonic() >= next_flush:
-                    reason = self._flush()
-                    next_flush = time.monotonic() + self._flush_period_s
+                try:
+                    self._drain()
+                    if time.monotonic() >= next_flush:
+                        reason = self._flush()
+                        next_flush = time.monotonic() + self._flush_period_s
+                except OSError as error:
+                    if error.errno not in _FULL:
+                        raise
+                    self._pause(error.strerror or str(error))
             if reason is not None:
                 self._give_up(reason)
+            if self._mark is not None:
+                self._split()
             with self._lock:  # callers go on counting what they lose
                 lost = dict(self._lost)
-            self._writer.close(lost, reason)
+            self._writer.close(lost, reason or self._paused)
             self._closed = True
         except Exception as error:  # whatever it is: the twin goes on without its recorder
             self._give_up(str(error), self._unflushed)
@@ -296,7 +349,7 @@ class Recorder:
                 samples.append(item)
             elif isinstance(item, _EntryItem):
                 samples = self._write_samples(samples)
-                if isinstance(item.entry, Snapshot) and self._part_is_full():
+                if isinstance(item.entry, Snapshot) and (self._mark is not None or self._part_is_full()):
                     publications = self._write_publications(publications)
                     self._split()
                 item.write(self._writer)
@@ -334,19 +387,52 @@ class Recorder:
             lost = dict(self._lost)
         self._writer.split(lost, self._limits[2])
         self._part_since = time.monotonic()
+        if self._ring is not None and self._mark is not None:
+            try:
+                self._ring.dump(self._mark, lost)
+                self._marks += 1
+            except (OSError, RecordingError) as error:  # the ring goes on
+                if self._on_error is not None:
+                    self._on_error(f"{self._mark}: not written: {error}")
+            self._mark = None
 
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
         if self._part_is_full():
             self._split_due = True
+        shortage = self._writer.shortage()
+        if shortage is not None and not self._paused:
+            self._pause(shortage)
+        elif shortage is None and self._paused:
+            with self._lock:
+                self._paused = self._error = None
         return self._writer.reason_to_stop()
+
+    def _pause(self, reason: str) -> None:
+        """Take nothing in until the disk has room again; what is queued or not yet safe is lost."""
+        with self._lock:
+            first = not self._paused
+            self._paused = reason
+            self._error = f"{self.path}: recording stopped: {reason}"
+            unwritten, self._queue = self._queue, deque()
+            lost = Counter(self._unflushed)
+            for item in unwritten:
+                lost.update(item.keys(self._publication_topics))
+            self._lost.update(lost)
+            self._journal_gap += lost.pop(JOURNAL, 0)
+            self._output_gaps.update(lost)
+            self._snapshot_due = True
+            error = self._error
+        self._unflushed.clear()
+        if first and self._on_error is not None:
+            self._on_error(error)
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
         """Stop taking in, count as lost what is queued and what is `unsafe`, by topic, and say so once."""
         first = self._error is None
         with self._lock:
-            self._accepting = False
+            self._accepting, self._paused = False, None
             self._error = self._error or f"{self.path}: recording stopped: {reason}"
             unwritten, self._queue = self._queue, deque()
             self._lost.update(unsafe)

@@ -16,7 +16,7 @@ from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
 from plow_twin.record.chunks import MESSAGE_HEAD
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, to_message
-from plow_twin.record.mcap_file import ChunkBuilder, McapFile
+from plow_twin.record.mcap_file import ByteFile, ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import Message, WrenchStamped
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
 from plow_twin.record.outputs import SLOW_TOPICS, head_numbers, publication_numbers, publication_templates
@@ -48,7 +48,8 @@ class RunWriter:
     """Write entries and outputs in the order given.
 
     The journal and the outputs stand in chunks of their own, a chunk of the journal before that of what was sent after
-    its entries. Every method may raise `OSError` (disk full); after that only `abandon` may be called.
+    its entries. Every method may raise `OSError` (disk full). After a `flush` or a write that did, the file is whole up
+    to what was flushed before and can be written on; after any other method only `abandon` may be called.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ class RunWriter:
     chunk_size
         Bytes [B] of journal and outputs at which their chunks are closed.
     min_free_bytes
-        `reason_to_stop` speaks up when the disk has less free space [B] than that.
+        `shortage` speaks up when the disk has less free space [B] than that.
     sync
         Whether each flush also asks the disk.
     """
@@ -77,13 +78,19 @@ class RunWriter:
         self._done: list[PartFacts] = []
         self._bytes_before = 0
         warm_up()
-        _make_folder(folder)
+        self._prepare(folder)
         self._number = 0
         self._part = self._open()
 
+    def _prepare(self, folder: Path) -> None:
+        make_folder(folder)
+
+    def _make(self, path: Path) -> ByteFile:
+        return UnbufferedFile(path)
+
     def _open(self) -> _Part:
         path = self.folder / f"{self.folder.name}_{self._number}.mcap"
-        file = McapFile(path, f"plow_twin {self.header.package_version}")
+        file = McapFile(self._make(path), f"plow_twin {self.header.package_version}")
         file.metadata(HEADER_RECORD, {**self.header.to_record(), "part": str(self._number)})
         return _Part(path, file)
 
@@ -170,8 +177,12 @@ class RunWriter:
             self._close_chunks()
 
     def _close_chunks(self) -> None:
-        self._part.file.chunk(self._journal)
-        self._part.file.chunk(self._outputs)
+        try:
+            self._part.file.chunk(self._journal)
+            self._part.file.chunk(self._outputs)
+        except OSError:
+            self._outputs.clear()  # without the journal's chunk they are of no use
+            raise
 
     def flush(self) -> None:
         """Hand all that was written to the operating system; a killed process loses nothing of it."""
@@ -180,10 +191,17 @@ class RunWriter:
             self._part.file.sync()
 
     def reason_to_stop(self) -> str | None:
-        """Return why recording should end now, while the file can still be closed: little disk space, or file gone."""
+        """Return why recording should end now for good: its file is gone."""
         if not self._part.file.is_linked():
             return "the file was removed or replaced"
-        free = shutil.disk_usage(self.folder).free
+        return None
+
+    def shortage(self) -> str | None:
+        """Return what is wrong with the space on the disk, if anything: the end of the file must have room, too."""
+        return self._shortage(self.folder)
+
+    def _shortage(self, folder: Path) -> str | None:
+        free = shutil.disk_usage(folder).free
         if free < self._min_free_bytes:
             return f"{free} B free on the disk, expected at least {self._min_free_bytes} B"
         return None
@@ -230,6 +248,15 @@ class RunWriter:
         self._part.file.close()
 
 
+def free_folder(folder: Path) -> Path:
+    """Return the folder, or the first of `<folder>_2`, `<folder>_3`, ... when it holds something already."""
+    path, number = folder, 1
+    while path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        number += 1
+        path = folder.with_name(f"{folder.name}_{number}")
+    return path
+
+
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size
@@ -237,7 +264,14 @@ def _size(path: Path) -> int:
         return 0
 
 
-def _make_folder(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
+    """Make a folder for a recording.
+
+    Raises
+    ------
+    RecordingError
+        It holds something already, or cannot be made.
+    """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RecordingError(f"{folder}: exists already, expected a new or empty folder for the recording")
     try:

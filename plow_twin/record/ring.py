@@ -1,0 +1,114 @@
+"""The newest seconds of a run, kept in memory as whole parts of a recording and written to a folder when asked."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.header import RunHeader
+from plow_twin.record.mcap_file import ByteFile
+from plow_twin.record.metadata_yaml import PartFacts, bag_metadata, write_metadata
+from plow_twin.record.writer import RunWriter, make_folder
+
+#: The ring is dropped in such shares.
+PARTS: Final = 8
+
+
+class RingWriter(RunWriter):
+    """A recording in memory of which the oldest parts are dropped.
+
+    Parameters
+    ----------
+    folder
+        Names the recording; nothing is made there.
+    ring_s
+        Time that is kept at least, once it has passed [s]; up to an eighth more.
+    """
+
+    def __init__(self, folder: Path, header: RunHeader, chunk_size: int, min_free_bytes: int, ring_s: float) -> None:
+        self._ring_s = ring_s
+        self._kept: list[tuple[float, PartFacts, bytes]] = []  # when each began, and what it holds
+        self._begun = time.monotonic()
+        super().__init__(folder, header, chunk_size, min_free_bytes)
+        self.path = folder
+
+    def _make(self, path: Path) -> ByteFile:
+        return MemoryFile()
+
+    def _prepare(self, folder: Path) -> None:
+        """Make nothing."""
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of what is kept [B]."""
+        return sum(len(content) for _, _, content in self._kept) + self.part_bytes
+
+    def shortage(self) -> str | None:
+        """Return None: memory does not fill up."""
+        return None
+
+    def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
+        """Go on in a new part, and drop what is older than the ring is long."""
+        old = self._part
+        super().split(loss, 0)
+        assert isinstance(old.file.out, MemoryFile)
+        self._kept.append((self._begun, self._done.pop(), bytes(old.file.out.content)))
+        self._bytes_before, self._begun = 0, time.monotonic()
+        while len(self._kept) > 1 and self._kept[1][0] <= self._begun - self._ring_s:
+            self._kept.pop(0)
+
+    def dump(self, folder: Path, loss: Mapping[str, int]) -> None:
+        """Write all parts that have ended to a new folder, and forget them.
+
+        Raises
+        ------
+        OSError, RecordingError
+            It could not be written; the ring is as it was.
+        """
+        make_folder(folder)
+        shortage = self._shortage(folder)
+        if shortage is not None:
+            raise RecordingError(shortage)
+        facts = []
+        for _, part, content in self._kept:
+            name = f"{folder.name}_{part.name.rpartition('_')[2]}"
+            (folder / name).write_bytes(content)
+            facts.append(PartFacts(name, part.start_ns, part.end_ns, part.topics))
+        write_metadata(folder, bag_metadata(facts, {f"plow_twin_lost {topic}": str(n) for topic, n in loss.items()}))
+        self._kept = []
+
+    def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
+        """Let go what is kept."""
+        self._kept = []
+
+
+class MemoryFile:
+    """A file that is never written to a disk."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+
+    def write(self, data: bytes) -> None:
+        """Write all of it."""
+        self.content += data
+
+    def tell(self) -> int:
+        """Return the bytes written so far."""
+        return len(self.content)
+
+    def truncate(self, size: int) -> None:
+        """Go back to a size."""
+        del self.content[size:]
+
+    def sync(self) -> None:
+        """Do nothing."""
+
+    def is_linked(self) -> bool:
+        """Return True."""
+        return True
+
+    def close(self) -> None:
+        """Do nothing."""
