@@ -193,8 +193,9 @@ def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for
         assert stamp_ns(forces[-1].header) == T0 + 41 * MS
 
 
-def test_a_force_above_its_threshold_is_an_alarm_until_it_is_acknowledged(tmp_path: Path) -> None:
-    with bench(tmp_path, excitation_timeout=60.0, alarm_force="[1.0, 1e9]", **RELIABLE_INPUT) as running:
+def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(tmp_path: Path) -> None:
+    ring = {"record_path": tmp_path / "run", "record_ring": 60.0}
+    with bench(tmp_path, excitation_timeout=60.0, alarm_force="[1.0, 1e9]", **ring, **RELIABLE_INPUT) as running:
         probe = running.probe
         latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         alarms: list[DiagnosticStatus] = []
@@ -210,6 +211,15 @@ def test_a_force_above_its_threshold_is_an_alarm_until_it_is_acknowledged(tmp_pa
         answer = probe.call(Trigger, f"{running.namespace}/plow_twin/acknowledge_alarms", Trigger.Request())
         assert answer.success
         probe.until(lambda: len(alarms) > 1, "what is left")
+        answer = probe.call(Trigger, f"{running.namespace}/plow_twin/mark", Trigger.Request())
+        assert answer.success and str(tmp_path / "run_2") in answer.message
+        probe.until_figure("recorder", "marks", "2")
+    before, after = replay(tmp_path / "run"), replay(tmp_path / "run_2")
+    assert (before.exit_code, after.exit_code) == (0, 0)
+    # at the alarm and not at the end; what follows it lies in the second one
+    assert 0 < before.samples < 600 and before.samples + after.samples == 601
+    kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
+    assert kinds.count("Parameter") == 2  # the acknowledgement and the mark
 
 
 def test_a_publisher_that_comes_after_the_followed_one_has_gone_is_followed(tmp_path: Path) -> None:

@@ -92,6 +92,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "written": "items in the file",
         "queued": "items waiting for the recorder's thread",
         "lost": "items lost, by topic",
+        "marks": "rings of the last seconds that were written",
         "error": "why recording stopped; empty: it did not",
     },
 }
@@ -303,6 +304,7 @@ class Health:
             "written": str(found.written),
             "queued": str(found.queued),
             "lost": ", ".join(f"{topic}: {count}" for topic, count in sorted(found.lost.items())),
+            "marks": str(found.marks),
             "error": found.error or "",
         }
         if found.error or found.lost:

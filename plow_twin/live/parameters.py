@@ -136,6 +136,15 @@ class Settings:
     record_keep_mb: float = _number(
         0.0, "MB", 0.0, 1e9, Effect.CONFIGURE, "the oldest parts are removed when the ended ones are larger; 0: never"
     )
+    record_ring: float = _number(
+        0.0,
+        "s",
+        0.0,
+        3600.0,
+        Effect.CONFIGURE,
+        "only the last so many seconds are kept, in memory, and written to a folder each time at an alarm or a mark; "
+        "0: everything is recorded",
+    )
     record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk each second, against a loss of power")
     excitation_timeout: float = _number(
         0.5,

@@ -14,6 +14,7 @@ from plow_twin.record.decimation import Decimation
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
+from plow_twin.record.writer import free_folder
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Publication
@@ -63,12 +64,13 @@ class Recording:
         )
         self._decimation = Decimation(settings.record_outputs, settings.record_rate)
         self._recorder = Recorder(
-            _free(Path(settings.record_path)),
+            free_folder(Path(settings.record_path)),
             header,
             queue_size=_QUEUE_SIZE,
             part_bytes=round(settings.record_part_mb * 1e6),
             part_s=settings.record_part_s,
             keep_bytes=round(settings.record_keep_mb * 1e6),
+            ring_s=settings.record_ring,
             sync=settings.record_sync,
             now_ns=clock or time.time_ns,
             on_error=on_error,
@@ -110,15 +112,10 @@ class Recording:
             self._recorder.journal(session.renew())
         return wanted
 
+    def mark(self) -> Path | None:
+        """Have the ring written and return its folder; None when everything is recorded anyway."""
+        return self._recorder.mark()
+
     def close(self) -> LossReport:
         """Write what is queued and close the file."""
         return self._recorder.close()
-
-
-def _free(folder: Path) -> Path:
-    """Return the folder, or the first of `<folder>_2`, `<folder>_3`, ... when it holds something already."""
-    path, number = folder, 1
-    while path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        number += 1
-        path = folder.with_name(f"{folder.name}_{number}")
-    return path

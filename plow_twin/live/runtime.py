@@ -212,6 +212,17 @@ class Runtime:
         end_ns = self.estimation.end_ns if self.estimation else None
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
+    def mark(self, reason: str = "service") -> tuple[bool, str]:
+        """Note a mark in the journal and have the ring written, if there is one."""
+        self.driver.parameter("mark", reason)
+        if self.recording is None:
+            return False, "nothing is recorded"
+        folder = self.recording.mark()
+        if folder is None:
+            return True, "noted in the recording"
+        self._renew_recording()
+        return True, f"what is kept in memory goes to {folder}"
+
     def record_status(self, status: DiagnosticStatus) -> None:
         """Put a published status into the recording."""
         if self.recording:
@@ -392,10 +403,7 @@ class Runtime:
 
     def _advanced(self) -> None:
         if self.recording:
-            renewed = self.recording.renew(self.driver.session)
-            if renewed and self.estimation and self.estimation.entry:
-                # no part of a snapshot
-                self.recording.journal(self.estimation.entry)
+            self._renew_recording()
             if self._front.follows_samples and self.recording.behind:
                 # nothing is late: a bounded pause lets the recorder's thread catch up
                 time.sleep(_CATCH_UP_S)
@@ -403,6 +411,13 @@ class Runtime:
         if seen != self._seen:
             self._seen = seen
             self._front.changed()
+
+    def _renew_recording(self) -> None:
+        assert self.recording is not None
+        renewed = self.recording.renew(self.driver.session)
+        if renewed and self.estimation and self.estimation.entry:
+            # no part of a snapshot
+            self.recording.journal(self.estimation.entry)
 
     def _publish(self, publication: Publication | None) -> None:
         if publication is None:
@@ -418,6 +433,7 @@ class Runtime:
             messages[QUALITY] = quality(publication, self._settings.frame_id)
         self._front.publish(messages, self._forces_sent)
         self.published += 1
+        latched = self.alarms.latched
         changed = self.alarms.take(publication)
         if self._received_ns and not self._front.follows_samples:
             self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
@@ -427,6 +443,9 @@ class Runtime:
                 self.recording.message(QUALITY, publication.stamp_ns, messages[QUALITY])
         if changed:
             self._publish_alarms(publication.stamp_ns)
+            risen = [name for name, level in self.alarms.latched.items() if level > latched[name]]
+            if risen:
+                self.mark(f"alarm: {', '.join(risen)}")
 
     def _publish_alarms(self, stamp_ns: int) -> None:
         head = self._settings.hardware_id

@@ -102,6 +102,11 @@ class Alarms:
         return {name: (alarm.level, alarm.latched) for name, alarm in self.alarms.items()}
 
     @property
+    def latched(self) -> dict[str, Level]:
+        """Highest level of each alarm since it was acknowledged."""
+        return {name: alarm.latched for name, alarm in self.alarms.items()}
+
+    @property
     def worst(self) -> Level:
         """The highest level, latched ones included."""
         return max((max(levels) for levels in self.levels.values()), default=Level.NONE)
