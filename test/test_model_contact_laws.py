@@ -78,7 +78,7 @@ def test_eight_power_series_side_by_side(n: float) -> None:
     assert np.polynomial.polynomial.polyval(t, power) == pytest.approx(value, rel=1e-12)
 
 
-@kernel()
+@kernel(entry=True)
 def _raise(base, power, n, inverse, half_root) -> None:  # type: ignore[no-untyped-def]
     for lane in range(8):
         power[0, lane] = base[0, lane] ** n

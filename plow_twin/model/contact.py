@@ -61,7 +61,7 @@ def ramp_terms(square: NDArray[np.float64], cube: NDArray[np.float64], k: int, r
     return row(square, k) * (3.0 / (ramp * ramp)) - row(cube, k) * (2.0 / (ramp * ramp * ramp))
 
 
-@kernel(fast=True)
+@kernel(fast=True, entry=True)
 def power_term(
     base: NDArray[np.float64], power: NDArray[np.float64], lane: int, k: int, exponent: float, shift: int
 ) -> float:

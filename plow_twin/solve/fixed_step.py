@@ -117,7 +117,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     return _OK
 
 
-@kernel()
+@kernel(entry=True)
 def integrate_fixed(
     p, parts, state, totals, log, z, done, steps, dt, euler, stride, q, v, penetration, force, balance
 ) -> int:

@@ -173,7 +173,7 @@ def _follow_line(piece, start, time, before, sample) -> None:
         piece.slope[j] = (sample[j] - before[j]) / span if span > 1e-100 else 0.0
 
 
-@kernel()
+@kernel(entry=True)
 def advance_times(p, parts, states, w, totals, times, budget, rows, bound) -> None:
     """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
     saved = np.empty(1, STATE)
@@ -182,7 +182,7 @@ def advance_times(p, parts, states, w, totals, times, budget, rows, bound) -> No
         _advance_row(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound, rows[i])
 
 
-@kernel()
+@kernel(entry=True)
 def advance_batch(params, parts, states, work, totals, first, last, times, wrench, budget, rows, bound) -> None:
     """Advance members `first` to `last` - 1 to each time: arrays but times have an axis of members in front.
 
@@ -199,7 +199,7 @@ def advance_batch(params, parts, states, work, totals, first, last, times, wrenc
             _advance_row(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound, rows[m, i])
 
 
-@kernel()
+@kernel(entry=True)
 def advance_marked(params, parts, states, work, totals, times, wrench, budget, marks, snapshots, status, rows) -> None:
     """Advance one twin to each time, as `advance_batch` does, and save its state where `marks` say.
 
@@ -223,7 +223,7 @@ def advance_marked(params, parts, states, work, totals, times, wrench, budget, m
             mark += 1
 
 
-@kernel()
+@kernel(entry=True)
 def interrupt_step(p, parts, state, w, totals) -> None:
     """End the step under way at the present time: something changes from outside."""
     if state.step_size < 0.0:
@@ -237,7 +237,7 @@ def interrupt_step(p, parts, state, w, totals) -> None:
     state.step_start = state.time = now
 
 
-@kernel()
+@kernel(entry=True)
 def lay_out_again(p, parts, state, w) -> None:
     """Compute the step under way once more after a restore: its series are not part of the state.
 
@@ -276,7 +276,7 @@ def _rows_in_flight(p, parts, flight, state, w, t, i, q, v, penetration, force):
     return i
 
 
-@kernel()
+@kernel(entry=True)
 def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force, balance) -> int:
     """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
 

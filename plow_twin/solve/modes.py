@@ -97,7 +97,7 @@ def mode_inside(p, state, pair):
     return ON if penetration >= p.release else RELEASED
 
 
-@kernel()
+@kernel(entry=True)
 def settle_modes(p, state) -> None:
     """Choose each pair's mode from its penetration, where a motion starts."""
     energy = 0.0

@@ -12,7 +12,7 @@ from plow_twin.solve.state import Status
 _OK, _LOG_FULL = int(Status.OK), int(Status.LOG_FULL)
 
 
-@kernel()
+@kernel(entry=True)
 def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> int:
     """Run state m through the times t[edges[m]:edges[m + 1]]; fill the same rows of q and v.
 
