@@ -10,16 +10,21 @@ import yaml
 from geometry_msgs.msg import WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_processes import Bench, Process, bench, value
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from plow_twin.live.parameters import SPECS, Effect
-from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.record.replay import replay
+from plow_twin.stream.journal import Mark
 
 T0 = 1_795_000_000_000_000_000
+RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
 
 
 def _change(running: Bench, transition: int) -> bool:
@@ -164,6 +169,49 @@ def test_a_changed_timeout_works_at_once(active: Bench) -> None:
     active.probe.until(lambda: forces and value(active.probe.status[-1], "stream") == "running", "an answer")
     assert _set(active, "excitation_timeout", 0.05).successful
     active.probe.until(lambda: value(active.probe.status[-1], "stream") == "stale", "the hold policy")
+
+
+def test_the_model_changes_a_motion_comes_back_and_the_journal_gives_it_all_again(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    with bench(tmp_path, record_path=str(run), excitation_timeout=3600.0, **RELIABLE_INPUT) as running:
+        probe = running.probe
+        heads = probe.listen(Odometry, "head_state")
+        send = probe.excitation()
+        sent = 0
+
+        def feed(count: int) -> list[tuple[float, float]]:
+            nonlocal sent
+            for index in range(count):
+                send(T0 + (sent + index) * 1_000_000, (30e3, 0.0, -40e3))
+                probe.pace(index)
+            sent += count
+            probe.until(lambda: len(heads) == sent, f"{sent} answers")
+            return [(head.pose.pose.position.x, head.pose.pose.position.y) for head in heads[-count:]]
+
+        def ask(service: str) -> Any:
+            return probe.call(Trigger, f"{running.namespace}/plow_twin/{service}", Trigger.Request())
+
+        feed(200)
+        assert "no snapshot" in ask("restore").message
+        assert ask("snapshot").success
+        first = feed(100)
+        assert ask("restore").success
+        # the first sample is that of the snapshot's time
+        assert feed(101)[1:] == first
+        answer = _set(running, "damping", 0.0)
+        assert not answer.successful and "configure anew" in answer.reason
+        assert not _set(running, "wear_coefficient", 1e-14).successful
+        assert _set(running, "clearance_horizontal", 0.04).successful
+        assert _set(running, "mark", "wider").successful and ask("mark").success
+        feed(50)
+        clearances = probe.listen(JointState, "clearance")
+        feed(150)
+        assert clearances[-1].position[0] == 0.04
+        assert running.twin.stop() == 0
+    entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+    assert [entry.text for entry in entries if isinstance(entry, Mark)] == ["wider"]
+    report = replay(run)
+    assert (report.exit_code, report.samples, report.first_divergence) == (0, sent, None)
 
 
 def test_every_parameter_has_a_descriptor_with_meaning_range_and_effect(active: Bench) -> None:

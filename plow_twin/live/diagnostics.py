@@ -27,6 +27,8 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "real_time_factor": "model seconds per second over the last period [1]",
         "real_time_factor_mean": "the same from the first to the newest advance [1]",
         "solver_failures": "failed advances",
+        "coarse_advances": "advances that max_evaluations has cut short",
+        "error_estimate_m": "largest error of the pose estimated of those since the last report [m]",
         "resets": "resets of the model, by jumps, failures and the service",
         "wear_saved": "folder that keeps the wear; empty: none",
         "wear_error": "why the wear could not be saved; empty: it could",
@@ -211,6 +213,8 @@ class Health:
                 "real_time_factor": f"{driver.real_time.recent(now_ns):.4f}",
                 "real_time_factor_mean": f"{driver.real_time.mean():.4f}",
                 "solver_failures": str(driver.failures),
+                "coarse_advances": str(driver.session.twin.bounded),
+                "error_estimate_m": f"{driver.session.take_error_estimate():.3g}",
                 "resets": str(driver.resets),
             }
             keeper = runtime.wear_keeper

@@ -182,6 +182,33 @@ class Settings:
         Effect.NOW,
         "wear depth of the eight pads that the service ~/set_wear sets; all 0: new pads",
     )
+    mark: str = _plain("", Effect.NOW, "text that the service ~/mark puts into the journal")
+    clearance_horizontal: float = _number(
+        -1.0, "m", -1.0, 10.0, Effect.NOW, "horizontal clearance of unworn pads; -1: the scene's"
+    )
+    clearance_vertical: float = _number(-1.0, "m", -1.0, 10.0, Effect.NOW, "the same, vertical; -1: the scene's")
+    stiffness: float = _number(
+        -1.0, "N/m^exponent", -1.0, 1e300, Effect.NOW, "stiffness of the contact law; -1: the scene's"
+    )
+    damping: float = _number(
+        -1.0,
+        "as in the scene",
+        -1.0,
+        1e300,
+        Effect.NOW,
+        "the same of its damping, where it has one",
+    )
+    restitution: float = _number(-1.0, "1", -1.0, 1.0, Effect.NOW, "the same of its restitution, where it has one")
+    wear_coefficient: float = _number(-1.0, "m^2/N", -1.0, 1.0, Effect.NOW, "the same of the wear coefficient")
+    max_evaluations: int = _number(
+        0,
+        "evaluations",
+        0,
+        1000000000,
+        Effect.CONFIGURE,
+        "most evaluations of the equations of motion in an advance, at least 16; the rest of it is coarse then, and "
+        "its error is estimated; 0: as many as it takes",
+    )
     alarm_force: tuple[float, ...] = _list(
         (0.0, 0.0),
         "N",
@@ -210,6 +237,15 @@ class Settings:
     )
 
 
+#: Parameters that change numbers of the model while it runs, with their keys in the scene file.
+MODEL: Final[Mapping[str, str]] = {
+    "clearance_horizontal": "clearance.horizontal_m",
+    "clearance_vertical": "clearance.vertical_m",
+    "stiffness": "contact.stiffness",
+    "damping": "contact.damping",
+    "restitution": "contact.restitution",
+    "wear_coefficient": "wear.coefficient_m2_n",
+}
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
 #: A number that YAML 1.1 takes for a text: its mantissa has no point.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -275,6 +311,12 @@ def settings(values: Mapping[str, Any]) -> Settings:
     if found:
         raise ParameterError(found)
     return Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
+
+
+def model_changes(given: Settings) -> dict[str, float]:
+    """Return the numbers of the scene that parameters change, by their keys there."""
+    values = {key: getattr(given, name) for name, key in MODEL.items()}
+    return {key: value for key, value in values.items() if value != -1.0}
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

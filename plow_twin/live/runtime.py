@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import Problem
+from plow_twin.errors import ArgumentError, Problem
 from plow_twin.live.inputs import Inputs
-from plow_twin.live.parameters import ParameterError, Settings
+from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import WearKeeper
 from plow_twin.model.scene import Scene
@@ -28,8 +28,9 @@ from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake
-from plow_twin.stream.journal import Entry, Pose
+from plow_twin.stream.journal import Entry, Pose, Snapshot
 from plow_twin.stream.limits import Limits, excitation_limits
+from plow_twin.stream.model_changes import changed_twin
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
@@ -98,8 +99,8 @@ class Runtime:
     ------
     RecordingError, WearStateError, OSError
         The recording or the saved wear cannot be used.
-    ParameterError
-        Parameters contradict each other.
+    ParameterError, ArgumentError
+        Parameters contradict each other or the scene.
     """
 
     def __init__(
@@ -121,6 +122,7 @@ class Runtime:
         #: frames computed without a sample, and frames after late samples have been worked in
         self.held_frames = self.corrected_frames = 0
         self._received_ns = 0
+        self._kept: Snapshot | None = None
         self._q: NDArray[np.float64] | None = None
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
@@ -138,6 +140,7 @@ class Runtime:
         self.alarms = Alarms(thresholds, settings.alarm_duration)
         if settings.estimate and settings.excitation_source == "scene":
             raise ParameterError([Problem("estimate", True, "false where excitation_source is scene: no load comes")])
+        changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
             self.recording = self._record()
             if self.recording:
@@ -164,6 +167,15 @@ class Runtime:
     def start(self) -> None:
         """Open the journal; nothing of the front can fail any more."""
         self.driver.session.start()
+        self.driver.set_model(self._stamp_ns(), model_changes(self._settings))
+
+    def refusals(self, settings: Settings) -> list[str]:
+        """Return why parameters cannot be taken while the twin runs."""
+        try:
+            self.driver.session.check_model(model_changes(settings))
+        except ArgumentError as error:
+            return [str(error)]
+        return []
 
     @property
     def unsteady(self) -> bool:
@@ -212,9 +224,9 @@ class Runtime:
         end_ns = self.estimation.end_ns if self.estimation else None
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
-    def mark(self, reason: str = "service") -> tuple[bool, str]:
-        """Note a mark in the journal and have the ring written, if there is one."""
-        self.driver.parameter("mark", reason)
+    def mark(self, text: str = "") -> tuple[bool, str]:
+        """Put a text, by default the parameter `mark`, into the journal and have the ring written, if there is one."""
+        self.driver.mark(self._stamp_ns(), text or self._settings.mark or "service")
         if self.recording is None:
             return False, "nothing is recorded"
         folder = self.recording.mark()
@@ -279,7 +291,10 @@ class Runtime:
         self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
-        if not isinstance(value, tuple):  # a list acts through the service that takes it, and its entry
+        if name in MODEL:
+            self.driver.set_model(self._stamp_ns(), model_changes(settings))
+            self._front.changed()
+        elif not isinstance(value, tuple):  # a list acts through the service that takes it, and its entry
             self.driver.parameter(name, value)
 
     def samples(self, arrived: list[Arrival]) -> None:
@@ -314,6 +329,19 @@ class Runtime:
         self.driver.reset(self._stamp_ns(), "service")
         self._front.changed()
         return True, "initial motion restored, the wear stays; the next sample starts model time anew"
+
+    def snapshot(self) -> tuple[bool, str]:
+        """Journal the exact state and keep it for `restore`."""
+        self._kept = self.driver.snapshot()
+        return True, f"the state at {self._kept.stamp_ns} ns is kept and stands in the journal"
+
+    def restore(self) -> tuple[bool, str]:
+        """Go back to the motion of the snapshot kept."""
+        if self._kept is None:
+            return False, "no snapshot has been taken since configure"
+        self.driver.restore(self._stamp_ns(), self._kept)
+        self._front.changed()
+        return True, f"the motion is that at {self._kept.stamp_ns} ns; the next sample is that of its time, wear stays"
 
     def acknowledge_alarms(self) -> tuple[bool, str]:
         """Let go the alarms that are latched."""

@@ -71,14 +71,20 @@ def key(settings: Settings) -> tuple[object, ...]:
     try:
         found = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):
-        return settings.scene, settings.tolerance, settings.excitation_source
-    return settings.scene, settings.tolerance, settings.excitation_source, found.st_mtime_ns, found.st_size
+        return settings.scene, settings.tolerance, settings.excitation_source, settings.max_evaluations
+    bound = settings.max_evaluations
+    return settings.scene, settings.tolerance, settings.excitation_source, bound, found.st_mtime_ns, found.st_size
 
 
 def _prepare(settings: Settings) -> Prepared:
     scene = load_scene(scene_path(settings.scene))
     own = settings.excitation_source == "scene"
-    twin = Twin(scene, tol=settings.tolerance, excitation="scene" if own else "sampled")
+    twin = Twin(
+        scene,
+        tol=settings.tolerance,
+        excitation="scene" if own else "sampled",
+        max_evaluations=settings.max_evaluations or None,
+    )
     return Prepared(scene, twin, twin.warm_up())
 
 

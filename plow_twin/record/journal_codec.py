@@ -17,10 +17,13 @@ from plow_twin.stream.journal import (
     Estimated,
     Hold,
     Loss,
+    Mark,
     Parameter,
     Pose,
     Reset,
+    Restore,
     Sample,
+    SetModel,
     SetWear,
     Snapshot,
     Travel,
@@ -42,6 +45,9 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "travel": Travel,
     "reset": Reset,
     "wear": SetWear,
+    "model": SetModel,
+    "restore": Restore,
+    "mark": Mark,
     "parameter": Parameter,
     "pose": Pose,
     "estimated": Estimated,
@@ -59,7 +65,7 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
         fx, fy, m = entry.wrench
         return WrenchStamped(entry.stamp_ns, frame_id, (fx, fy, 0.0), (0.0, 0.0, m))
     values = {spec.name: getattr(entry, spec.name) for spec in fields(entry)}
-    if isinstance(entry, Snapshot):
+    if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
     return Text(json.dumps({"kind": _NAMES[type(entry)], **values}, allow_nan=False))
 

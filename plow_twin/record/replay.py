@@ -179,7 +179,8 @@ class _Replay:
         }
         scene = header.scene(report.path)
         excitation: Any = "scene" if header.excitation_source == "scene" else "sampled"
-        twin = Twin(scene, tol=header.tol, excitation=excitation)
+        bound = header.parameters.get("max_evaluations") or None
+        twin = Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=None if bound is None else int(bound))
         twin.warm_up()
         self.templates = publication_templates(header.frame_id, header.child_frame_id)
         if excitation == "sampled":

@@ -24,7 +24,7 @@ from plow_twin.ros.qos import LATCHED
 from plow_twin.ros.subscriptions import Subscriptions
 
 #: Services by name, each a method of the runtime.
-SERVICES: Final = ("reset", "switch_publisher", "set_wear", "acknowledge_alarms", "mark")
+SERVICES: Final = ("reset", "switch_publisher", "set_wear", "acknowledge_alarms", "snapshot", "restore", "mark")
 
 
 class RosFront:

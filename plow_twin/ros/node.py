@@ -16,6 +16,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.live import diagnostics
+from plow_twin.live.parameters import Settings
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Preparation, key
 from plow_twin.record import messages as plain
@@ -52,7 +53,7 @@ class TwinNode(LifecycleNode):
         self._preparation: Preparation | None = None
         self._health = diagnostics.Health()
         self._published_status: tuple[Any, ...] = ()
-        self._table = ParameterServer(self, lambda: self.runtime is None, self._parameter_changed)
+        self._table = ParameterServer(self, lambda: self.runtime is None, self._parameter_changed, self._refusals)
         self._status = self.create_publisher(DiagnosticStatus, "status", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         # steady: reports go on when /clock is paused
@@ -163,6 +164,9 @@ class TwinNode(LifecycleNode):
         self.reason = ""
         self._publish_status()
         return TransitionCallbackReturn.SUCCESS
+
+    def _refusals(self, settings: Settings) -> list[str]:
+        return [] if self.runtime is None else self.runtime.refusals(settings)
 
     def _parameter_changed(self, name: str, value: Any) -> None:
         if self.runtime is not None:

@@ -46,6 +46,8 @@ class ParameterServer:
         Tells whether parameters that take effect on configure can be changed now.
     changed
         Called with name and value of each parameter that has changed at run time and takes effect at once.
+    refusals
+        Returns why settings cannot be taken now, each of whose values alone could.
 
     Raises
     ------
@@ -53,10 +55,17 @@ class ParameterServer:
         Some of the values given at start cannot be used; the message lists them all.
     """
 
-    def __init__(self, node: Node, unconfigured: Callable[[], bool], changed: Callable[[str, Any], None]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        unconfigured: Callable[[], bool],
+        changed: Callable[[str, Any], None],
+        refusals: Callable[[Settings], list[str]],
+    ) -> None:
         self._node = node
         self._unconfigured = unconfigured
         self._changed = changed
+        self._refusals = refusals
         found: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
         given = {name: parameter.value for name, parameter in found.items()}
         self.unknown = parameters.unknown(given)
@@ -98,6 +107,9 @@ class ParameterServer:
             ]
             if values.get("use_sim_time", self._sim_time()) != self._sim_time():
                 reasons.append(f"use_sim_time: takes effect {Effect.CONFIGURE.value}")
+        if not reasons:
+            known = {name: parameters.coerce(name, value) for name, value in values.items() if name in SPECS}
+            reasons += self._refusals(replace(self.settings, **known))
         return SetParametersResult(successful=not reasons, reason="; ".join(reasons))
 
     def _sim_time(self) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Scene
+from plow_twin.model.scene import Initial, Scene
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, per_mass, wear_rate
@@ -79,7 +79,8 @@ class Twin:
             raise ArgumentError(f"excitation: got {excitation!r}, expected 'scene' or 'sampled'")
         self.scene = scene
         self.tol = tol
-        self.excitation = excitation
+        self.excitation: Literal["scene", "sampled"] = excitation
+        self.max_evaluations = max_evaluations
         compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
         self._params, self._states = new_records(PARAMS, 1), new_records(STATE, 1)
         self._params[0] = compiled.params
@@ -93,6 +94,26 @@ class Twin:
         self._states[0] = compiled.initial_state(start)
         self._wrench = np.zeros(3)
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
+
+    @property
+    def signature(self) -> tuple[bool, ...]:
+        """Which terms the equations have: twins of one signature share their compiled code."""
+        parts = self._parts
+        there = (*parts.terms, parts.harmonics, parts.segments, parts.implicit, self._bound)
+        return tuple(part is not None for part in there)
+
+    def like(self, scene: Scene) -> Twin:
+        """Return a twin of another scene, with the tolerance, excitation and bound of this one.
+
+        Parameters
+        ----------
+        scene : Scene
+
+        Returns
+        -------
+        Twin
+        """
+        return Twin(scene, tol=self.tol, excitation=self.excitation, max_evaluations=self.max_evaluations)
 
     @property
     def time(self) -> float:
@@ -226,8 +247,14 @@ class Twin:
         """The last sample: Fx, Fy [N] and M [N m], shape (3,); zero before the first."""
         return self._wrench.copy()
 
-    def reset(self, t: float, *, wear_depth: ArrayLike | None = None) -> None:
-        """Go back to the scene's initial state at model time `t`.
+    def reset(
+        self,
+        t: float,
+        *,
+        wear_depth: ArrayLike | None = None,
+        pose: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Go back to the scene's initial state at model time `t`, or begin at another one there.
 
         Parameters
         ----------
@@ -235,18 +262,27 @@ class Twin:
             Model time in s.
         wear_depth : array_like, shape (8,), optional
             Wear depth of each pad in m, at least 0. Without it the scene's initial one.
+        pose : tuple of array_like, shapes (3,) and (3,), optional
+            x, y [m], theta [rad] and their rates to begin with. Without it those of the scene.
 
         Raises
         ------
         ArgumentError
-            For a time or depth out of range; nothing has changed then.
+            For a time, depth or pose out of range; nothing has changed then.
         """
         if not np.isfinite(t):
             raise ArgumentError(f"t: got {t!r}, expected a finite time in s")
         depth = None if wear_depth is None else np.asarray(wear_depth, dtype=np.float64)
         if depth is not None and (depth.shape != (PAIR_COUNT,) or not (np.isfinite(depth) & (depth >= 0.0)).all()):
             raise ArgumentError(f"wear_depth: got {wear_depth!r}, expected {PAIR_COUNT} finite depths >= 0 in m")
-        self._states[0] = self._compiled.initial_state(t, depth)
+        begin = self._compiled
+        if pose is not None:
+            q, v = (np.asarray(part, dtype=np.float64) for part in pose)
+            if q.shape != (3,) or v.shape != (3,) or not np.isfinite([q, v]).all():
+                raise ArgumentError(f"pose: got {pose!r}, expected two times 3 finite numbers")
+            initial = Initial((q[0], q[1], q[2]), (v[0], v[1], v[2]))
+            begin = replace(begin, scene=replace(self.scene, initial=initial))
+        self._states[0] = begin.initial_state(t, depth)
         self._wrench = np.zeros(3)
 
     def set_travel_speed(self, speed_m_s: float) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -17,11 +18,15 @@ from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 from plow_twin.stream.journal import (
     Entry,
     Hold,
+    Mark,
     Parameter,
     ParameterValue,
     Reset,
+    Restore,
     Sample,
+    SetModel,
     SetWear,
+    Snapshot,
     Travel,
     Unload,
 )
@@ -196,6 +201,35 @@ class Driver:
     def parameter(self, name: str, value: ParameterValue) -> None:
         """Journal a parameter that has changed."""
         self.session.apply(Parameter(name, value))
+
+    def mark(self, stamp_ns: int, text: str) -> None:
+        """Journal a mark."""
+        self.session.apply(Mark(stamp_ns, text))
+
+    def snapshot(self) -> Snapshot:
+        """Journal and return the exact state; what is older than that can no longer be worked in."""
+        snapshot = self.session.renew()
+        self.session.emit(snapshot)
+        return snapshot
+
+    def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
+        """Go back to the motion of a snapshot; the next sample is that of its time, whatever its stamp."""
+        self.session.apply(Restore(stamp_ns, snapshot.data))
+        self._begin_again()
+        self.intake.restart()
+        self.clock.restart()
+
+    def set_model(self, stamp_ns: int, changes: Mapping[str, float]) -> None:
+        """Go on with other numbers of the scene, given by their keys in its file; all others are the scene's.
+
+        Raises
+        ------
+        ArgumentError
+            They cannot be taken while the twin runs; nothing has changed then.
+        """
+        self.session.check_model(changes)
+        if dict(changes) != self.session.changes:
+            self.session.apply(SetModel(stamp_ns, json.dumps(dict(changes))))
 
     def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
         """Set the wear depth of each pad [m]: other pads, or a measurement; the motion starts anew.

@@ -63,6 +63,33 @@ class SetWear:
 
 
 @dataclass(frozen=True)
+class SetModel:
+    """Numbers of the scene are other ones from here on: `changes` is JSON, numbers by key of the scene file.
+
+    All that differ from the scene of the run; pose, rates and wear go on. Contacts have the history of a start there.
+    """
+
+    stamp_ns: int
+    changes: str
+
+
+@dataclass(frozen=True)
+class Restore:
+    """The motion is that of the snapshot `data` from here on; the next stamp is that of its time. The wear stays."""
+
+    stamp_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Somebody has marked this place."""
+
+    stamp_ns: int
+    text: str
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A parameter that the model sees has taken `value`."""
 
@@ -119,4 +146,20 @@ class Loss:
     count: int
 
 
-Entry = Sample | Hold | Unload | Travel | Reset | SetWear | Parameter | Pose | Estimated | Snapshot | Digest | Loss
+Entry = (
+    Sample
+    | Hold
+    | Unload
+    | Travel
+    | Reset
+    | SetWear
+    | SetModel
+    | Restore
+    | Mark
+    | Parameter
+    | Pose
+    | Estimated
+    | Snapshot
+    | Digest
+    | Loss
+)

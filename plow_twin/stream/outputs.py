@@ -180,6 +180,10 @@ class Outputs:
             values[[axis, points, points + 1]] = shift[3 * axis : 3 * axis + 3]
         self._shift = values if values.any() else None
 
+    def set_scene(self, scene: Scene) -> None:
+        """Speak of a scene with other numbers from here on."""
+        self._scene = scene
+
     def clear_shift(self) -> None:
         """Let the clearances be those of the model again."""
         self._shift = None

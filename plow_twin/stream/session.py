@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
@@ -18,15 +19,19 @@ from plow_twin.stream.journal import (
     Estimated,
     Hold,
     Loss,
+    Mark,
     Parameter,
     Pose,
     Reset,
+    Restore,
     Sample,
+    SetModel,
     SetWear,
     Snapshot,
     Travel,
     Unload,
 )
+from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import Outputs
 
 if TYPE_CHECKING:
@@ -86,6 +91,9 @@ class Session:
         wear_depth: Sequence[float] | None = None,
     ) -> None:
         self.twin = twin
+        self._scene = twin.scene
+        #: numbers of the scene that have been changed, by their keys
+        self.changes: dict[str, float] = {}
         self.origin_ns = origin_ns
         #: the time that the model has reached [ns], None before the first stamp
         self.stamp_ns: int | None = None
@@ -100,6 +108,7 @@ class Session:
         if wear_depth is not None:
             self.wear_depth[:] = wear_depth
             twin.reset(twin.time, wear_depth=self.wear_depth)
+        self._largest_error_m = 0.0
         #: whether the motion goes on without samples
         self.held = False
         self._wears = scene.wear is not None and scene.wear.coefficient_m2_n != 0.0
@@ -148,7 +157,13 @@ class Session:
             case Estimated(shift=shift):
                 self._on_entry(entry)
                 self.outputs.set_shift(shift)
-            case Parameter() | Pose():
+            case SetModel(_, changes):
+                self._on_entry(entry)
+                self._change_model(read_changes(changes))
+            case Restore(_, data):
+                self._on_entry(entry)
+                self._restore_motion(data)
+            case Parameter() | Pose() | Mark():
                 # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):
@@ -209,7 +224,7 @@ class Session:
         reached = self.stamp_ns if self.stamp_ns is not None else int(stamps[0])
         if not self.plain or stamps[0] < reached or (stamps[1:] < stamps[:-1]).any():
             raise ValueError(f"stamp: expected samples only, with stamps that do not fall, from {reached} ns on")
-        origin = int(stamps[0]) if self.origin_ns is None else self.origin_ns
+        origin = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         before = self.snapshot().data
         done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows or self._wears)
         self.history.add_snapshot(int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns, before)
@@ -226,6 +241,19 @@ class Session:
         self.history.cut(self.stamp_ns)
         self.origin_ns = origin_ns
         self.outputs.set_pending(pending)
+
+    def emit(self, entry: Entry) -> None:
+        """Emit an entry that says something of the present state and changes nothing."""
+        self._on_entry(entry)
+
+    def check_model(self, changes: Mapping[str, float]) -> None:
+        """Raise an `ArgumentError` when the model cannot be changed so while it runs."""
+        changed_twin(self.twin, self._scene, changes)
+
+    def take_error_estimate(self) -> float:
+        """Return the largest error [m] that `max_evaluations` is estimated to have made since the last call."""
+        largest, self._largest_error_m = self._largest_error_m, 0.0
+        return largest
 
     def renew(self) -> Snapshot:
         """Return the exact state for a journal that goes on from here, and forget what was before it."""
@@ -247,7 +275,9 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot()
+        # the changes of the model come last: most runs have none
+        changes = json.dumps(self.changes).encode() if self.changes else b""
+        data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)
 
     def _run(self, samples: list[Sample]) -> AdvanceSeries:
@@ -272,12 +302,14 @@ class Session:
     def _advance(self, samples: list[Sample]) -> AdvanceSeries:
         stamps_ns = [sample.stamp_ns for sample in samples]
         if self.origin_ns is None:
-            self.origin_ns = stamps_ns[0]
+            self.origin_ns = self._begin(stamps_ns[0])
         origin_ns = self.origin_ns
         series = self.twin.advance_samples(
             [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
         )
         self.stamp_ns, self.wear_depth = stamps_ns[-1], series.wear_depth[-1].copy()
+        if self.twin.max_evaluations is not None:
+            self._largest_error_m = max(self._largest_error_m, float(series.error_estimate_m.max()))
         self.outputs.add_series(stamps_ns, series, self.held)
         return series
 
@@ -338,7 +370,7 @@ class Session:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
         self._on_entry(entry)
         if self.origin_ns is None:
-            self.origin_ns = stamp_ns
+            self.origin_ns = self._begin(stamp_ns)
         if self._sampled:
             self._suspend_wear()
         while self._travels and self._travels[0].stamp_ns <= stamp_ns:
@@ -420,11 +452,65 @@ class Session:
         self._travels = []
         self.origin_ns = self.stamp_ns = None
 
+    def _begin(self, stamp_ns: int) -> int:
+        """Return the stamp of model time 0 when the motion goes on from its present time at `stamp_ns`."""
+        return stamp_ns - round(self.twin.time * 1e9)
+
+    def _change_model(self, changes: dict[str, float]) -> None:
+        """Go on with other numbers of the scene; the contacts begin anew, what is remembered is forgotten."""
+        before, speed = self.twin, 0.0 if self.held else self._speed
+        self.twin = changed_twin(before, self._scene, changes)
+        self._carry(before)
+        self.changes = changes
+        if self._wears:
+            self.twin.set_travel_speed(speed)
+        self.outputs.set_scene(self.twin.scene)
+        self.outputs.clear_shift()
+        self._forget()
+
+    def _carry(self, before: Twin) -> None:
+        """Begin with pose, rates, load and time of another twin; the wear is the present one."""
+        now = before.advance(before.time)
+        self.twin.reset(before.time, wear_depth=self.wear_depth, pose=(now.q, now.v))
+        if self._sampled:
+            self.twin.advance(before.time, before.wrench)
+
+    def _restore_motion(self, data: bytes) -> None:
+        """Take over the motion of a snapshot; wear, model, speed along the face and counts stay as they are."""
+        self._resume_wear()
+        for travel in self._travels:
+            self._set_speed(travel)
+        travels = _HEADER.unpack_from(data)[-1]
+        end = _HEADER.size + travels * _TRAVEL.size
+        depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end)
+        twin_data, changes = self._split_twin(data[end + _WEAR_SIZE + self.outputs.state_size() :])
+        if changes == self.changes and (depth == self.wear_depth).all():
+            self.twin.restore(twin_data)
+        else:
+            saved = self.twin.like(changed_scene(self._scene, changes))
+            saved.restore(twin_data)
+            self._carry(saved)
+        if self._wears:
+            self.twin.set_travel_speed(self._speed)
+        self.outputs.restart()
+        self.history.clear()
+        self._travels = []
+        self.origin_ns = self.stamp_ns = None
+
+    def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
+        """Return the snapshot of the twin, and the changes of the model behind it."""
+        size = len(self.twin.snapshot())
+        return data[:size], read_changes(data[size:].decode()) if len(data) > size else {}
+
     def _restore(self, data: bytes) -> None:
         known, origin_ns, stamp_ns, advances, held, speed, travels = _HEADER.unpack_from(data)
         end = _HEADER.size + travels * _TRAVEL.size
         split = end + _WEAR_SIZE + self.outputs.state_size()
-        self.twin.restore(data[split:])
+        twin_data, changes = self._split_twin(data[split:])
+        if changes != self.changes:
+            self.twin, self.changes = changed_twin(self.twin, self._scene, changes), changes
+            self.outputs.set_scene(self.twin.scene)
+        self.twin.restore(twin_data)
         self.outputs.set_state(data[end + _WEAR_SIZE : split])
         self.wear_depth = np.frombuffer(data, np.float64, PAIR_COUNT, offset=end).copy()
         self._travels = [Travel(*found) for found in _TRAVEL.iter_unpack(data[_HEADER.size : end])]

@@ -1,0 +1,79 @@
+"""Numbers of a scene that can change while its twin runs: those that take no other compiled code."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final
+
+from plow_twin.errors import ArgumentError
+from plow_twin.model.scene import Scene
+from plow_twin.run.twin import Twin
+
+#: Keys of the scene file, each with the smallest value that is taken.
+CHANGEABLE: Final[Mapping[str, float]] = {
+    "clearance.horizontal_m": 0.0,
+    "clearance.vertical_m": 0.0,
+    "contact.stiffness": math.ulp(0.0),
+    "contact.damping": 0.0,
+    "contact.restitution": 0.0,
+    "wear.coefficient_m2_n": 0.0,
+}
+
+
+def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
+    """Return the scene with other numbers.
+
+    Raises
+    ------
+    ArgumentError
+        A key or a number cannot be taken; the message names it, the value got and the value expected.
+    """
+    for key, value in changes.items():
+        if key not in CHANGEABLE:
+            raise ArgumentError(f"{key}: got a change, expected one of {', '.join(CHANGEABLE)}")
+        section, _, name = key.partition(".")
+        part = getattr(scene, section)
+        if part is None or getattr(part, name) is None:
+            raise ArgumentError(f"{key}: got {value!r}, but the scene has no {name if part else section}")
+        if not (math.isfinite(value) and value >= CHANGEABLE[key]):
+            raise ArgumentError(f"{key}: got {value!r}, expected a finite number >= {CHANGEABLE[key]:.3g}")
+        try:
+            scene = replace(scene, **{section: replace(part, **{name: value})})
+        except ValueError as error:
+            raise ArgumentError(f"{key}: got {value!r}: {error}") from error
+    return scene
+
+
+def changed_twin(twin: Twin, scene: Scene, changes: Mapping[str, float]) -> Twin:
+    """Return a twin of `scene` with other numbers, like `twin` else, at its scene's initial state.
+
+    Raises
+    ------
+    ArgumentError
+        As `changed_scene`, or the changed scene takes other compiled code, which a live twin has no time for.
+    """
+    found = twin.like(changed_scene(scene, changes))
+    if found.signature != twin.signature:
+        raise ArgumentError(
+            f"{', '.join(changes)}: got {', '.join(map(repr, changes.values()))}, which adds a term to the equations "
+            "or takes one away, expected a change of numbers: configure anew"
+        )
+    return found
+
+
+def read_changes(text: str) -> dict[str, float]:
+    """Return changes from their JSON text.
+
+    Raises
+    ------
+    ArgumentError
+        The text does not hold numbers by key.
+    """
+    try:
+        found = json.loads(text)
+        return {str(key): float(value) for key, value in found.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ArgumentError(f"changes: got {text[:80]!r}, expected numbers by key of the scene file") from error
