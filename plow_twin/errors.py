@@ -59,16 +59,7 @@ class SolverError(PlowTwinError, RuntimeError):
     """The motion could not be continued; the message says when and why."""
 
 
-class _StoppedError(PlowTwinError):
-    """A run was stopped on its way."""
-
-    def __init__(self, message: str, result: Any, time_s: float) -> None:
-        super().__init__(message)
-        self.result = result
-        self.time_s = time_s
-
-
-class LimitError(_StoppedError, SolverError):
+class LimitError(SolverError):
     """A run has reached a limit that its caller set; `result` is the motion up to `time_s`.
 
     Attributes
@@ -79,8 +70,13 @@ class LimitError(_StoppedError, SolverError):
         Model time reached in s.
     """
 
+    def __init__(self, message: str, result: Any, time_s: float) -> None:
+        super().__init__(message)
+        self.result = result
+        self.time_s = time_s
 
-class RunInterrupted(_StoppedError, KeyboardInterrupt):
+
+class RunInterrupted(PlowTwinError, KeyboardInterrupt):
     """A run was interrupted by the user; `result` is the motion up to `time_s`.
 
     Attributes
@@ -90,6 +86,11 @@ class RunInterrupted(_StoppedError, KeyboardInterrupt):
     time_s : float
         Model time reached in s.
     """
+
+    def __init__(self, message: str, result: Any, time_s: float) -> None:
+        super().__init__(message)
+        self.result = result
+        self.time_s = time_s
 
 
 class ToleranceWarning(UserWarning):

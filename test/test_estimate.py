@@ -15,6 +15,7 @@ from scenes import ROOT, preset
 from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
 from plow_twin import Scene, Table, simulate
+from plow_twin.estimate.bouncing import _regress
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.measurements import EstimateError, Load, Poses
 from plow_twin.estimate.result import Interval, State
@@ -74,6 +75,30 @@ def test_what_is_outside_the_model_is_flagged_and_withdrawn(name: str) -> None:
     assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
     assert result.horizontal_state is result.vertical_state is State.WITHDRAWN
     assert result.reasons
+
+
+@pytest.mark.stress
+def test_a_hard_contact_is_told_by_what_its_bounces_are_like() -> None:
+    truth = draw(GROUPS["hard"], 1)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert "distance" in result.figures, "the bounces were compared"
+    assert (result.model, result.sensor) == ("ok", "ok"), result.reasons
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert abs(value.mean - true) < 1.5 * (value.p95 - value.p05)
+    assert result.stiffness.p05 < truth.scene.contact.stiffness < result.stiffness.p95
+
+
+def test_the_regression_of_bounces_gives_the_value_at_what_was_measured() -> None:
+    rng = np.random.default_rng(5)
+    features = rng.standard_normal((200, 3))
+    targets = np.stack([2.0 + features @ [1.0, -1.0, 0.0], features[:, 2] ** 2], axis=1)
+    targets[:, 0] += 0.1 * rng.standard_normal(200)
+    found = _regress(features, targets, np.array([0.5, 0.2, 0.0]))
+    assert found.value[0] == pytest.approx(2.3, abs=0.1)
+    assert 0.05 < found.deviation[0] < 0.2
+    # what is not linear is in the deviation
+    assert found.deviation[1] > 0.2
+    assert found.distance < 1.5 < _regress(features, targets, np.full(3, 6.0)).distance
 
 
 def test_a_wall_never_touched_is_not_observable() -> None:

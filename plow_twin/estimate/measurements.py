@@ -133,6 +133,21 @@ class Load:
                 stack += [(left, left + 1 + worst), (left + 1 + worst, right)]
         return Load(self.t[keep], self.wrench[keep])
 
+    def averaged(self, count: int) -> Load:
+        """Return `count` knots at equal distances, each the mean of the samples about it, weighted by nearness."""
+        step = float(self.t[-1] - self.t[0]) / (count - 1)
+        place = (self.t - self.t[0]) / step
+        left = np.minimum(place.astype(np.int64), count - 2)
+        share = place - left
+        weight = np.bincount(left, 1.0 - share, count) + np.bincount(left + 1, share, count)
+        there = weight > 1e-9
+        columns = [
+            (np.bincount(left, (1.0 - share) * column, count) + np.bincount(left + 1, share * column, count))[there]
+            / weight[there]
+            for column in self.wrench.T
+        ]
+        return Load(self.t[0] + step * np.flatnonzero(there), np.stack(columns, axis=1))
+
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
     """Return the indices of usable rows in order of time, the first of equal stamps."""

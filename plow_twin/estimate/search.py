@@ -42,8 +42,8 @@ STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 _SHORT, _LONG = (0.04, 0.11), (0.35, np.inf)
 
 
-def search(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> tuple[Problem, Fit] | None:
-    """Return the best fit of all poses with its problem, or None where no start could be run."""
+def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> Fit | None:
+    """Return the best fit to the beginnings of the first swings, or None where no start could be run."""
     interval = float(np.median(np.diff(poses.t)))
     first = poses.between(float(poses.t[0]), float(poses.t[0]) + _FIRST_PERIODS * period)
     window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
@@ -57,7 +57,7 @@ def search(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) ->
         fits = [one for one in (fit(problem, *point, stage.iterations) for point in points) if one is not None]
         fits = sorted(fits, key=lambda one: one.loss)[: stage.keep]
         points = [(one.shared, one.point.states, one.noise) for one in fits]
-    return refine(forward, unknowns, poses, period, fits[0].shared, fits[0].noise) if fits else None
+    return fits[0] if fits else None
 
 
 def refine(

@@ -112,6 +112,10 @@ class Unknowns:
         """Return psi of a stiffness."""
         return math.log((self.force / stiffness) ** (1.0 / self.scene.contact.exponent) + _RESOLVED)
 
+    def penetration_of(self, psi: float) -> float:
+        """Return the penetration in m under the reference force."""
+        return math.exp(psi) - _RESOLVED
+
     def stiffness_of(self, psi: float) -> float:
         """Return the stiffness of psi, at most that of the hardest contact that is simulated."""
         u = max(math.exp(psi) - _RESOLVED, _HARDEST)

@@ -1,0 +1,218 @@
+"""Clearances of a hard guide: what the whole motion is like is compared, not where the head is at each moment.
+
+A hard contact returns the head many times before it rests, and which bounce it is at a moment cannot be foretold. How
+far the corners reach on the whole, and how much the pose scatters at each phase of the load, can. Motions with drawn
+stiffness, damping and load gains are simulated and seen through the sensor's noise and gaps; a regression among those
+that look like the measured one then tells by how much the clearance differs from the reach (approximate Bayesian
+computation with local-linear adjustment). What it leaves over is the interval.
+
+References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012)
+419; Wood, Nature 466 (2010) 1102.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches
+from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, Unknowns
+from plow_twin.model import geometry
+
+Array = NDArray[np.float64]
+
+#: Softness in m below which a contact bounces for certain, and below which it may.
+SURE, POSSIBLE = 3e-4, 1e-3
+#: Scatter of the largest reaches in units of the noise, and in m, below which they are all of one place: a hard wall.
+NARROW, NARROW_M = 1.58, 8e-4
+#: Quantiles between which reaches are averaged, from the wall's middle to the farthest.
+_WINDOWS: Final = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
+#: Parts of a period in which the scatter is told.
+_PHASES = 20
+#: Draws of each round, and the share of the last ones that are regressed.
+_DRAWS: Final = (40, 40, 40)
+_KEPT, _NEAR = 1.6, 0.7
+#: Steps of the solver after which no further draw is made.
+_MOST_WORK = 3_500_000
+#: Drawn: logarithm of the penetration under the reference force [m] and its bounds; deviations of the damping's
+#: logarithm, of the gains, of the clearance [m].
+_LN_PENETRATION, _BOUNDS = (math.log(3e-5), 1.2), (5e-6, 6e-4)
+_DAMPING, _GAIN, _CLEARANCE = 0.7, 0.06, 3e-4
+#: What the range of motion overrates a clearance by: noise, and bounces against it [m].
+_OVERRATED: Final = np.array([0.8e-3, 1.0e-3])
+#: Scatter of the logarithm of the noise as it is told by neighbours.
+_NOISE_SCATTER = 0.03
+#: Widening of the intervals, set on seeds below 1000 of the benchmark.
+_WIDENED = 1.5
+#: Fewest draws that are regressed.
+_FEWEST = 30
+
+
+@dataclass(frozen=True, eq=False)
+class Bounced:
+    """What the comparison tells.
+
+    clearance, clearance_deviation : (2,) in m
+    bias : (2,) of x and y in m with its deviation
+    ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
+    noise : (3,) standard deviation of the measurements
+    distance : of the measured motion from the drawn ones near it, over that of drawn ones among themselves
+    """
+
+    clearance: Array
+    clearance_deviation: Array
+    bias: Array
+    bias_deviation: Array
+    ln_penetration: tuple[float, float]
+    ln_damping: tuple[float, float]
+    noise: Array
+    distance: float
+
+
+def bounces(unknowns: Unknowns, poses: Poses, softness: float) -> bool:
+    """Tell whether the contact is so hard that this way is the right one; `softness` is a first estimate in m."""
+    noise = _reach_noise(unknowns, filled(poses))
+    return softness < SURE or (_is_narrow(unknowns, poses) and (softness < POSSIBLE or noise < POSSIBLE))
+
+
+def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
+    """Tell whether the head stops at one place, within the noise: the walls do not give way."""
+    q = filled(poses)
+    reach = _reach(unknowns, q)
+    return bool(np.median(reach[2] - reach[0]) < max(NARROW * _reach_noise(unknowns, q), NARROW_M))
+
+
+def _reach_noise(unknowns: Unknowns, q: Array) -> float:
+    """Return the standard deviation of a corner's reach in m."""
+    level = noise_level(q)
+    return math.hypot(level[0], level[2] * geometry.half_diagonal(unknowns.scene))
+
+
+def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0) -> Bounced | None:
+    """Compare the measured motion with drawn ones; None where too few can be run."""
+    eye = _Eye(unknowns, poses, period)
+    measured = eye.features(eye.q)
+    rng = np.random.default_rng(seed)
+    centre = range_of_motion(unknowns.scene, poses)[0] - _OVERRATED
+    mean = np.array([_LN_PENETRATION[0], unknowns.nominal()[DAMPING], 1.0, 1.0, 1.0])
+    spread = np.array([_LN_PENETRATION[1], _DAMPING if unknowns.damped else 0.0, _GAIN, _GAIN, _GAIN])
+    first_mean, first_spread = mean, spread
+    features: list[Array] = []
+    targets: list[Array] = []
+    found: _Regressed | None = None
+    for count in _DRAWS:
+        for _ in range(count):
+            if forward.work > _MOST_WORK:
+                break
+            numbers = mean + spread * rng.standard_normal(5)
+            numbers[0] = np.clip(numbers[0], *np.log(_BOUNDS))
+            clearance = np.maximum(centre + _CLEARANCE * rng.standard_normal(2), 5e-4)
+            seen = eye.look(forward, clearance, numbers, rng)
+            if seen is not None:
+                features.append(seen)
+                targets.append(np.concatenate([clearance - seen[:2], -seen[2:4], numbers]))
+        kept = -int(_KEPT * count)
+        if len(features) < _FEWEST:
+            return None
+        found = _regress(np.array(features[kept:])[:, 4:], np.array(targets[kept:]), measured[4:])
+        moved = measured[:2] + found.value[:2] - centre
+        centre = centre + moved
+        mean = np.clip(found.value[4:], first_mean - 2.0 * first_spread, first_mean + 2.0 * first_spread)
+        spread = np.clip(1.3 * found.deviation[4:], 0.3 * first_spread, first_spread)
+    assert found is not None
+    # what still moves has not been found
+    deviation = np.hypot(_WIDENED * found.deviation[:2], 2.0 * moved)
+    return Bounced(
+        centre,
+        deviation,
+        measured[2:4] + found.value[2:4],
+        _WIDENED * found.deviation[2:4],
+        (float(found.value[4]), _WIDENED * float(found.deviation[4])),
+        (float(found.value[5]), _WIDENED * float(found.deviation[5])),
+        eye.noise,
+        found.distance,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Regressed:
+    value: Array
+    deviation: Array
+    distance: float
+
+
+def _regress(features: Array, targets: Array, measured: Array) -> _Regressed:
+    """Regress targets (n, k) on features (n, m), the nearest to what was measured most; errors by leaving one out."""
+    scale = features.std(axis=0) + 1e-12
+    z = (features - measured) / scale
+    distance = (z * z).mean(axis=1)
+    weight = np.maximum(1.0 - distance / np.sort(distance)[int(_NEAR * len(distance))], 0.0)
+    basis = np.concatenate([np.ones((len(z), 1)), z], axis=1)
+    ridge = np.diag([0.0] + [1.0] * z.shape[1])
+    inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
+    beta = inverse @ (basis.T @ (weight[:, None] * targets))
+    leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
+    error = (targets - basis @ beta) / (1.0 - np.minimum(leverage, 0.9))[:, None]
+    deviation = np.sqrt((weight[:, None] * error**2).sum(axis=0) / weight.sum())
+    between = ((features[:, None] - features[None]) ** 2 / scale**2).mean(axis=2)
+    nearest = np.sort(between, axis=1)[:, 1:6].mean(axis=1)
+    return _Regressed(beta[0], deviation, float(np.sort(distance)[:5].mean() / np.quantile(nearest, 0.95)))
+
+
+class _Eye:
+    """How motions are seen: at the poses' times, with their gaps and noise, as a few numbers."""
+
+    def __init__(self, unknowns: Unknowns, poses: Poses, period: float) -> None:
+        self._unknowns, self._t = unknowns, poses.t
+        self._there = np.isfinite(poses.q)
+        self.q = filled(poses)
+        self.noise = noise_level(self.q)
+        self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * _PHASES).astype(int), _PHASES - 1)
+
+    def look(self, forward: Forward, clearance: Array, numbers: Array, rng: np.random.Generator) -> Array | None:
+        """Return the features of a simulated motion; None where it cannot be run."""
+        unknowns = self._unknowns
+        vector = unknowns.nominal()
+        vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
+        vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
+        scene = unknowns.scene_of(vector)
+        # harder than a fit simulates: how soon the bounces die out depends on it
+        contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
+        start = np.concatenate([self.q[0], np.zeros(3)])
+        start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
+        noise = self.noise * math.exp(_NOISE_SCATTER * rng.standard_normal())
+        seen = noise * rng.standard_normal(self.q.shape)
+        edges = np.array([0, len(self._t)])
+        run = forward.run(replace(scene, contact=contact), vector[GAIN], self._t[:1] - 0.1, start[None], edges, self._t)
+        return None if run is None else self.features(run.q + seen)
+
+    def features(self, q: Array) -> Array:
+        """Return reach of the clearances, half the difference of the reaches, then what the motion is like."""
+        whole = self._there.all(axis=1)
+        reach = _reach(self._unknowns, q[whole] if whole.sum() > 100 else q)
+        right, left, top, bottom = reach[1]
+        scatter = []
+        for i in range(3):
+            parts = np.array([
+                q[inside, i].std()
+                for k in range(_PHASES)
+                if (inside := (self._phase == k) & self._there[:, i]).sum() > 8
+            ])  # fmt: skip
+            calm = np.sort(parts)[: max(len(parts) // 3, 1)]
+            scatter += [math.log(calm.mean() + 1e-9), math.log(parts.mean() + 1e-9)] if len(parts) else [0.0, 0.0]
+        sums = [right + left, top + bottom, 0.5 * (left - right), 0.5 * (bottom - top)]
+        return np.array([*sums, *(reach[2] - reach[0]), *(reach[2] - reach[1]), *scatter])
+
+
+def _reach(unknowns: Unknowns, q: Array) -> Array:
+    """Return mean reaches toward the right, left, top and bottom between quantiles, shape (3, 4), in m."""
+    ordered = np.sort(reaches(unknowns.scene, q), axis=0)
+    count = len(ordered)
+    windows = [ordered[int(low * count) : max(int(high * count), int(low * count) + 1)] for low, high in _WINDOWS]
+    return np.stack([window.mean(axis=0) for window in windows])
