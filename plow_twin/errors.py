@@ -59,7 +59,16 @@ class SolverError(PlowTwinError, RuntimeError):
     """The motion could not be continued; the message says when and why."""
 
 
-class LimitError(SolverError):
+class _StoppedError(PlowTwinError):
+    """A run was stopped on its way."""
+
+    def __init__(self, message: str, result: Any, time_s: float) -> None:
+        super().__init__(message)
+        self.result = result
+        self.time_s = time_s
+
+
+class LimitError(_StoppedError, SolverError):
     """A run has reached a limit that its caller set; `result` is the motion up to `time_s`.
 
     Attributes
@@ -70,13 +79,8 @@ class LimitError(SolverError):
         Model time reached in s.
     """
 
-    def __init__(self, message: str, result: Any, time_s: float) -> None:
-        super().__init__(message)
-        self.result = result
-        self.time_s = time_s
 
-
-class RunInterrupted(PlowTwinError, KeyboardInterrupt):
+class RunInterrupted(_StoppedError, KeyboardInterrupt):
     """A run was interrupted by the user; `result` is the motion up to `time_s`.
 
     Attributes
@@ -86,11 +90,6 @@ class RunInterrupted(PlowTwinError, KeyboardInterrupt):
     time_s : float
         Model time reached in s.
     """
-
-    def __init__(self, message: str, result: Any, time_s: float) -> None:
-        super().__init__(message)
-        self.result = result
-        self.time_s = time_s
 
 
 class ToleranceWarning(UserWarning):

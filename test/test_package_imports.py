@@ -61,7 +61,7 @@ LIBRARIES = {
         "rerun",
         "rainflow",
     },
-    "live": {"yaml", "paho"},
+    "live": {"scipy", "yaml", "paho"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", "rich", *MESSAGES},
     "cli": {"click", "rich"},
 }

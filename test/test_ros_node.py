@@ -467,16 +467,31 @@ def test_silence_is_held_and_said(tmp_path: Path) -> None:
 
 
 def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
-    with bench(tmp_path, excitation_timeout=0.05, use_sim_time="true") as running:
+    run = tmp_path / "run"
+    settings = {"use_sim_time": "true", "record_path": str(run), "input_depth": 200}
+    with bench(tmp_path, excitation_timeout=0.05, **settings, **RELIABLE_INPUT) as running:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
-        probe.excitation()(T0, (30e3, 0.0, 0.0))
-        probe.until(lambda: forces, "the answer")
+        send = probe.excitation()
+        # without /clock it waits and says so; what is more than the queue holds is counted
+        for index in range(210):
+            send(T0 + index * MS, (30e3, 0.0, 0.0))
+            probe.pace(index)
+        probe.until_figure("input", "dropped_without_clock", "10")
+        assert "nothing has come on /clock" in probe.status[-1].message and probe.status[-1].level == b"\x01"
+        assert not probe.call(Trigger, f"{running.namespace}/plow_twin/reset", Trigger.Request()).success
+        assert (len(forces), probe.figures("recorder")["written"]) == (0, "0")
+        clock = probe.node.create_publisher(Clock, "/clock", 10)
+        message = Clock()
+        message.clock.sec = T0 // 10**9
+        probe.until(lambda: clock.publish(message) or len(forces) == 200, "200 answers")
         for _ in range(2):
             assert probe.figures("input")["holds"] == "0"
-        assert len(forces) == 1
         assert value(probe.status[-1], "stream") == "running"
-        assert "nothing has come on /clock" in probe.status[-1].message and probe.status[-1].level == b"\x01"
+        assert running.twin.stop() == 0
+    report = replay(run)
+    assert (report.exit_code, report.samples) == (0, 200)
+    assert all(record.log_time_ns >= T0 for record in RunReader(run))
 
 
 def test_diagnostics_go_on_without_a_clock_and_hold_every_documented_key(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from plow_twin.cli.estimate import estimate
 from plow_twin.cli.forecast import forecast
 from plow_twin.cli.info import info
 from plow_twin.cli.live import live
+from plow_twin.cli.record import record
 from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
@@ -58,7 +59,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, live, estimate, forecast, replay, analyse, doctor, view, info, study):
+for _verb in (simulate, demo, live, estimate, forecast, record, replay, analyse, doctor, view, info, study):
     commands.add_command(_verb)
 
 

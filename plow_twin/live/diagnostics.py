@@ -55,6 +55,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "dropped_malformed": "dropped: names do not match the loads of the scene",
         "dropped_not_selected": "ignored: not the selected excitation source",
         "dropped_inactive": "ignored: the node was not active",
+        "dropped_without_clock": "dropped: more than input_depth came before the first /clock under use_sim_time",
         "jumps_back": "stamps stepped back by more than jump_back",
         "jumps_forward": "stamps stepped forward by more than jump_forward",
         "out_of_plane": "samples used although a component outside the plane was not zero",

@@ -53,6 +53,8 @@ class Inputs:
         self.depth = depth
         #: whether samples are taken
         self.active = False
+        #: tells whether the clock that time is to follow has not come yet
+        self.without_clock: Callable[[], bool] = lambda: False
         #: senders of the selected source
         self.senders = Senders()
         #: called when it may be that the followed sender has gone
@@ -126,9 +128,10 @@ class Inputs:
     def _judged(
         self, topic: str, intake: Intake, stamp_ns: int, values: tuple[float, ...], history: RecentStamps | None = None
     ) -> Verdict:
-        if not self.active:
-            intake.refuse(Verdict.INACTIVE)
-            return Verdict.INACTIVE
+        if not self.active or self.without_clock():
+            refused = Verdict.NO_CLOCK if self.active else Verdict.INACTIVE
+            intake.refuse(refused)
+            return refused
         verdict = intake.judge(stamp_ns, values, history=history)
         if verdict.used:
             self._heard_ns[topic] = time.monotonic_ns()

@@ -27,7 +27,7 @@ from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
-from plow_twin.stream.intake import Intake
+from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import Entry, Pose, Snapshot
 from plow_twin.stream.limits import Limits, excitation_limits
 from plow_twin.stream.model_changes import changed_twin
@@ -43,6 +43,7 @@ QUALITY: Final = "quality"
 #: Topic of the estimate.
 ESTIMATE: Final = "estimate"
 _CATCH_UP_S: Final = 0.002
+_LOOK_FOR_CLOCK_HZ: Final = 20.0
 
 
 class Front(Protocol):
@@ -123,6 +124,8 @@ class Runtime:
         self.held_frames = self.corrected_frames = 0
         self._received_ns = 0
         self._kept: Snapshot | None = None
+        self._start_due = True
+        self._early: list[Arrival] = []
         self._q: NDArray[np.float64] | None = None
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
@@ -162,12 +165,15 @@ class Runtime:
             self._pose if self.estimation else None,
             settings.rollback_span,
         )
+        self.inputs.without_clock = lambda: self._start_due and self.without_clock
         self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
 
     def start(self) -> None:
-        """Open the journal; nothing of the front can fail any more."""
-        self.driver.session.start()
-        self.driver.set_model(self._stamp_ns(), model_changes(self._settings))
+        """Open the journal; nothing of the front can fail any more. Without a clock the first sample opens it."""
+        self._start_due = self.without_clock
+        if not self._start_due:
+            self.driver.session.start()
+            self.driver.set_model(self._stamp_ns(), model_changes(self._settings))
 
     def refusals(self, settings: Settings) -> list[str]:
         """Return why parameters cannot be taken while the twin runs."""
@@ -186,6 +192,11 @@ class Runtime:
     def without_clock(self) -> bool:
         """Whether the time is to come from outside and has not come."""
         return self._front.now_ns() == 0
+
+    @property
+    def waits_for_clock(self) -> bool:
+        """Whether the journal is not open yet for want of a clock: nothing can be asked of the twin."""
+        return self._start_due
 
     @property
     def wear_error(self) -> str:
@@ -237,7 +248,7 @@ class Runtime:
 
     def record_status(self, status: DiagnosticStatus) -> None:
         """Put a published status into the recording."""
-        if self.recording:
+        if self.recording and not self._start_due:
             self.recording.message("status", self._stamp_ns(), status)
 
     def activate(self) -> None:
@@ -277,6 +288,8 @@ class Runtime:
             periodic.append((settings.publish_rate, self.publish_due))
         if self.wear_keeper:
             periodic.append((1.0 / settings.wear_save_period, self._save_wear))
+        if self.without_clock:
+            periodic.append((_LOOK_FOR_CLOCK_HZ, self._look_for_clock))
         if self.estimation:
             from plow_twin.live.estimation import RATE_HZ
 
@@ -291,6 +304,8 @@ class Runtime:
         self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
+        if self._start_due:
+            return  # nothing is journaled yet
         if name in MODEL:
             self.driver.set_model(self._stamp_ns(), model_changes(settings))
             self._front.changed()
@@ -299,6 +314,17 @@ class Runtime:
 
     def samples(self, arrived: list[Arrival]) -> None:
         """Take samples in order of arrival."""
+        if self._start_due:
+            self.start()
+        if self._start_due:
+            # kept until the clock comes: one that plays a recording may hear it a little later
+            room = self._settings.input_depth - len(self._early)
+            self._early += arrived[:room]
+            for _ in arrived[room:]:
+                self.driver.intake.refuse(Verdict.NO_CLOCK)
+            return
+        if self._early:
+            arrived, self._early = self._early + arrived, []
         self._received_ns = now_ns = time.monotonic_ns()
         for publication in self.driver.samples(arrived, now_ns):
             self._publish(publication)
@@ -316,6 +342,10 @@ class Runtime:
 
     def clock_tick(self) -> None:
         """Go on under the scene's own loads."""
+        if self._start_due:
+            self.start()
+            if self._start_due:
+                return
         self._received_ns = now_ns = time.monotonic_ns()
         self._publish(self.driver.clock_tick(self._front.now_ns(), now_ns))
         self._advanced()
@@ -419,6 +449,10 @@ class Runtime:
             if self.recording:
                 self.recording.message(ESTIMATE, message.stamp_ns, message)
             self._front.changed()
+
+    def _look_for_clock(self) -> None:
+        if self._start_due and not self.without_clock:
+            self.samples([])
 
     def _save_wear(self) -> None:
         if self.wear_keeper:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.sources import Arrived
+from plow_twin.record.sources import Arrived, Source
 
 #: What a recording can hold, and the numbers of each, with the fields where they stand by default, by type.
 ROLES: Final[dict[str, tuple[str, ...]]] = {
@@ -236,6 +236,22 @@ def _follow(content: Any, path: str) -> float | None:
         return float(value)
     except (TypeError, ValueError):
         return None
+
+
+def roles_by_source(
+    sources: Sequence[Source], path: Path | None, left_out: str = ""
+) -> Iterator[tuple[Source, dict[str, Role]]]:
+    """Yield several recordings of one run, each with the roles whose topics it has, as `read_map` of all together.
+
+    Topics that begin with `left_out` are none of them.
+    """
+    tables = [
+        {topic: kind for topic, kind in source.topics().items() if not left_out or not topic.startswith(left_out)}
+        for source in sources
+    ]
+    roles = read_map(path, {topic: kind for table in tables for topic, kind in table.items()})
+    for source, table in zip(sources, tables, strict=True):
+        yield source, {name: role for name, role in roles.items() if role.topic in table}
 
 
 def read_map(path: Path | None, topics: Mapping[str, str] | None) -> dict[str, Role]:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
-from plow_twin.record.mapping import ROLES, read_map
+from plow_twin.record.bag import beside_folders
+from plow_twin.record.mapping import ROLES, roles_by_source
 from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene
@@ -89,7 +90,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         rows, unfit = {"head_pose": journalled}, 0
         if mapping is not None or not len(journalled):
             folder = path if path.is_dir() else path.parent
-            rows, unfit = _collect([folder, folder / "beside"], mapping, ("head_pose",), own.header.node)
+            rows, unfit = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
         unfit += sum(own.lost.values())
     poses = rows["head_pose"]
     for name, found in (("load", loads), ("measured pose", poses)):
@@ -117,20 +118,8 @@ def _collect(
     """Return the rows of each role that is wanted, stamps in ns, and how many messages did not fit."""
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
     unfit = 0
-    for place in places:
-        if not place.exists() or (place.is_dir() and not any(place.iterdir())):
-            continue
-        try:
-            source = open_source(place)
-        except RecordingError:
-            if len(places) == 1:
-                raise
-            continue
-        topics = source.topics()
-        if node:
-            topics = {topic: kind for topic, kind in topics.items() if not topic.startswith(f"{node}/")}
-        roles = {name: role for name, role in read_map(mapping, topics).items() if name in wanted}
-        names = {role.topic: name for name, role in roles.items()}
+    for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/" if node else ""):
+        names = {role.topic: name for name, role in roles.items() if name in wanted}
         for arrived in source.messages(names.__contains__):
             name = names[arrived.topic]
             found = roles[name].read(arrived)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,20 +17,27 @@ _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
 
 @dataclass
 class TopicCount:
-    """One topic of a recording and how many messages it has."""
+    """One topic of a recording and how many messages it has; QoS and hash of one that the node does not send."""
 
     topic: str
     message_type: str
     count: int = 0
+    qos: str = ""
+    type_hash: str = ""
 
 
 def qos_profile(message_type: str) -> dict[str, Any]:
     """Return the QoS that the node offers: reliable, and latched for the status."""
     latched = message_type == DiagnosticStatus.TYPE
+    return offered(True, latched, 1 if latched else 10)
+
+
+def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
+    """Return a QoS as rosbag2 writes it."""
     return {
         "history": "keep_last",
-        "depth": 1 if latched else 10,
-        "reliability": "reliable",
+        "depth": depth,
+        "reliability": "reliable" if reliable else "best_effort",
         "durability": "transient_local" if latched else "volatile",
         "deadline": dict(_INFINITE),
         "lifespan": dict(_INFINITE),
@@ -43,6 +50,13 @@ def qos_profile(message_type: str) -> dict[str, Any]:
 def qos_text(message_type: str) -> str:
     """Return the QoS as the text that a channel of the file carries."""
     return dump_yaml([qos_profile(message_type)]).strip()
+
+
+def load_yaml(text: str) -> Any:
+    """Return what YAML holds."""
+    from ruamel.yaml import YAML
+
+    return YAML(typ="safe").load(text)
 
 
 def dump_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
@@ -71,7 +85,7 @@ def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[
     totals: dict[str, TopicCount] = {}
     for part in parts:
         for topic in part.topics:
-            total = totals.setdefault(topic.topic, TopicCount(topic.topic, topic.message_type))
+            total = totals.setdefault(topic.topic, replace(topic, count=0))
             total.count += topic.count
 
     def span(some: Sequence[PartFacts]) -> dict[str, Any]:
@@ -90,8 +104,8 @@ def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[
                 "name": topic.topic,
                 "type": topic.message_type,
                 "serialization_format": "cdr",
-                "offered_qos_profiles": [qos_profile(topic.message_type)],
-                "type_description_hash": type_hash(topic.message_type),
+                "offered_qos_profiles": load_yaml(topic.qos) if topic.qos else [qos_profile(topic.message_type)],
+                "type_description_hash": topic.type_hash or type_hash(topic.message_type),
             },
             "message_count": topic.count,
         }

@@ -13,14 +13,23 @@ from plow_twin.record.reader import read_header, run_parts
 
 
 def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path:
-    """Return the recording at `path`, or the one beside it (`<path>_2`, ...), that is being written.
-
-    When there is none within `wait_s` [s] the one at `path` is returned as it is.
+    """Return `running_run`, or else the recording at `path` as it is.
 
     Raises
     ------
     RecordingError
         There is none at all.
+    """
+    found = running_run(path, wait_s, stop)
+    if found is None and not path.exists():
+        raise RecordingError(f"{path}: got no recording within {wait_s:g} s, expected one that is being written")
+    return found or path
+
+
+def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path | None:
+    """Return the recording at `path`, or the one beside it (`<path>_2`, ...), that is being written.
+
+    None when there is none within `wait_s` [s] or before `stop` is true.
     """
     deadline = time.monotonic() + wait_s
     while True:
@@ -34,11 +43,8 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
             except (RecordingError, OSError):  # not begun yet, or just removed
                 continue
         if stop() or time.monotonic() >= deadline:
-            break
+            return None
         time.sleep(POLL_S)
-    if not path.exists():
-        raise RecordingError(f"{path}: got no recording within {wait_s:g} s, expected one that is being written")
-    return path
 
 
 def _candidates(path: Path) -> list[Path]:

@@ -25,6 +25,8 @@ from plow_twin.record.template import Indexes
 from plow_twin.stream.journal import Entry, Sample
 from plow_twin.stream.outputs import Publications
 
+#: Folder in a run's folder with what was recorded beside it; further ones are `beside_2`, ...
+BESIDE: Final = "beside"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 
@@ -201,10 +203,7 @@ class RunWriter:
         return self._shortage(self.folder)
 
     def _shortage(self, folder: Path) -> str | None:
-        free = shutil.disk_usage(folder).free
-        if free < self._min_free_bytes:
-            return f"{free} B free on the disk, expected at least {self._min_free_bytes} B"
-        return None
+        return shortage(folder, self._min_free_bytes)
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
         """Go on in a new part, which is opened before the old one is closed.
@@ -248,10 +247,23 @@ class RunWriter:
         self._part.file.close()
 
 
+def shortage(folder: Path, min_free_bytes: int) -> str | None:
+    """Return what is wrong with the space on the disk of a folder, if anything."""
+    free = shutil.disk_usage(folder).free
+    return f"{free} B free on the disk, expected at least {min_free_bytes} B" if free < min_free_bytes else None
+
+
+def _is_free(folder: Path) -> bool:
+    """Tell whether a recording can be made there; what is recorded beside it may have come first."""
+    if not folder.exists():
+        return True
+    return folder.is_dir() and all(item.name.startswith(BESIDE) and item.is_dir() for item in folder.iterdir())
+
+
 def free_folder(folder: Path) -> Path:
     """Return the folder, or the first of `<folder>_2`, `<folder>_3`, ... when it holds something already."""
     path, number = folder, 1
-    while path.exists() and not (path.is_dir() and not any(path.iterdir())):
+    while not _is_free(path):
         number += 1
         path = folder.with_name(f"{folder.name}_{number}")
     return path
@@ -272,7 +284,7 @@ def make_folder(folder: Path) -> None:
     RecordingError
         It holds something already, or cannot be made.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not _is_free(folder):
         raise RecordingError(f"{folder}: exists already, expected a new or empty folder for the recording")
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,7 @@
 """The program `excitation_publisher`: a scene's load as samples on `excitation`, by the clock or as fast as it goes.
 
+With `--cutting` a stochastic cutting load is added, and the speed along the face goes out on `travel`.
+
 `real` keeps a grid on the steady clock: each sample leaves at its own time, a late one at once, none is left out.
 `fast` is the source of `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
 """
@@ -17,7 +19,7 @@ from typing import Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import TwistStamped, WrenchStamped
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.executors import Executor
@@ -26,7 +28,8 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from plow_twin.errors import SceneError
+from plow_twin.errors import ArgumentError, SceneError
+from plow_twin.live.cutting_load import CuttingLoad, Face
 from plow_twin.live.stop import StopRequested, StopSignals
 from plow_twin.model.loads import compile_loads
 from plow_twin.ros.main import make_executor
@@ -41,6 +44,8 @@ FIRST_STAMP_NS: Final = NS_PER_S
 WINDOW: Final = 200
 #: Samples between two messages on /clock.
 _CLOCK_EVERY: Final = 10
+#: Time between two messages on travel [s].
+_TRAVEL_S: Final = 0.1
 #: Without an answer for so long, the samples under way count as lost [s].
 _STALL_S: Final = 2.0
 #: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
@@ -49,10 +54,11 @@ _STAMP: Final = struct.Struct("<4xiI")
 
 @dataclass(frozen=True)
 class Plan:
-    """What to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`."""
+    """What to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`; `speed` (n,) [m/s] of travel."""
 
     wrench: NDArray[np.float64]
     period_ns: int
+    speed: NDArray[np.float64] | None = None
 
 
 class ExcitationPublisher(Node):
@@ -61,12 +67,15 @@ class ExcitationPublisher(Node):
     def __init__(self, plan: Plan, stop: StopSignals, *, fast: bool) -> None:
         super().__init__("excitation_publisher")
         self._plan = plan
+        self._travel_every = max(1, round(_TRAVEL_S * NS_PER_S / plan.period_ns))
         self._stop = stop
         self._executor: Executor = make_executor()
         self._executor.add_node(self)
         self._message = WrenchStamped()
         self._message.header.frame_id = "slide_frame"
         self._samples = self.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=1000))
+        self._travel = None if plan.speed is None else self.create_publisher(TwistStamped, "travel", 100)
+        self._twist = TwistStamped()
         self._twin_reads = False
         self._answered_ns = FIRST_STAMP_NS
         self.sent = 0
@@ -141,6 +150,10 @@ class ExcitationPublisher(Node):
         force = self._message.wrench.force
         force.x, force.y, self._message.wrench.torque.z = wrench
         self._samples.publish(self._message)
+        if self._travel is not None and self._plan.speed is not None and self.sent % self._travel_every == 0:
+            set_stamp(self._twist.header, stamp_ns)
+            self._twist.twist.linear.z = float(self._plan.speed[self.sent])
+            self._travel.publish(self._twist)
         self.sent += 1
 
     def _on_status(self, message: DiagnosticStatus) -> None:
@@ -153,8 +166,8 @@ class ExcitationPublisher(Node):
         self._answered_ns = max(self._answered_ns, sec * NS_PER_S + nanosec)
 
 
-def plan(scene_name: str, rate_hz: float, seconds: float) -> Plan:
-    """Sample the loads of a scene, gravity not included.
+def plan(scene_name: str, rate_hz: float, seconds: float, cutting: CuttingLoad | None = None) -> Plan:
+    """Sample the loads of a scene, gravity not included, with a cutting load on top.
 
     Raises
     ------
@@ -164,7 +177,9 @@ def plan(scene_name: str, rate_hz: float, seconds: float) -> Plan:
     period_ns = round(NS_PER_S / rate_hz)
     loads = compile_loads(load_scene(scene_name).loads)
     times = np.arange(max(1, round(seconds * NS_PER_S / period_ns)), dtype=np.float64) * (period_ns * 1e-9)
-    return Plan(loads.at(times), period_ns)
+    if cutting is None:
+        return Plan(loads.at(times), period_ns)
+    return Plan(loads.at(times) + cutting.at(times), period_ns, cutting.face.travel(times)[1])
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -174,11 +189,35 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=20.0, help="machine time [s]")
     parser.add_argument("--speed", choices=("real", "fast"), default="real", help="by the clock, or as fast as it goes")
     parser.add_argument("--wait", type=float, default=60.0, help="longest wait for an active twin [s]")
+    group = parser.add_argument_group("cutting load", "added to the scene's loads; the speed goes out on travel")
+    group.add_argument("--cutting", type=float, metavar="N", help="mean force into the face, along x [N]")
+    group.add_argument("--lateral", type=float, default=0.0, metavar="N", help="deviation of the force along y [N]")
+    group.add_argument("--at", type=float, nargs=2, default=(0.0, 0.0), metavar="M", help="point of action x y [m]")
+    group.add_argument("--variation", type=float, default=0.5, help="coefficient of variation (Gamma distribution)")
+    group.add_argument("--correlation", type=float, default=0.05, help="correlation length along the face [m]")
+    group.add_argument("--travel-speed", type=float, default=2.0, help="speed along the face [m/s]")
+    group.add_argument("--face", type=float, default=250.0, help="length of the face, at whose ends it turns [m]")
+    group.add_argument("--turn", type=float, default=4.0, help="time of a turn [s]")
+    group.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     for name in ("rate", "seconds", "wait"):
         if not 0.0 < getattr(options, name) < 1e6:
             parser.error(f"--{name}: got {getattr(options, name)!r}, expected a number between 0 and 1e6")
     return options
+
+
+def _cutting(options: argparse.Namespace) -> CuttingLoad | None:
+    if options.cutting is None:
+        return None
+    return CuttingLoad(
+        Face(options.face, options.travel_speed, options.turn),
+        options.cutting,
+        options.lateral,
+        (options.at[0], options.at[1]),
+        options.variation,
+        options.correlation,
+        options.seed,
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -190,11 +229,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stop = StopSignals()
     try:
         options = _parse(rclpy.utilities.remove_ros_args(given)[1:])
-        samples = plan(options.scene, options.rate, options.seconds)
+        samples = plan(options.scene, options.rate, options.seconds, _cutting(options))
         stop.interrupt = False
     except StopRequested:
         return 0
-    except (SceneError, OSError) as error:
+    except (SceneError, ArgumentError, OSError) as error:
         print(f"excitation_publisher: {error}", file=sys.stderr)
         return 2
     rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)

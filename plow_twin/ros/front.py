@@ -93,7 +93,7 @@ class RosFront:
             self._timers.append(timer)
             made.callback(node.destroy_timer, timer)
         for name in SERVICES:
-            service = node.create_service(Trigger, f"~/{name}", _answer(getattr(runtime, name)))
+            service = node.create_service(Trigger, f"~/{name}", _answer(runtime, getattr(runtime, name)))
             made.callback(node.destroy_service, service)
         runtime.start()
 
@@ -137,10 +137,14 @@ class RosFront:
 
 
 def _answer(
+    runtime: Runtime,
     do: Callable[[], tuple[bool, str]],
 ) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
     def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success, response.message = do()
+        if runtime.waits_for_clock:
+            response.success, response.message = False, "use_sim_time is set and nothing has come on /clock yet"
+        else:
+            response.success, response.message = do()
         return response
 
     return answer

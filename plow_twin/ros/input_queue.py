@@ -19,12 +19,13 @@ _FIRST_CAPACITY: Final = 1024
 
 
 class Taken(NamedTuple):
-    """One message: identity of its publisher, its number there (from 1), time of reception [ns], CDR bytes."""
+    """One message: publisher, its number there (from 1), time of reception [ns], CDR bytes, time of sending [ns]."""
 
     sender: bytes
     number: int
     received_ns: int
     data: bytes
+    sent_ns: int = 0
 
 
 class _Allocator(ctypes.Structure):
@@ -115,6 +116,11 @@ class InputQueue(Waitable):
         node._subscriptions.remove(subscription)
         node.add_waitable(self)
 
+    def flush(self) -> None:
+        """Hand over what waits now."""
+        while taken := self.take_data():
+            self._on_batch(taken)
+
     def close(self) -> None:
         """Take the subscription off the node."""
         self._node.remove_waitable(self)
@@ -146,7 +152,7 @@ class InputQueue(Waitable):
                 if answer:
                     break
                 data = ctypes.string_at(buffer.buffer, buffer.length)
-                taken.append(Taken(bytes(info.publisher), info.number, info.received_ns, data))
+                taken.append(Taken(bytes(info.publisher), info.number, info.received_ns, data, info.source_ns))
             else:
                 answer = 0
         if answer not in (0, _NOTHING_TAKEN):

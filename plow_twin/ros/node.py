@@ -6,7 +6,7 @@ import gc
 import time
 import traceback
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.srv import ChangeState
@@ -24,6 +24,9 @@ from plow_twin.ros.front import RosFront
 from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
+
+#: Reports between two times that a lasting trouble is logged.
+_SAY_AGAIN: Final = 5
 
 
 class TwinNode(LifecycleNode):
@@ -59,6 +62,7 @@ class TwinNode(LifecycleNode):
         # steady: reports go on when /clock is paused
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._refuse_invalid_transitions()
+        self._reports = 0
         self._publish_status()
 
     @property
@@ -207,6 +211,12 @@ class TwinNode(LifecycleNode):
         elif self.lifecycle == "unconfigured" and not self.reason:
             # a manager that configures later, perhaps another scene, need not wait for the compiler then
             self.prepare()
+        runtime = self.runtime
+        if runtime is not None and runtime.without_clock and self._reports % _SAY_AGAIN == 0:
+            self.get_logger().warning(
+                "use_sim_time is set and nothing has come on /clock: waiting, nothing is recorded"
+            )
+        self._reports += 1
         parts = self._health.parts(self.lifecycle, self.reason, self.runtime, time.monotonic_ns())
         array = DiagnosticArray()
         array.header.stamp = self.get_clock().now().to_msg()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any, Final
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,23 +69,23 @@ class _Rows:
     status: NDArray[np.int64]
     error_estimate_m: NDArray[np.float64]
 
-
-@dataclass(frozen=True)
-class AdvanceSeries(_Rows):
-    """Many advances at once: the fields of `Advance`, each with a leading axis of length n."""
-
-    @staticmethod
-    def of(times: NDArray[np.float64], rows: NDArray[np.void]) -> AdvanceSeries:
+    @classmethod
+    def of(cls, times: NDArray[np.float64], rows: NDArray[np.void]) -> Self:
         """Return the fields of the rows that the kernels fill; they share memory.
 
         Parameters
         ----------
         times : ndarray, shape (n,)
             Model times in s.
-        rows : ndarray of `ROW`, shape (n,)
+        rows : ndarray of `ROW`, shape (n,), of a batch (m, n)
             What the kernels filled.
         """
-        return AdvanceSeries(times, *_fields(rows))
+        return cls(times, *(rows[name] for name in _NAMES))
+
+
+@dataclass(frozen=True)
+class AdvanceSeries(_Rows):
+    """Many advances at once: the fields of `Advance`, each with a leading axis of length n."""
 
     def __len__(self) -> int:
         return len(self.t)
@@ -105,19 +105,6 @@ class AdvanceSeries(_Rows):
 class AdvanceBatch(_Rows):
     """Advances of m twins: the fields of `AdvanceSeries`, each but `t` with a leading axis of length m."""
 
-    @staticmethod
-    def of(times: NDArray[np.float64], rows: NDArray[np.void]) -> AdvanceBatch:
-        """Return the fields of the rows that the kernels fill; they share memory.
-
-        Parameters
-        ----------
-        times : ndarray, shape (n,)
-            Model times in s.
-        rows : ndarray of `ROW`, shape (m, n)
-            What the kernels filled.
-        """
-        return AdvanceBatch(times, *_fields(rows))
-
     def __len__(self) -> int:
         return len(self.status)
 
@@ -128,10 +115,6 @@ class AdvanceBatch(_Rows):
 _NAMES: Final = ROW.names or ()
 #: Fields of a row that are arrays.
 _ARRAYS: Final = _NAMES[: _NAMES.index("steps")]
-
-
-def _fields(rows: NDArray[np.void]) -> tuple[NDArray[Any], ...]:
-    return tuple(rows[name] for name in _NAMES)
 
 
 def check_times(now: float, times: NDArray[np.float64]) -> None:

@@ -52,6 +52,8 @@ class Verdict(Enum):
     NOT_SELECTED = "not_selected"
     #: came while the node was not active
     INACTIVE = "inactive"
+    #: came before the clock that time is to follow
+    NO_CLOCK = "without_clock"
 
     @property
     def used(self) -> bool:

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
+from plow_twin.record.bag import beside_folders
 from plow_twin.record.importing import Feed, Walked, Walker
-from plow_twin.record.mapping import Role, read_map
+from plow_twin.record.mapping import Role, read_map, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import Source, open_source
 from plow_twin.run.twin import Twin
@@ -34,9 +35,6 @@ Array = NDArray[np.float64]
 _POSE: Final = ("x", "y", "theta")
 #: Tolerance of a run that is made of another recording.
 _TOLERANCE: Final = 1e-9
-#: Folder beside a run's files where other topics of the same run lie.
-BESIDE: Final = "beside"
-
 #: Receives the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
 
@@ -278,9 +276,12 @@ def _walk_own(
     if reader.status is not FileStatus.COMPLETE:
         losses[reader.status.value] = 1
     unknown: dict[str, str] = {}
-    for place in dict.fromkeys((path if path.is_dir() else path.parent, path.parent / BESIDE, path / BESIDE)):
-        if place.is_dir() and any(place.glob("*.mcap")):
-            unknown |= _measure(place, mapping, header.node, measured)
+    folder = path if path.is_dir() else path.parent
+    places = [place for place in (folder, *beside_folders(folder)) if any(place.glob("*.mcap"))]
+    # what was measured beside the run; the loads are those of the journal
+    for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{header.node}/"):
+        _collect(source, {name: roles[name] for name in roles.keys() - {"excitation", "travel"}}, measured)
+        unknown |= source.losses.unknown_types
     return Analysis(reader.path, "run", predictions, measured, {"samples_used": used}, losses, unknown)
 
 
@@ -300,15 +301,6 @@ def _journal(reader: RunReader) -> Iterator[tuple[NDArray[np.int64], Array, Any]
                     yield (*empty, entry)
                 lost = isinstance(entry, Loss)
             begin = place + 1
-
-
-def _measure(place: Path, mapping: Path | None, node: str, measured: Measured) -> dict[str, str]:
-    """Read what was measured beside a run; the loads are those of the journal."""
-    source = open_source(place)
-    topics = {topic: kind for topic, kind in source.topics().items() if not topic.startswith(f"{node}/")}
-    roles = {name: role for name, role in read_map(mapping, topics).items() if name not in ("excitation", "travel")}
-    _collect(source, roles, measured)
-    return source.losses.unknown_types
 
 
 def _collect(source: Source, roles: Mapping[str, Role], measured: Measured) -> None:

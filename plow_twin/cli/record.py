@@ -1,0 +1,66 @@
+"""`plow-twin record`: other topics beside a run."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import click
+
+from plow_twin.cli.console import (
+    DONE,
+    DONE_WITH_LOSS,
+    json_option,
+    output_console,
+    quiet_option,
+    show_facts,
+)
+
+
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with counted loss.")
+@click.argument("run", type=click.Path(path_type=Path, file_okay=False))
+@click.argument("topics", metavar="[TOPIC]...", nargs=-1)
+@click.option("--all", "every", is_flag=True, help="All topics but hidden ones and those that the run holds itself.")
+@click.option("--exclude", metavar="REGEX", help="With --all: leave these out.")
+@click.option(
+    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long to look for a run [s]."
+)
+@json_option
+@quiet_option
+def record(
+    run: Path, topics: tuple[str, ...], every: bool, exclude: str | None, wait: float, as_json: bool, quiet: bool
+) -> int:
+    """Record topics into the folder of RUN, beside what the twin records, until interrupted.
+
+    RUN is the recording that the twin is making (its `record_path`, or the newest of RUN_2, ...); without one the
+    folder is made, and the twin takes it later.
+    """
+    if not topics and not every:
+        raise click.UsageError("got no topic, expected some or --all")
+    os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels: where the types' texts stand
+    from plow_twin.cli.interruption import interruptible
+    from plow_twin.record.bag import new_beside_folder
+    from plow_twin.record.reader import RunReader
+    from plow_twin.record.running import running_run
+    from plow_twin.record.writer import free_folder
+    from plow_twin.ros.topic_recorder import record_topics
+
+    with interruptible() as stopped:
+        present = running_run(run, wait, stopped)
+        own = {*RunReader(present).header.topics.values()} if present is not None else set()
+        folder = new_beside_folder(present or free_folder(run))
+
+        def say() -> None:
+            if not quiet:
+                click.echo(f"recording to {folder} until interrupted", err=True)
+
+        facts = record_topics(folder, topics, every=every, exclude=exclude, but=own, stopped=stopped, on_started=say)
+    if as_json:
+        click.echo(json.dumps(facts, indent=2, allow_nan=False))
+    elif not quiet:
+        show_facts(output_console(), facts)
+    for name, reason in facts["skipped_topics"].items():
+        click.echo(f"plow-twin: {name}: not recorded: {reason}", err=True)
+    return DONE_WITH_LOSS if facts["lost"] or facts["error"] else DONE

@@ -1,0 +1,135 @@
+"""A cutting load along the face: Gamma-distributed about its mean, correlated in space, new in each pass.
+
+The fluctuation belongs to the coal at a place of the face, not to a time: the same seed gives the same load at the same
+place of the same pass, at any sampling rate and speed.
+
+References
+----------
+Grigoriu, M. (1995). Applied Non-Gaussian Processes. Prentice Hall. (Translation processes: a Gaussian process with
+exponential correlation, taken to another distribution by its quantiles.)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.stats import gamma, norm
+
+from plow_twin.errors import ArgumentError
+
+Array = NDArray[np.float64]
+
+#: Points of the field in a correlation length: between two of them it is straight, which takes 1 % of its variance.
+_POINTS: Final = 25
+
+
+@dataclass(frozen=True)
+class Face:
+    """The face and how the plough runs along it: there at `speed_m_s`, a turn of `turn_s`, and back."""
+
+    length_m: float = 250.0
+    speed_m_s: float = 2.0
+    turn_s: float = 4.0
+
+    def travel(self, t: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Return position [m], signed speed [m/s] and number of the pass at times `t` (n,) [s], from 0 on.
+
+        In a turn the speed falls linearly to zero and rises to the other side; half of it belongs to each pass.
+        """
+        # the distance of the turn is run within the face: its ends are reached in the middle of the turn
+        steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
+        period = steady + self.turn_s
+        number = np.floor(t / period).astype(np.int64)
+        into = t - number * period - 0.5 * self.turn_s
+        ramp = 0.5 * self.turn_s
+        if ramp > 0.0:
+            share = np.clip(np.minimum(1.0 + into / ramp, 1.0 - (into - steady) / ramp), 0.0, 1.0)
+        else:
+            share = np.ones_like(into)
+        begin, end = np.clip(into + ramp, 0.0, ramp), np.clip(into - steady, 0.0, ramp)
+        distance = self.speed_m_s * np.clip(into, 0.0, steady)
+        if ramp > 0.0:
+            distance = distance + self.speed_m_s * (0.5 * begin**2 / ramp + end - 0.5 * end**2 / ramp)
+        back = number % 2 == 1
+        position = np.where(back, self.length_m - distance, distance)
+        return position, np.where(back, -1.0, 1.0) * self.speed_m_s * share, number
+
+
+@dataclass(frozen=True)
+class CuttingLoad:
+    """A force into the face that fluctuates, and a lateral one about zero, at one point of the head.
+
+    Parameters
+    ----------
+    face : Face
+    force_n : float
+        Mean cutting force along x [N], its sign the direction.
+    lateral_n : float
+        Standard deviation of the lateral force along y [N], normal distributed.
+    at_m : tuple of float
+        Point of action from the cavity's centre [m]: M = x Fy - y Fx.
+    variation : float
+        Coefficient of variation of the cutting force.
+    correlation_m : float
+        Distance along the face over which the correlation falls to 1/e [m].
+    seed : int
+
+    Raises
+    ------
+    ArgumentError
+        A number is out of range; the message names it.
+    """
+
+    face: Face
+    force_n: float
+    lateral_n: float = 0.0
+    at_m: tuple[float, float] = (0.0, 0.0)
+    variation: float = 0.5
+    correlation_m: float = 0.05
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        face = self.face
+        for name, value, low in (
+            ("length_m", face.length_m, 1e-3),
+            ("speed_m_s", face.speed_m_s, 1e-6),
+            ("turn_s", face.turn_s, 0.0),
+            ("variation", self.variation, 1e-6),
+            ("correlation_m", self.correlation_m, 1e-4),
+            ("lateral_n", self.lateral_n, 0.0),
+            ("seed", self.seed, 0),
+        ):
+            if not low <= value < math.inf:
+                raise ArgumentError(f"{name}: got {value!r}, expected a finite number >= {low:g}")
+        if face.speed_m_s * face.turn_s >= 2.0 * face.length_m:
+            raise ArgumentError(f"turn_s: got {face.turn_s!r}, expected less than two passes of {face.length_m:g} m")
+        if not all(map(math.isfinite, (self.force_n, *self.at_m))):
+            raise ArgumentError(f"force_n, at_m: got {self.force_n!r}, {self.at_m!r}, expected finite numbers")
+
+    def at(self, t: Array) -> Array:
+        """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3); in a turn it falls with the speed."""
+        position, speed, number = self.face.travel(t)
+        force = np.zeros((len(t), 2))
+        for one in np.unique(number):
+            own = number == one
+            cutting, lateral = self._fields(int(one), position[own])
+            force[own] = np.column_stack([self.force_n * cutting, self.lateral_n * lateral])
+        force *= (np.abs(speed) / self.face.speed_m_s)[:, None]
+        x, y = self.at_m
+        return np.column_stack([force, x * force[:, 1] - y * force[:, 0]])
+
+    def _fields(self, number: int, position: Array) -> tuple[Array, Array]:
+        """Return the cutting force over its mean, and the lateral one over its deviation, in one pass."""
+        step = self.correlation_m / _POINTS
+        grid = np.arange(math.ceil(self.face.length_m / step) + 2) * step
+        rho = math.exp(-1.0 / _POINTS)
+        noise = np.random.default_rng([self.seed, number]).standard_normal((2, len(grid)))
+        noise[:, 1:] *= math.sqrt(1.0 - rho * rho)
+        cutting, lateral = (np.interp(position, grid, lfilter([1.0], [1.0, -rho], row)) for row in noise)
+        shape = self.variation**-2
+        return gamma.ppf(norm.cdf(cutting), shape, scale=1.0 / shape), lateral

@@ -1,0 +1,110 @@
+"""Any messages as their bytes, in a file that every reader of MCAP opens: what is recorded beside a run."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from plow_twin.build import package_version
+from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
+from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, write_metadata
+from plow_twin.record.writer import BESIDE, free_folder, make_folder, shortage
+
+_CHUNK_SIZE: Final = 2**20
+_MIN_FREE_BYTES: Final = 64 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic: its name, type, the `ros2msg` text of the type, its REP-2016 hash and the offered QoS as YAML."""
+
+    name: str
+    message_type: str
+    schema: str
+    type_hash: str
+    qos: str
+
+
+class BagWriter:
+    """Write messages to a new folder; `lost` counts by topic what had no room on the disk.
+
+    A killed process loses what came since the last `flush`.
+
+    Raises
+    ------
+    RecordingError
+        The folder cannot be made.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        make_folder(folder)
+        self.folder = folder
+        self.path = folder / f"{folder.name}_0.mcap"
+        self._file = McapFile(UnbufferedFile(self.path), f"plow_twin {package_version()}")
+        self._chunk = ChunkBuilder("zstd")
+        self._topics: dict[int, Topic] = {}
+        self._waiting: Counter[str] = Counter()
+        self.written: Counter[str] = Counter()
+        self.lost: Counter[str] = Counter()
+        self.error = ""
+
+    def topic(self, topic: Topic) -> int:
+        """Return the number of a new topic."""
+        metadata = {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash}
+        number = self._file.channel(topic.name, topic.message_type, topic.schema.encode(), metadata)
+        self._topics[number] = topic
+        return number
+
+    def add(self, number: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
+        """Write one message of a topic."""
+        times = (max(0, log_time_ns), max(0, publish_time_ns))
+        self._chunk.add(number, sequence & 0xFFFFFFFF, *times, data)
+        self._waiting[self._topics[number].name] += 1
+        if self._chunk.size >= _CHUNK_SIZE:
+            self.flush()
+
+    def flush(self) -> None:
+        """Hand all that was written to the operating system; without room on the disk it is lost and counted."""
+        waiting, self._waiting = self._waiting, Counter()
+        try:
+            short = shortage(self.folder, _MIN_FREE_BYTES) if waiting else None
+            if short is not None:
+                raise OSError(short)
+            self._file.chunk(self._chunk)
+        except OSError as error:  # it goes on when there is room again
+            self._chunk.clear()
+            self.lost.update(waiting)
+            self.error = f"{self.path}: {error.strerror or error}"
+        else:
+            self.written.update(waiting)
+
+    def close(self) -> None:
+        """Write index and `metadata.yaml`.
+
+        Raises
+        ------
+        OSError
+            The disk is full; the file is left without an index.
+        """
+        self.flush()
+        self._file.finish()
+        self._file.close()
+        counts = [
+            TopicCount(topic.name, topic.message_type, self.written[topic.name], topic.qos, topic.type_hash)
+            for topic in self._topics.values()
+        ]
+        custom = {f"plow_twin_lost {name}": str(count) for name, count in self.lost.items()}
+        write_metadata(self.folder, bag_metadata([PartFacts(self.path.name, *self._file.times, counts)], custom))
+
+
+def beside_folders(run: Path) -> Sequence[Path]:
+    """Return the folders in a run's folder with what was recorded beside it."""
+    return sorted(path for path in run.glob(f"{BESIDE}*") if path.is_dir() and any(path.glob("*.mcap")))
+
+
+def new_beside_folder(run: Path) -> Path:
+    """Return the folder for what is recorded beside a run from now on."""
+    return free_folder(run / BESIDE)

@@ -1,0 +1,215 @@
+"""`plow-twin record`: any topics as the bytes that came, with their types' texts, beside a run of the twin."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+
+from plow_twin.record.bag import BagWriter, Topic
+from plow_twin.record.cdr import schema_text
+from plow_twin.record.metadata_yaml import dump_yaml, offered
+from plow_twin.ros.input_queue import InputQueue, Taken
+from plow_twin.ros.main import make_executor
+
+#: Messages that may wait for a slow disk, by topic.
+_DEPTH: Final = 5000
+_LOOK_S: Final = 0.5
+_FLUSH_S: Final = 1.0
+
+
+class TopicRecorder:
+    """Record topics as they appear.
+
+    Parameters
+    ----------
+    node
+        Makes the subscriptions.
+    writer
+        Takes the messages.
+    wanted
+        Asked for each topic that there is.
+    """
+
+    def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
+        self._node, self._writer, self._wanted = node, writer, wanted
+        self._queues: dict[str, InputQueue] = {}
+        #: why a topic is not recorded
+        self.skipped: dict[str, str] = {}
+        #: messages that publishers sent and that never came, by their own numbering
+        self.missed: dict[str, int] = {}
+        self._newest: dict[tuple[str, bytes], int] = {}
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        node.create_timer(_LOOK_S, self.look, clock=steady)
+        node.create_timer(_FLUSH_S, writer.flush, clock=steady)
+
+    @property
+    def topics(self) -> list[str]:
+        """What is recorded."""
+        return sorted(self._queues)
+
+    def look(self) -> None:
+        """Subscribe to what has appeared."""
+        for name, types in self._node.get_topic_names_and_types():
+            publishers = self._node.get_publishers_info_by_topic(name)
+            if publishers and name not in self._queues and name not in self.skipped and self._wanted(name):
+                try:
+                    self._subscribe(name, types, publishers)
+                except (LookupError, ImportError, AttributeError, OSError) as error:
+                    self.skipped[name] = f"{', '.join(types)}: {error}"
+
+    def _subscribe(self, name: str, types: Sequence[str], publishers: Sequence[Any]) -> None:
+        if len(types) != 1:
+            raise LookupError("expected one type")
+        package, folder, kind = types[0].split("/")
+        message_class = getattr(import_module(f"{package}.{folder}"), kind)
+        profiles = [publisher.qos_profile for publisher in publishers]
+        reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles)
+        latched = all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles)
+        topic = Topic(
+            name,
+            types[0],
+            schema_of(types[0]),
+            str(publishers[0].topic_type_hash),
+            dump_yaml([offered(reliable, latched, max(1, profile.depth)) for profile in profiles]).strip(),
+        )
+        subscription = self._node.create_subscription(
+            message_class,
+            name,
+            lambda message: None,
+            QoSProfile(
+                depth=_DEPTH,
+                reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            ),
+            raw=True,
+        )
+        take = partial(self._take, name, self._writer.topic(topic))
+        self._queues[name] = InputQueue(self._node, subscription, _DEPTH, take)
+
+    def _take(self, name: str, number: int, taken: list[Taken]) -> None:
+        for message in taken:
+            key = (name, message.sender)
+            before = self._newest.get(key, message.number - 1)
+            self.missed[name] = self.missed.get(name, 0) + max(0, message.number - before - 1)
+            self._newest[key] = message.number
+            received_ns = message.received_ns or time.time_ns()
+            self._writer.add(number, message.number, received_ns, message.sent_ns or received_ns, message.data)
+
+    def close(self) -> None:
+        """Take what still waits, and end the subscriptions."""
+        for queue in self._queues.values():
+            queue.flush()
+            queue.close()
+
+
+def record_topics(
+    folder: Path,
+    topics: Iterable[str],
+    *,
+    every: bool,
+    exclude: str | None,
+    but: Iterable[str],
+    stopped: Callable[[], bool],
+    on_started: Callable[[], object] = lambda: None,
+) -> Mapping[str, Any]:
+    """Record topics to a new folder until `stopped`; return what was written, lost and skipped by topic.
+
+    Parameters
+    ----------
+    folder
+        Made for the recording.
+    topics
+        Names, without a namespace those of the root.
+    every
+        Take all topics but hidden ones, those in `but`, and those that match `exclude`.
+    """
+    named = {name if name.startswith("/") else f"/{name}" for name in topics}
+    left_out = {*but, "/parameter_events"}
+
+    def wanted(name: str) -> bool:
+        if name in named:
+            return True
+        hidden = any(part.startswith("_") for part in name.split("/"))
+        excluded = exclude is not None and re.search(exclude, name) is not None
+        return every and not hidden and not excluded and name not in left_out
+
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = Node("plow_twin_record", start_parameter_services=False, enable_rosout=False)
+    writer = BagWriter(folder)
+    try:
+        recorder = TopicRecorder(node, writer, wanted)
+        executor = make_executor()
+        executor.add_node(node)
+        on_started()
+        while not stopped():
+            executor.spin_once(timeout_sec=0.1)
+        executor.remove_node(node)
+        recorder.close()
+        writer.close()
+    finally:
+        node.destroy_node()
+        rclpy.utilities.try_shutdown()
+    lost = {name: writer.lost[name] + recorder.missed.get(name, 0) for name in {*writer.lost, *recorder.missed}}
+    return {
+        "file": str(writer.path),
+        "messages": {name: writer.written[name] for name in recorder.topics},
+        "lost": {name: count for name, count in sorted(lost.items()) if count},
+        "skipped_topics": recorder.skipped,
+        "without_publisher": sorted(named - {*recorder.topics, *recorder.skipped}),
+        "error": writer.error,
+    }
+
+
+def schema_of(message_type: str) -> str:
+    """Return the `ros2msg` text of a type with those it uses: from its package, else that of ROS 2 Jazzy.
+
+    Raises
+    ------
+    LookupError
+        Neither is there.
+    """
+    from ament_index_python.packages import get_package_share_directory
+
+    found: dict[str, str] = {}
+    waiting = [message_type]
+    try:
+        while waiting:
+            name = waiting.pop(0)
+            if name in found:
+                continue
+            package, _, kind = name.split("/")
+            text = (Path(get_package_share_directory(package)) / "msg" / f"{kind}.msg").read_text(encoding="utf-8")
+            found[name] = text
+            waiting += _used(text, package)
+    except (LookupError, OSError):
+        return schema_text(message_type)
+    first, *others = found.items()
+    line = "=" * 80
+    return first[1] + "".join(f"\n{line}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in others)
+
+
+_BUILT_IN: Final = re.compile(r"(bool|byte|char|float32|float64|u?int(8|16|32|64)|w?string(<=\d+)?)$")
+
+
+def _used(text: str, package: str) -> list[str]:
+    """Return the types of the fields of a message that are messages."""
+    used = []
+    for line in text.splitlines():
+        kind = line.split("#")[0].strip().partition(" ")[0].partition("[")[0]
+        if not kind or _BUILT_IN.match(kind):
+            continue
+        parts = kind.split("/")
+        used.append(f"{parts[0] if len(parts) > 1 else package}/msg/{parts[-1]}")
+    return used

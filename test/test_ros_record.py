@@ -1,0 +1,72 @@
+"""`plow-twin record` beside a node: other topics as the bytes that came, into the folder of the run."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from ros_processes import bench
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from plow_twin.record.reader import RunReader
+from plow_twin.ros.messages import set_stamp
+from plow_twin.study.analysis.analyse import analyse
+
+COUNT = 300
+T0 = 1_795_000_000_000_000_000
+MAP = "head_pose: {topic: %s/camera/pose, type: geometry_msgs/msg/PoseStamped}\n"
+
+
+def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path) -> None:
+    run, log = tmp_path / "run", tmp_path / "record.log"
+    parameters = {"record_path": run, "qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
+    with bench(tmp_path, excitation_timeout=60.0, **parameters) as running:
+        probe, namespace = running.probe, running.namespace
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        notes = probe.node.create_publisher(DiagnosticArray, "notes", latched)
+        note = DiagnosticArray(status=[DiagnosticStatus(name="n", values=[KeyValue(key="k", value="v")])])
+        notes.publish(note)
+        camera = probe.node.create_publisher(PoseStamped, "camera/pose", 1000)
+        others = f"^(?!{namespace}/)"  # other tests may run beside this one
+        command = [sys.executable, "-m", "plow_twin", "record", str(run), "--all", "--exclude", others, "--json"]
+        with log.open("wb") as stream:
+            recorder = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stream, text=True)
+        try:
+            probe.until(lambda: camera.get_subscription_count() == 1, "the recorder")
+            send = probe.excitation()
+            for index in range(COUNT):
+                send(T0 + index * 1_000_000, (32e3, 0.0, -45e3))
+                pose = PoseStamped()
+                set_stamp(pose.header, T0 + index * 1_000_000)
+                pose.pose.position.x = float(index)
+                camera.publish(pose)
+                probe.pace(index)
+            probe.until_figure("input", "samples_used", str(COUNT))
+            recorder.send_signal(signal.SIGTERM)
+            out, _ = recorder.communicate(timeout=20)
+        finally:
+            recorder.kill()
+            recorder.wait()
+    assert recorder.returncode == 0, log.read_text()
+    facts = json.loads(out)
+    assert facts["messages"][f"{namespace}/camera/pose"] == COUNT and facts["messages"][f"{namespace}/notes"] == 1
+    assert facts["lost"] == {} and facts["skipped_topics"] == {}
+    # what the run holds itself is left out
+    assert not facts["messages"].keys() & {*RunReader(run).header.topics.values()}
+    with Reader(run / "beside") as reader:
+        store = get_typestore(Stores.EMPTY)
+        for connection in reader.connections:
+            store.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+        poses = [store.deserialize_cdr(data, c.msgtype) for c, _, data in reader.messages() if "camera" in c.topic]
+        assert [pose.pose.position.x for pose in poses] == list(np.arange(COUNT, dtype=float))
+    (tmp_path / "map.yaml").write_text(MAP % namespace)
+    found = analyse(run, mapping=tmp_path / "map.yaml")
+    assert found.comparisons(found.predictions[0])["x"].n == COUNT
