@@ -10,6 +10,7 @@ from typing import Any, Final
 from plow_twin.live import diagnostics
 from plow_twin.live.bridge.feeder import Feeder
 from plow_twin.live.bridge.source import Bridge, BridgeError
+from plow_twin.live.load_model import read_load_model
 from plow_twin.live.parameters import Settings
 from plow_twin.live.part import Part
 from plow_twin.live.runtime import ESTIMATE, QUALITY, Runtime
@@ -68,9 +69,11 @@ class BridgeFront:
         self._bridge, self._settings, self._say = bridge, settings, say
         self.say_error = on_error
         self._said: Part | None = None
-        self.roles = _roles(bridge, mapping, settings.excitation_source)
+        model = read_load_model(mapping)
+        self.roles = _roles(bridge, mapping, settings.excitation_source, model is not None)
+        self._connected = {"excitation" if name == "drive" else name for name in self.roles}
         self.runtime = Runtime(self, settings, prepared)
-        self._feeder = Feeder(self.roles, self.runtime)
+        self._feeder = Feeder(self.roles, self.runtime, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
 
     def now_ns(self) -> int:
@@ -125,7 +128,7 @@ class BridgeFront:
             next_due = min(timer.due for timer in periodic)
             messages = bridge.poll(max(0.0, min(_POLL_S, next_due - time.monotonic())))
             inputs.lost = bridge.lost
-            inputs.publishers |= dict.fromkeys(inputs.publishers.keys() & self.roles.keys(), int(bridge.connected))
+            inputs.publishers |= dict.fromkeys(self._connected, int(bridge.connected))
             if messages:
                 if not bridge.ends:
                     inputs.waited(len(messages), (time.time_ns() - messages[0].log_time_ns) * 1e-9)
@@ -156,7 +159,7 @@ class _Timer:
             self._do()
 
 
-def _roles(bridge: Bridge, mapping: Path | None, source: str) -> dict[str, Role]:
+def _roles(bridge: Bridge, mapping: Path | None, source: str, modelled: bool) -> dict[str, Role]:
     """Return the roles that the twin takes."""
     if source == "tool_forces":
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")
@@ -164,10 +167,12 @@ def _roles(bridge: Bridge, mapping: Path | None, source: str) -> dict[str, Role]
     if topics is None and mapping is None:
         raise BridgeError("mapping: got none, expected one that names the topics")
     roles = {name: role for name, role in read_map(mapping, topics).items() if name in _TAKEN}
-    if source == "excitation" and "excitation" not in roles:
+    if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
+        raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
+    if source == "excitation" and not {"drive", "excitation"} & roles.keys():
         there = "; ".join(f"{topic} ({kind.partition(':')[2]})" for topic, kind in (topics or {}).items())
         raise BridgeError(f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m")
     return roles
 
 
-_TAKEN: Final = ("excitation", "travel", "head_pose")
+_TAKEN: Final = ("excitation", "drive", "travel", "head_pose")

@@ -26,6 +26,7 @@ from plow_twin.stream.journal import (
     SetModel,
     SetWear,
     Snapshot,
+    Spread,
     Travel,
     Unload,
 )
@@ -48,6 +49,7 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "model": SetModel,
     "restore": Restore,
     "mark": Mark,
+    "spread": Spread,
     "parameter": Parameter,
     "pose": Pose,
     "estimated": Estimated,

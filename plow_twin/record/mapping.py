@@ -21,7 +21,10 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "travel": ("speed",),
     "gaps": PAIR_NAMES,
     "forces": PAIR_NAMES,
+    "drive": ("power", "chain_force", "speed", "depth", "position"),
 }
+#: Key of a mapping that is no role: how a live twin makes the load of what the drive tells.
+_LOAD_MODEL: Final = "load_model"
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("excitation", "geometry_msgs/msg/WrenchStamped"): _WRENCH,
@@ -65,6 +68,7 @@ UNITS: Final[dict[str, dict[str, float]]] = {
     "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
     "angle": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0},
+    "power": {"W": 1.0, "kW": 1e3, "MW": 1e6},
     "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
 }
 _QUANTITIES: Final = {
@@ -73,6 +77,10 @@ _QUANTITIES: Final = {
     **{("head_pose", name): "length" for name in ("x", "y")},
     ("head_pose", "theta"): "angle",
     ("travel", "speed"): "speed",
+    ("drive", "power"): "power",
+    ("drive", "chain_force"): "force",
+    ("drive", "speed"): "speed",
+    **{("drive", name): "length" for name in ("depth", "position")},
     **{("gaps", name): "length" for name in PAIR_NAMES},
     **{("forces", name): "force" for name in PAIR_NAMES},
 }
@@ -266,7 +274,7 @@ def read_map(path: Path | None, topics: Mapping[str, str] | None) -> dict[str, R
     """
     if path is None:
         topics = topics or {}
-        return {role: found for role in ROLES if (found := _guess(role, topics)) is not None}
+        return {role: found for role in _NAMES if (found := _guess(role, topics)) is not None}
     import yaml
 
     try:
@@ -276,7 +284,7 @@ def read_map(path: Path | None, topics: Mapping[str, str] | None) -> dict[str, R
         raise RecordingError(f"{path}: cannot be read as YAML: {error}") from error
     if not isinstance(given, dict) or not given:
         raise RecordingError(f"{path}: got {type(given).__name__}, expected a mapping with {', '.join(ROLES)}")
-    return {str(role): _role(path, str(role), entry, topics) for role, entry in given.items()}
+    return {str(role): _role(path, str(role), entry, topics) for role, entry in given.items() if role != _LOAD_MODEL}
 
 
 def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str] | None) -> Role:

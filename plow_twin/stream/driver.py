@@ -27,6 +27,7 @@ from plow_twin.stream.journal import (
     SetModel,
     SetWear,
     Snapshot,
+    Spread,
     Travel,
     Unload,
 )
@@ -201,6 +202,10 @@ class Driver:
     def parameter(self, name: str, value: ParameterValue) -> None:
         """Journal a parameter that has changed."""
         self.session.apply(Parameter(name, value))
+
+    def spread(self, stamp_ns: int, deviation: Sequence[float]) -> None:
+        """Journal how well the load is known from a stamp on: deviations of Fx, Fy [N], M [N m]."""
+        self.session.apply(Spread(stamp_ns, tuple(deviation)))
 
     def mark(self, stamp_ns: int, text: str) -> None:
         """Journal a mark."""

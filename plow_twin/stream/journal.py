@@ -90,6 +90,14 @@ class Mark:
 
 
 @dataclass(frozen=True)
+class Spread:
+    """The load is known to these standard deviations, Fx, Fy [N] and M [N m], from `stamp_ns` on; moves nothing."""
+
+    stamp_ns: int
+    deviation: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A parameter that the model sees has taken `value`."""
 
@@ -156,6 +164,7 @@ Entry = (
     | SetModel
     | Restore
     | Mark
+    | Spread
     | Parameter
     | Pose
     | Estimated

@@ -28,6 +28,7 @@ from plow_twin.stream.journal import (
     SetModel,
     SetWear,
     Snapshot,
+    Spread,
     Travel,
     Unload,
 )
@@ -163,7 +164,7 @@ class Session:
             case Restore(_, data):
                 self._on_entry(entry)
                 self._restore_motion(data)
-            case Parameter() | Pose() | Mark():
+            case Parameter() | Pose() | Mark() | Spread():
                 # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):

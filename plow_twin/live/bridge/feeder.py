@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from plow_twin.live.load_model import LoadModel
 from plow_twin.live.runtime import Runtime
 from plow_twin.record.mapping import Role
 from plow_twin.record.sources import Arrived
@@ -13,6 +14,8 @@ from plow_twin.stream.intake import Intake, Verdict
 
 #: A number that falls by more than this is that of a sender that has begun anew.
 _RESTART = 1000
+#: A deviation of the load that changes by a smaller share is not journaled anew.
+_NOTABLE = 0.02
 
 
 class Feeder:
@@ -24,9 +27,13 @@ class Feeder:
         The mapping; roles that the twin does not take are passed over.
     runtime
         The live twin.
+    model
+        What makes a load of what the drive tells; None: the load itself comes.
     """
 
-    def __init__(self, roles: Mapping[str, Role], runtime: Runtime) -> None:
+    def __init__(self, roles: Mapping[str, Role], runtime: Runtime, model: LoadModel | None = None) -> None:
+        self._model = model
+        self._deviation = (0.0, 0.0, 0.0)
         self._runtime = runtime
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
@@ -48,7 +55,7 @@ class Feeder:
             for name, role in roles:
                 if len(roles) > 1 and role.empty(arrived):
                     continue  # another role's row
-                if name == "excitation":
+                if name in ("excitation", "drive"):
                     samples += self._sample(role, arrived)
                 elif name in self._optional:
                     self._measured(name, role, arrived)
@@ -76,7 +83,17 @@ class Feeder:
         if not role.plausible(values):
             intake.refuse(Verdict.IMPLAUSIBLE)
             return []
-        return [(stamp_ns, (values["fx"], values["fy"], values["m"]))]
+        if self._model is None:
+            return [(stamp_ns, (values["fx"], values["fy"], values["m"]))]
+        load = self._model.wrench(values)
+        if load is None:
+            intake.refuse(Verdict.MALFORMED)
+            return []
+        wrench, deviation = load
+        if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
+            self._deviation = deviation
+            self._runtime.driver.spread(stamp_ns, deviation)
+        return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
         """Return the sender, its number of the message (one without is counted here), and whether it came before."""

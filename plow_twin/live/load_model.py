@@ -1,0 +1,174 @@
+"""From what a plough's drive tells to the load on its head, with an interval: nobody measures the wrench itself.
+
+The drive pulls the chain with C = efficiency P / v (or C is measured); what is left after the drag of chain and plough
+is the cutting force along the face, Z = C - idle. A second opinion is the coal: Z = specific_force * depth *
+resistance(position). The two are averaged by their variances. Force into the face Fx = push_ratio Z, lateral
+Fy = lateral_ratio Z, both at one point of the head: M = x Fy - y Fx. All coefficients have a standard deviation, which
+goes on to the result. They are a machine's own, from idle runs and from weighing; none is published for the paper's
+machine, so none has a default.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from plow_twin.errors import RecordingError
+
+#: Key of the mapping file that holds the coefficients.
+KEY: Final = "load_model"
+#: Below that speed [m/s] the power says nothing of the chain's force.
+SLOWEST_M_S: Final = 0.1
+#: 5 % and 95 % points of a normal distribution, in standard deviations.
+POINT_90: Final = 1.6448536269514722
+
+Number = tuple[float, float]
+Wrench = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class LoadModel:
+    """Coefficients, each a mean and a standard deviation.
+
+    Attributes
+    ----------
+    push_ratio : tuple of float
+        Force into the face over the cutting force.
+    at_m : tuple of float
+        Point of action x, y [m] from the cavity's centre.
+    lateral_ratio : tuple of float
+        Lateral force over the cutting force.
+    efficiency : tuple of float, optional
+        Power at the chain over motor power.
+    idle_force_n : tuple of float
+        Pull of the chain when nothing is cut [N].
+    specific_force_n_m : tuple of float, optional
+        Cutting force per metre of depth [N/m].
+    resistance : tuple of tuples, optional
+        Places along the face [m] and the factors of the specific force there, straight between two of them.
+    """
+
+    push_ratio: Number
+    at_m: tuple[float, float]
+    lateral_ratio: Number = (0.0, 0.0)
+    efficiency: Number | None = None
+    idle_force_n: Number = (0.0, 0.0)
+    specific_force_n_m: Number | None = None
+    resistance: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+
+    def cutting_force(self, drive: Mapping[str, float]) -> Number | None:
+        """Return mean and deviation of the cutting force [N], or None when the drive does not tell enough.
+
+        `drive` has some of `power` [W], `chain_force` [N], `speed` [m/s], `depth` and `position` [m]; NaN counts as
+        not told. Without travel nothing is cut.
+        """
+        told = {name: value for name, value in drive.items() if math.isfinite(value)}
+        if abs(told.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in told:
+            return 0.0, 0.0
+        opinions = [found for found in (self._by_drive(told), self._by_coal(told)) if found is not None]
+        if not opinions:
+            return None
+        weights = [1.0 / max(deviation, 1.0) ** 2 for _, deviation in opinions]
+        total = sum(weights)
+        mean = sum(weight * value for weight, (value, _) in zip(weights, opinions, strict=True)) / total
+        return max(mean, 0.0), math.sqrt(1.0 / total)
+
+    def wrench(self, drive: Mapping[str, float]) -> tuple[Wrench, Wrench] | None:
+        """Return Fx, Fy [N], M [N m], and their standard deviations, or None when the drive does not tell enough."""
+        force = self.cutting_force(drive)
+        if force is None:
+            return None
+        z, spread = force
+        push, lateral = self.push_ratio, self.lateral_ratio
+        fx, fy = push[0] * z, lateral[0] * z
+        var_x = (push[0] * spread) ** 2 + (z * push[1]) ** 2 + (spread * push[1]) ** 2
+        var_y = (lateral[0] * spread) ** 2 + (z * lateral[1]) ** 2 + (spread * lateral[1]) ** 2
+        both = push[0] * lateral[0] * spread**2
+        x, y = self.at_m
+        var_m = x * x * var_y + y * y * var_x - 2.0 * x * y * both
+        return (fx, fy, x * fy - y * fx), (math.sqrt(var_x), math.sqrt(var_y), math.sqrt(max(var_m, 0.0)))
+
+    def _by_drive(self, told: Mapping[str, float]) -> Number | None:
+        if "chain_force" in told:
+            pull, deviation = told["chain_force"], 0.0
+        elif self.efficiency is not None and "power" in told and abs(told.get("speed", 0.0)) >= SLOWEST_M_S:
+            share = told["power"] / abs(told["speed"])
+            pull, deviation = self.efficiency[0] * share, self.efficiency[1] * abs(share)
+        else:
+            return None
+        return pull - self.idle_force_n[0], math.hypot(deviation, self.idle_force_n[1])
+
+    def _by_coal(self, told: Mapping[str, float]) -> Number | None:
+        if self.specific_force_n_m is None or "depth" not in told:
+            return None
+        factor = 1.0
+        if self.resistance is not None:
+            if "position" not in told:
+                return None
+            factor = float(np.interp(told["position"], *self.resistance))
+        force, deviation = self.specific_force_n_m
+        return force * factor * told["depth"], deviation * factor * told["depth"]
+
+
+def read_load_model(path: Path | None) -> LoadModel | None:
+    """Return the load model of a mapping file, or None when it has none.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be used; the message names key, value got and value expected.
+    """
+    if path is None:
+        return None
+    import yaml
+
+    given: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
+    entry = given.get(KEY) if isinstance(given, dict) else None
+    if entry is None:
+        return None
+    names = [spec.name for spec in fields(LoadModel)]
+    if not isinstance(entry, dict) or not set(entry) <= set(names) or not {"push_ratio", "at_m"} <= set(entry):
+        raise RecordingError(
+            f"{path}: {KEY}: got {entry!r}, expected push_ratio, at_m and others of {', '.join(names)}"
+        )
+    if not {"efficiency", "specific_force_n_m", "idle_force_n"} & set(entry):
+        raise RecordingError(
+            f"{path}: {KEY}: expected efficiency, specific_force_n_m or idle_force_n (for chain_force)"
+        )
+    values: dict[str, Any] = {
+        name: _resistance(path, value) if name == "resistance" else _pair(path, name, value)
+        for name, value in entry.items()
+    }
+    return LoadModel(**values)
+
+
+def _pair(path: Path, name: str, given: Any) -> Number:
+    """Return mean and deviation, or x and y."""
+    try:
+        first, second = (float(value) for value in given)
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"{path}: {KEY}: {name}: got {given!r}, expected two numbers") from error
+    if not math.isfinite(first + second) or (name != "at_m" and second < 0.0):
+        expected = "two finite numbers" if name == "at_m" else "a mean and a deviation >= 0"
+        raise RecordingError(f"{path}: {KEY}: {name}: got {given!r}, expected {expected}")
+    return first, second
+
+
+def _resistance(path: Path, given: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    try:
+        places = tuple(float(value) for value in given["position_m"])
+        factors = tuple(float(value) for value in given["factor"])
+    except (TypeError, ValueError, KeyError) as error:
+        raise RecordingError(f"{path}: {KEY}: resistance: got {given!r}, expected position_m and factor") from error
+    rising = all(later > earlier for earlier, later in pairwise(places))
+    if not places or len(places) != len(factors) or not rising or not all(0.0 <= value < math.inf for value in factors):
+        raise RecordingError(
+            f"{path}: {KEY}: resistance: got {given!r}, expected rising position_m and as many factors >= 0"
+        )
+    return places, factors

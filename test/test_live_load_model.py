@@ -1,0 +1,110 @@
+"""The load made of what the drive tells: figures by hand, the interval by chance, and the way into the journal."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.live import parameters
+from plow_twin.live.bridge.files import Files
+from plow_twin.live.front import BridgeFront
+from plow_twin.live.load_model import LoadModel, read_load_model
+from plow_twin.live.solver_start import Preparation
+from plow_twin.record.reader import EntryRecord, RunReader
+from plow_twin.record.replay import replay
+from plow_twin.stream.journal import Sample, Spread
+
+MODEL = LoadModel(
+    push_ratio=(0.5, 0.1),
+    at_m=(0.1, 0.7),
+    lateral_ratio=(0.1, 0.02),
+    efficiency=(0.8, 0.05),
+    idle_force_n=(20e3, 3e3),
+    specific_force_n_m=(1e6, 4e5),
+)
+
+
+def test_power_speed_and_depth_give_the_load_and_its_deviation() -> None:
+    by_drive, spread = MODEL.cutting_force({"power": 200e3, "speed": -2.0})  # type: ignore[misc]
+    assert by_drive == pytest.approx(0.8 * 100e3 - 20e3)
+    assert spread == pytest.approx(math.hypot(0.05 * 100e3, 3e3))
+    by_coal, wide = MODEL.cutting_force({"depth": 0.08})  # type: ignore[misc]
+    assert (by_coal, wide) == (pytest.approx(80e3), pytest.approx(32e3))
+    both, narrow = MODEL.cutting_force({"power": 200e3, "speed": 2.0, "depth": 0.08, "position": math.nan})  # type: ignore[misc]
+    assert 60e3 < both < 62e3 and narrow < spread
+    assert MODEL.cutting_force({"power": 5e3, "speed": 0.01}) == (0.0, 0.0)
+    assert MODEL.cutting_force({"power": 5e3}) is None and MODEL.wrench({}) is None
+    assert MODEL.cutting_force({"chain_force": 1e3})[0] == 0.0  # type: ignore[index]  # the chain alone, nothing is cut
+
+
+def test_the_interval_holds_what_coefficients_drawn_by_chance_give() -> None:
+    drive = {"power": 200e3, "speed": 2.0}
+    found = MODEL.wrench(drive)
+    assert found is not None
+    rng = np.random.default_rng(5)
+    n = 200_000
+    assert MODEL.efficiency is not None
+    z = rng.normal(*MODEL.efficiency, n) * 100e3 - rng.normal(*MODEL.idle_force_n, n)
+    fx, fy = rng.normal(*MODEL.push_ratio, n) * z, rng.normal(*MODEL.lateral_ratio, n) * z
+    drawn = np.stack([fx, fy, 0.1 * fy - 0.7 * fx])
+    np.testing.assert_allclose(found[0], drawn.mean(axis=1), rtol=0.01)
+    np.testing.assert_allclose(found[1], drawn.std(axis=1), rtol=0.02)
+
+
+MAP = """
+drive: {topic: drive, fields: {power: p, speed: v, depth: d, position: s}, unit: {power: kW, depth: cm}}
+travel: {topic: drive, fields: {speed: v}}
+load_model:
+  push_ratio: [0.5, 0.1]
+  at_m: [0.1, 0.7]
+  efficiency: [0.8, 0.05]
+  idle_force_n: [20000, 3000]
+  specific_force_n_m: [1.0e6, 4.0e5]
+  resistance: {position_m: [0, 100, 200], factor: [1.0, 1.5, 0.8]}
+"""
+
+
+def test_telemetry_of_the_drive_runs_the_twin_and_its_interval_is_in_the_journal(tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(MAP)
+    rows = [f"{0.1 * k:.1f},{200 + 20 * math.sin(k)},2.0,8,{0.2 * k}" for k in range(100)]
+    (tmp_path / "drive.csv").write_text("\n".join(["t,p,v,d,s", *rows, "10.0,,,,", "10.1,x,2,8,20"]) + "\n")
+    settings = parameters.settings({"record_path": str(tmp_path / "run")})
+    prepared = Preparation(settings).result(lambda: False)
+    files = Files([tmp_path / "drive.csv"], follow=False)
+    front = BridgeFront(files, tmp_path / "map.yaml", settings, prepared, lambda *_: None, print)
+    assert front.run(lambda: False) == []
+    values = front.parts()["input"][2]
+    assert (values["samples_used"], values["dropped_malformed"], values["travel_used"]) == ("100", "1", "101")
+    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    first = next(entry for entry in entries if isinstance(entry, Sample))
+    model = read_load_model(tmp_path / "map.yaml")
+    assert model is not None
+    expected = model.wrench({"power": 200e3, "speed": 2.0, "depth": 0.08, "position": 0.0})
+    assert expected is not None and first.wrench == pytest.approx(expected[0])
+    spreads = [entry for entry in entries if isinstance(entry, Spread)]
+    assert spreads[0].deviation == pytest.approx(expected[1]) and 1 < len(spreads) < 100
+    assert replay(tmp_path / "run").exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "load_model: {push_ratio: [0.5, 0.1], at_m: [0, 0], efficiency: 0.8}",
+            "efficiency: got 0.8, expected two numbers",
+        ),
+        ("load_model: {push_ratio: [0.5, -0.1], at_m: [0, 0], efficiency: [1, 0]}", "a deviation >= 0"),
+        ("load_model: {push_ratio: [0.5, 0.1]}", "expected push_ratio, at_m"),
+        ("load_model: {push_ratio: [0.5, 0.1], at_m: [0, 0]}", "expected efficiency, specific_force_n_m or"),
+        ("load_model: {push_ratio: [1, 0], at_m: [0, 0], idle_force_n: [0, 0], resistance: {}}", "resistance"),
+    ],
+)
+def test_coefficients_that_cannot_be_used_are_named(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(text)
+    with pytest.raises(PlowTwinError) as caught:
+        read_load_model(tmp_path / "map.yaml")
+    assert said in str(caught.value)
