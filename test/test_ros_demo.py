@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 from ros_processes import ROOT
 
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.start import range_of_motion
 from plow_twin.model.loads import compile_loads
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.ros.demo import program
+from plow_twin.ros.excitation_publisher import plan
 from plow_twin.ros.run_summary import summarise
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
@@ -66,6 +69,16 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     assert 0.025 < low < horizontal < high
     for shares in summary.contact_sets.values():
         assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_the_synthetic_sensor_is_of_a_wider_guide() -> None:
+    found = plan("paper", 1000.0, 7.0, sensor_mm=3.0)
+    assert found.pose is not None and found.pose.shape == (700, 3) and found.pose_every == 10
+    poses, _ = Poses.of(np.arange(700) * 0.01, found.pose)
+    reached = range_of_motion(load_scene("paper"), poses)[0]
+    series = Twin(load_scene("paper"), excitation="sampled").advance_samples(np.arange(7000) * 1e-3, found.wrench)
+    own = range_of_motion(load_scene("paper"), Poses.of(np.arange(700) * 0.01, series.q[::10])[0])[0]
+    assert reached - own == pytest.approx([3e-3, 3e-3], abs=2e-3)
 
 
 def test_a_program_is_named_as_a_shell_in_this_folder_finds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

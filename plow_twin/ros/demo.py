@@ -31,6 +31,10 @@ DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
+#: How much wider than the scene says the guide of the synthetic sensor's head is [mm].
+_SENSOR_MM: Final = 1.5
+#: Shortest demo that has an estimate [s], its window and its interval [s].
+_ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
 #: Without progress for so long, the run has failed [s].
 _STUCK_S: Final = 30.0
 
@@ -130,6 +134,18 @@ def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]
     publisher = ["plow_twin.ros.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
+    estimating = seconds >= _ESTIMATED_S
+    if estimating:
+        node += [
+            "-p",
+            "estimate:=true",
+            "-p",
+            f"estimate_window:={_WINDOW_S}",
+            "-p",
+            f"estimate_interval:={_INTERVAL_S}",
+        ]
+        node += ["-p", "qos_overrides./head_pose.subscription.reliability:=reliable"]
+        publisher += ["--sensor", repr(_SENSOR_MM)]
     with _progress(console, quiet) as bar, _watching() as (watch, spin), _process(node, folder / "node.log") as twin:
         task = bar.add_task("compiling the solver", total=None)
         _until(lambda: watch.text("state", "lifecycle") == "active", spin, twin, _START_TIMEOUT_S)
@@ -137,6 +153,9 @@ def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool
         with _process([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
             _follow(source, twin, watch, spin, bar, task)
             sent = int(json.loads(source.output().splitlines()[-1])["sent"])
+        if estimating:
+            bar.update(task, description="estimating", total=None)
+            _until(lambda: watch.number("estimate", "estimates") or watch.text("estimate", "error"), spin, twin, 120.0)
         reports = watch.reports
         _until(lambda: watch.reports > reports, spin, twin, _STOP_TIMEOUT_S)
         twin.stop()
@@ -283,9 +302,7 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
     for sense, shares in summary.contact_sets.items():
         sets = "  ".join(f"{corners} {share:.1%}" for corners, share in shares.items() if share >= 0.001)
         console.print(f"contact sets {sense}: {sets or 'none'}", highlight=False, soft_wrap=True)
-    for name, (value, low, high) in summary.clearance.items():
-        interval = f"prior {low * 1e3:.6f} .. {high * 1e3:.6f} mm"
-        console.print(f"{name} clearance {value * 1e3:.6f} mm ({interval})", highlight=False)
+    _print_clearances(console, summary)
     wear = (
         "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e9:.3f} nm, deepest pad"
     )
@@ -298,6 +315,22 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
     factor = watch.text("state", "real_time_factor_mean")
     p50, p99 = watch.text("output", "latency_p50_ms"), watch.text("output", "latency_p99_ms")
     console.print(f"real-time factor {factor}; latency p50 {p50} ms, p99 {p99} ms", highlight=False)
+
+
+def _print_clearances(console: Console, summary: RunSummary) -> None:
+    """Print what is estimated from the synthetic sensor, or what the model and its prior say where nothing is."""
+    for name, (value, low, high) in summary.clearance.items():
+        found = None if summary.estimate is None else summary.estimate[name]
+        if found is None:
+            text = f"{value * 1e3:.6f} mm (prior {low * 1e3:.6f} .. {high * 1e3:.6f} mm)"
+        elif found["state"] == "estimated":
+            true = 1e3 * getattr(summary.scene.clearance, f"{name}_m") + _SENSOR_MM
+            low, high = 1e3 * found["p05_m"], 1e3 * found["p95_m"]
+            interval = f"estimated {low:.3f} .. {high:.3f} mm"
+            text = f"{1e3 * found['mean_m']:.3f} mm ({interval}; true of the synthetic sensor: {true:.3f} mm)"
+        else:
+            text = f"{found['state']} from the synthetic sensor"
+        console.print(f"{name} clearance {text}", highlight=False, soft_wrap=True)
 
 
 def _force_table(summary: RunSummary) -> Table:

@@ -1,5 +1,8 @@
 """The program `excitation_publisher`: a scene's load as samples on `excitation`, by the clock or as fast as it goes.
 
+With `--sensor` the pose of a head in a wider guide goes out on `head_pose`, as a noisy sensor would measure it: a
+synthetic one, whose truth is known.
+
 With `--cutting` a stochastic cutting load is added, and the speed along the face goes out on `travel`.
 
 `real` keeps a grid on the steady clock: each sample leaves at its own time, a late one at once, none is left out.
@@ -10,16 +13,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import struct
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import TwistStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.executors import Executor
@@ -32,9 +36,11 @@ from plow_twin.errors import ArgumentError, SceneError
 from plow_twin.live.cutting_load import CuttingLoad, Face
 from plow_twin.live.stop import StopRequested, StopSignals
 from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import Clearance, Scene
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import set_stamp
 from plow_twin.ros.qos import LATCHED, sensor_input
+from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import NS_PER_S
 
@@ -46,6 +52,9 @@ WINDOW: Final = 200
 _CLOCK_EVERY: Final = 10
 #: Time between two messages on travel [s].
 _TRAVEL_S: Final = 0.1
+#: Rate of the synthetic sensor, and its noise [m, m, rad].
+_POSE_HZ: Final = 100.0
+_POSE_NOISE: Final = np.array([5e-4, 5e-4, 2e-3])
 #: Without an answer for so long, the samples under way count as lost [s].
 _STALL_S: Final = 2.0
 #: CDR of a message that begins with a stamp: 4 bytes of encapsulation, then sec and nanosec.
@@ -54,11 +63,16 @@ _STAMP: Final = struct.Struct("<4xiI")
 
 @dataclass(frozen=True)
 class Plan:
-    """What to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`; `speed` (n,) [m/s] of travel."""
+    """What to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`; `speed` (n,) [m/s] of travel.
+
+    `pose` (m, 3) x, y [m], theta [rad] is what a synthetic sensor measures, one row with every `pose_every`-th sample.
+    """
 
     wrench: NDArray[np.float64]
     period_ns: int
     speed: NDArray[np.float64] | None = None
+    pose: NDArray[np.float64] | None = None
+    pose_every: int = 1
 
 
 class ExcitationPublisher(Node):
@@ -76,6 +90,9 @@ class ExcitationPublisher(Node):
         self._samples = self.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=1000))
         self._travel = None if plan.speed is None else self.create_publisher(TwistStamped, "travel", 100)
         self._twist = TwistStamped()
+        self._poses = None if plan.pose is None else self.create_publisher(PoseStamped, "head_pose", 1000)
+        self._pose = PoseStamped()
+        self._pose.header.frame_id = "slide_frame"
         self._twin_reads = False
         self._answered_ns = FIRST_STAMP_NS
         self.sent = 0
@@ -154,6 +171,12 @@ class ExcitationPublisher(Node):
             set_stamp(self._twist.header, stamp_ns)
             self._twist.twist.linear.z = float(self._plan.speed[self.sent])
             self._travel.publish(self._twist)
+        if self._poses is not None and self._plan.pose is not None and self.sent % self._plan.pose_every == 0:
+            set_stamp(self._pose.header, stamp_ns)
+            pose = self._pose.pose
+            pose.position.x, pose.position.y, theta = self._plan.pose[self.sent // self._plan.pose_every].tolist()
+            pose.orientation.z, pose.orientation.w = math.sin(0.5 * theta), math.cos(0.5 * theta)
+            self._poses.publish(self._pose)
         self.sent += 1
 
     def _on_status(self, message: DiagnosticStatus) -> None:
@@ -166,8 +189,12 @@ class ExcitationPublisher(Node):
         self._answered_ns = max(self._answered_ns, sec * NS_PER_S + nanosec)
 
 
-def plan(scene_name: str, rate_hz: float, seconds: float, cutting: CuttingLoad | None = None) -> Plan:
+def plan(
+    scene_name: str, rate_hz: float, seconds: float, cutting: CuttingLoad | None = None, sensor_mm: float | None = None
+) -> Plan:
     """Sample the loads of a scene, gravity not included, with a cutting load on top.
+
+    With `sensor_mm` the plan has the pose of a head whose guide is wider by that than the scene says, seen with noise.
 
     Raises
     ------
@@ -175,11 +202,26 @@ def plan(scene_name: str, rate_hz: float, seconds: float, cutting: CuttingLoad |
         The scene cannot be used.
     """
     period_ns = round(NS_PER_S / rate_hz)
-    loads = compile_loads(load_scene(scene_name).loads)
+    scene = load_scene(scene_name)
     times = np.arange(max(1, round(seconds * NS_PER_S / period_ns)), dtype=np.float64) * (period_ns * 1e-9)
-    if cutting is None:
-        return Plan(loads.at(times), period_ns)
-    return Plan(loads.at(times) + cutting.at(times), period_ns, cutting.face.travel(times)[1])
+    wrench, speed = compile_loads(scene.loads).at(times), None
+    if cutting is not None:
+        wrench, speed = wrench + cutting.at(times), cutting.face.travel(times)[1]
+    if sensor_mm is None:
+        return Plan(wrench, period_ns, speed)
+    every = max(1, round(rate_hz / _POSE_HZ))
+    return Plan(wrench, period_ns, speed, _measured(scene, times, wrench, sensor_mm)[::every], every)
+
+
+def _measured(
+    scene: Scene, times: NDArray[np.float64], wrench: NDArray[np.float64], wider_mm: float
+) -> NDArray[np.float64]:
+    """Return what a noisy sensor measures of a head in a wider guide, shape (n, 3)."""
+    clearance = Clearance(scene.clearance.horizontal_m + 1e-3 * wider_mm, scene.clearance.vertical_m + 1e-3 * wider_mm)
+    twin = Twin(replace(scene, clearance=clearance), excitation="sampled")
+    noise = np.random.default_rng(0).standard_normal((len(times), 3)) * _POSE_NOISE
+    measured: NDArray[np.float64] = twin.advance_samples(times, wrench).q + noise
+    return measured
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -189,6 +231,9 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seconds", type=float, default=20.0, help="machine time [s]")
     parser.add_argument("--speed", choices=("real", "fast"), default="real", help="by the clock, or as fast as it goes")
     parser.add_argument("--wait", type=float, default=60.0, help="longest wait for an active twin [s]")
+    parser.add_argument(
+        "--sensor", type=float, metavar="MM", help="send head_pose of a head in a guide wider by that [mm], synthetic"
+    )
     group = parser.add_argument_group("cutting load", "added to the scene's loads; the speed goes out on travel")
     group.add_argument("--cutting", type=float, metavar="N", help="mean force into the face, along x [N]")
     group.add_argument("--lateral", type=float, default=0.0, metavar="N", help="deviation of the force along y [N]")
@@ -229,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stop = StopSignals()
     try:
         options = _parse(rclpy.utilities.remove_ros_args(given)[1:])
-        samples = plan(options.scene, options.rate, options.seconds, _cutting(options))
+        samples = plan(options.scene, options.rate, options.seconds, _cutting(options), options.sensor)
         stop.interrupt = False
     except StopRequested:
         return 0

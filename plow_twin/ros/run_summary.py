@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKWISE, corner_of
 from plow_twin.model.scene import Scene
 from plow_twin.record.messages import JointState
-from plow_twin.record.reader import OutputRecord, RunReader
+from plow_twin.record.reader import EntryRecord, OutputRecord, RunReader
+from plow_twin.stream.journal import Estimated
 
 #: Mask of the pairs that belong to each sense of swing.
 SENSES: Final = {"ccw": STOPS_COUNTER_CLOCKWISE, "cw": ~STOPS_COUNTER_CLOCKWISE}
@@ -38,6 +40,8 @@ class RunSummary:
         Newest depth of each pad [m].
     frames : int
         Messages on contact_forces.
+    estimate : dict or None
+        The newest estimate that the node has made, as `plow-twin estimate --json` prints it.
     """
 
     scene: Scene
@@ -48,6 +52,7 @@ class RunSummary:
     clearance: dict[str, tuple[float, float, float]]
     wear_depth: NDArray[np.float64]
     frames: int
+    estimate: dict[str, Any] | None = None
 
 
 def corner_letters(scene: Scene) -> dict[str, str]:
@@ -66,7 +71,7 @@ def summarise(path: Path) -> RunSummary:
     """
     reader = RunReader(path)
     scene = reader.header.scene(reader.path)
-    found = _read(reader)
+    found, estimate = _read(reader)
     forces, peaks = found["contact_forces"], found["contact_peaks"]
     largest, impulse, in_contact = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
     before_ns = peaks[0].stamp_ns if peaks else 0
@@ -91,18 +96,22 @@ def summarise(path: Path) -> RunSummary:
         },
         np.array([value for name, value in clearance.items() if name.startswith("pad_") and "/" not in name]),
         len(forces),
+        estimate,
     )
 
 
-def _read(reader: RunReader) -> dict[str, list[JointState]]:
+def _read(reader: RunReader) -> tuple[dict[str, list[JointState]], dict[str, Any] | None]:
     topics = {reader.header.topic(name): name for name in _TOPICS}
     found: dict[str, list[JointState]] = {name: [] for name in _TOPICS}
+    estimate = None
     for record in reader:
+        if isinstance(record, EntryRecord) and isinstance(record.entry, Estimated):
+            estimate = json.loads(record.entry.result)
         if isinstance(record, OutputRecord) and record.topic in topics:
             message = record.message()
             if isinstance(message, JointState):
                 found[topics[record.topic]].append(message)
-    return found
+    return found, estimate
 
 
 def _named(messages: list[JointState]) -> tuple[tuple[str, ...], list[float]]:
