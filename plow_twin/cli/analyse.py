@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from plow_twin.cli.console import (
     DONE,
     DONE_WITH_LOSS,
     FAILED,
+    POSITIVE,
     json_option,
     output_console,
     progress,
@@ -22,7 +24,7 @@ from plow_twin.cli.console import (
 
 
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.")
-@click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path, exists=True), nargs=-1, required=True)
+@click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--scene", help="Scene file or preset; needed for a recording that is no run of ours.")
 @click.option(
     "--map",
@@ -33,6 +35,10 @@ from plow_twin.cli.console import (
 @click.option("--with", "others", multiple=True, help="A further scene to predict with; may be given many times.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and Parquet.")
 @click.option("--workers", type=click.IntRange(1), help="Processes for many recordings; by default one a core.")
+@click.option(
+    "--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster for many recordings, e.g. tcp://host:8786."
+)
+@click.option("--watch", type=POSITIVE, metavar="S", help="Follow a run while it is recorded, with a report every S s.")
 @json_option
 @quiet_option
 def analyse(
@@ -42,6 +48,8 @@ def analyse(
     others: tuple[str, ...],
     out: Path | None,
     workers: int | None,
+    dask: str | None,
+    watch: float | None,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -49,12 +57,25 @@ def analyse(
     from plow_twin.study.analysis.analyse import expand
     from plow_twin.study.analysis.task import Task
 
+    if watch is not None:
+        if len(recordings) != 1:
+            raise click.UsageError(f"--watch: got {len(recordings)} recordings, expected one")
+        task = Task(recordings[0], Path(scene) if scene else None, mapping, tuple(map(Path, others)), out)
+        facts = _watch(task, watch, as_json, quiet)
+        if as_json:
+            click.echo(json.dumps(facts, allow_nan=False))
+        else:
+            _show([facts], False, False, quiet)
+        return DONE_WITH_LOSS if facts["lossy"] else DONE
+    for path in recordings:
+        if not path.exists():
+            raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
     found = expand(recordings)
     many = len(found) > 1 or found != list(recordings)
     extra = tuple(Path(name) for name in others)
     scene_file = Path(scene) if scene else None
     tasks = [Task(path, scene_file, mapping, extra, _out(out, path, many)) for path in found]
-    results = _run(tasks, workers or os.cpu_count() or 1, quiet) if many else [_alone(tasks[0], quiet)]
+    results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
 
@@ -87,32 +108,56 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
     return {**found.facts(), "lossy": found.lossy}
 
 
-def _run(tasks: list[Any], workers: int, quiet: bool) -> list[dict[str, Any]]:
-    """Analyse on all cores; results that are there already are taken, so that an interrupted call goes on."""
-    from concurrent.futures import ProcessPoolExecutor, as_completed
-    from multiprocessing import get_context
+def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
+    """Analyse on all cores or a cluster; what is there already is taken, so that an interrupted call goes on."""
+    from plow_twin.study.analysis.many import analyse_many
 
-    from plow_twin.study.analysis.task import analyse_task
+    with progress("analysing", quiet) as on_progress:
+        return analyse_many(tasks, workers=workers, dask=dask, on_progress=on_progress)
 
-    results: dict[int, dict[str, Any]] = {}
-    for number, task in enumerate(tasks):
-        done = None if task.out is None else task.out / "analysis.json"
-        if done is not None and done.is_file():
-            facts = json.loads(done.read_text(encoding="utf-8"))
-            results[number] = {**facts, "lossy": bool(facts["lost"])}
-    with (
-        progress("analysing", quiet) as on_progress,
-        ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool,
-    ):
-        waiting = {pool.submit(analyse_task, task): n for n, task in enumerate(tasks) if n not in results}
-        for future in as_completed(waiting):
-            number = waiting[future]
-            try:
-                results[number] = future.result()
-            except Exception as error:  # a worker that was killed takes its own result alone
-                results[number] = {"run": str(tasks[number].path), "error": f"worker ended: {error!r}"}
-            on_progress(len(results) / len(tasks))
-    return [results[number] for number in range(len(tasks))]
+
+def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any]:
+    """Analyse a run while it is recorded: again and again, until it ends or the command is interrupted."""
+    import time
+
+    from plow_twin.cli.interruption import interruptible
+    from plow_twin.record.follow import Tail
+    from plow_twin.record.running import find_run
+    from plow_twin.study.analysis.analyse import analyse as run
+    from plow_twin.study.analysis.report import write_report
+
+    due = time.monotonic() + every
+
+    def report(found: Any) -> None:
+        nonlocal due
+        if time.monotonic() < due:
+            return
+        begin = time.monotonic()
+        facts = found.facts()
+        if task.out is not None:
+            write_report(found, task.out)
+        if as_json:
+            click.echo(json.dumps(facts, allow_nan=False))
+            sys.stdout.flush()
+        else:
+            _show([facts], False, False, quiet)
+        # a long run takes long to sum up: at most a tenth of the time
+        due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
+
+    with interruptible() as stopped:
+        path = find_run(task.path, max(every, 10.0), stopped)
+        found = run(
+            path,
+            scene=task.scene,
+            mapping=task.mapping,
+            others=task.others,
+            out=task.out,
+            tail=Tail(stopped),
+            on_caught_up=report,
+        )
+        if task.out is not None:
+            write_report(found, task.out)
+    return {**found.facts(), "lossy": found.lossy}
 
 
 def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool) -> None:

@@ -475,11 +475,11 @@ def _part_number(path: Path) -> tuple[int, str]:
     return (int(digits[1]) if digits else -1, path.name)
 
 
-def own_run(path: Path) -> RunReader | None:
+def own_run(path: Path, tail: Tail | None = None) -> RunReader | None:
     """Return the reader of a run of ours, or None for another recording."""
     if path.is_dir() and not any(path.glob("*.mcap")):
         return None
     try:
-        return RunReader(path)
+        return RunReader(path, tail)
     except ForeignRecordingError:
         return None

@@ -281,7 +281,10 @@ class Outputs:
         The same bits as `add` for each row and `take` after those rows.
         """
         first = np.concatenate(([0], taken[:-1] + 1)) if len(taken) else taken
-        impulse, peak = rows.impulse[first] + 0.0, rows.peak[first].copy()
+        # after each row: views instead of copies
+        chosen: NDArray[np.int64] | slice = slice(None) if len(taken) == len(stamps) else taken
+        begins = chosen if isinstance(chosen, slice) else first
+        impulse, peak = rows.impulse[begins] + 0.0, rows.peak[begins].copy()
         if len(taken):
             impulse[0] = self._impulse + rows.impulse[0]
             np.maximum(self._peak, rows.peak[0], out=peak[0])
@@ -291,17 +294,17 @@ class Outputs:
             impulse[longer] += rows.impulse[first[longer] + offset]
             peak[longer] = np.maximum(peak[longer], rows.peak[first[longer] + offset])
         makes = self._makes + np.cumsum(rows.makes, axis=0)
-        slow_index, clearance, wear_rate = self._slow_rows(stamps[taken], rows.wear_depth[taken])
+        slow_index, clearance, wear_rate = self._slow_rows(stamps[chosen], rows.wear_depth[chosen])
         publications = Publications(
-            stamp_ns=stamps[taken],
-            penetration=rows.penetration[taken],
-            rate=rows.rate[taken],
-            force=rows.force[taken],
-            makes=makes[taken],
+            stamp_ns=stamps[chosen],
+            penetration=rows.penetration[chosen],
+            rate=rows.rate[chosen],
+            force=rows.force[chosen],
+            makes=makes[chosen],
             impulse=impulse,
             peak=peak,
-            q=rows.q[taken],
-            v=rows.v[taken],
+            q=rows.q[chosen],
+            v=rows.v[chosen],
             slow_index=slow_index,
             clearance=clearance,
             wear_rate=wear_rate,

@@ -16,6 +16,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
+from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed, Walked, Walker
 from plow_twin.record.mapping import Role, read_map, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
@@ -177,6 +178,8 @@ def analyse(
     others: Sequence[Path] = (),
     out: Path | None = None,
     on_progress: OnProgress | None = None,
+    tail: Tail | None = None,
+    on_caught_up: Callable[[Analysis], object] = lambda found: None,
 ) -> Analysis:
     """Analyse a recording.
 
@@ -192,6 +195,9 @@ def analyse(
         Further scenes to predict with.
     out
         Folder in which another recording becomes a run like any other (`run`).
+    tail, on_caught_up
+        With a `Tail` a run of ours is followed while it is written; the second receives the analysis of what there is,
+        each time that all has been read.
 
     Raises
     ------
@@ -201,7 +207,9 @@ def analyse(
     begin = time.perf_counter()
     if not path.exists():
         raise RecordingError(f"{path}: no such recording")
-    reader = own_run(path)
+    reader = own_run(path, tail)
+    if tail is not None and reader is None:
+        raise RecordingError(f"{path}: expected a run of plow_twin: another recording cannot be followed")
     if reader is not None:
         own = reader.header.scene(reader.path)
         chosen, name = (own, "of the run") if scene is None else (load_scene(scene_path(str(scene))), str(scene))
@@ -216,7 +224,7 @@ def analyse(
         predictions.append(Prediction(str(other), with_scene, LoadTotals(with_scene)))
     measured = Measured()
     if reader is not None:
-        found = _walk_own(reader, path, mapping, predictions, measured, on_progress)
+        found = _walk_own(reader, path, mapping, predictions, on_progress, on_caught_up)
     else:
         found = _walk_other(path, mapping, predictions, measured, out)
     found.wall_s = time.perf_counter() - begin
@@ -232,8 +240,8 @@ def _walk_own(
     path: Path,
     mapping: Path | None,
     predictions: list[Prediction],
-    measured: Measured,
     on_progress: OnProgress | None,
+    on_caught_up: Callable[[Analysis], object],
 ) -> Analysis:
     header = reader.header
     if header.excitation_source == "scene":
@@ -243,7 +251,19 @@ def _walk_own(
         for prediction in predictions
     ]
     used, late, reached_ns = 0, 0, -1
+
+    def so_far() -> Analysis:
+        losses = {topic: count for topic, count in reader.lost.items() if count}
+        if late:
+            losses["samples_too_late"] = late
+        if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
+            losses[reader.status.value] = 1
+        measured, unknown = _measured_beside(path, mapping, header.node)
+        return Analysis(reader.path, "run", predictions, measured, {"samples_used": used}, losses, unknown)
+
     for stamps, wrench, other in _journal(reader):
+        if other is None and not len(stamps):
+            on_caught_up(so_far())
         if on_progress is not None:
             on_progress(reader.position)
         if len(stamps):
@@ -270,27 +290,28 @@ def _walk_own(
             walkers[0].apply(other)
             for prediction in predictions:
                 prediction.restart()
-    losses = {topic: count for topic, count in reader.lost.items() if count}
-    if late:
-        losses["samples_too_late"] = late
-    if reader.status is not FileStatus.COMPLETE:
-        losses[reader.status.value] = 1
-    unknown: dict[str, str] = {}
+    return so_far()
+
+
+def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measured, dict[str, str]]:
+    """Return what was measured beside a run, and the topics whose type is unknown; its loads are in the journal."""
+    measured, unknown = Measured(), dict[str, str]()
     folder = path if path.is_dir() else path.parent
     places = [place for place in (folder, *beside_folders(folder)) if any(place.glob("*.mcap"))]
-    # what was measured beside the run; the loads are those of the journal
-    for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{header.node}/"):
+    for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/"):
         _collect(source, {name: roles[name] for name in roles.keys() - {"excitation", "travel"}}, measured)
         unknown |= source.losses.unknown_types
-    return Analysis(reader.path, "run", predictions, measured, {"samples_used": used}, losses, unknown)
+    return measured, unknown
 
 
 def _journal(reader: RunReader) -> Iterator[tuple[NDArray[np.int64], Array, Any]]:
     """Yield runs of samples, and the entry that ends each; nothing is held, as in every replay of another recording."""
     empty = (np.zeros(0, np.int64), np.zeros((0, 3)))
-    lost = False
+    lost = bool(reader.header.part)  # what was before the first part that is there
     for batch in reader.batches(outputs=False):
         entries, begin = batch.entries, 0
+        if not len(entries) and reader.tail is not None:
+            yield (*empty, None)
         for place in (*sorted(entries.others), len(entries)):
             chosen = slice(begin, place)
             if place > begin:

@@ -1,0 +1,95 @@
+"""Many recordings: on all cores of this machine, or on a Dask cluster; a worker that dies loses nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any
+
+from plow_twin.study.analysis.task import Task, analyse_task
+from plow_twin.study.parameters import StudyError
+
+#: Time to wait for a scheduler [s].
+CONNECT_TIMEOUT_S = 20.0
+
+#: Receives the share of the recordings that are done.
+OnProgress = Callable[[float], object]
+_OnDone = Callable[[int, dict[str, Any]], object]
+
+
+def analyse_many(
+    tasks: Sequence[Task], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
+) -> list[dict[str, Any]]:
+    """Return the facts of each analysis, `error` where one failed; those that are there already are taken.
+
+    Parameters
+    ----------
+    workers
+        Processes on this machine.
+    dask
+        Address of a scheduler to run on instead; its workers must see the same files.
+
+    Raises
+    ------
+    StudyError
+        The cluster cannot be reached.
+    """
+    results = {number: facts for number, task in enumerate(tasks) if (facts := task.stored()) is not None}
+
+    def done(number: int, facts: dict[str, Any]) -> None:
+        results[number] = facts
+        on_progress(len(results) / len(tasks))
+
+    waiting = [number for number in range(len(tasks)) if number not in results]
+    if waiting and dask is not None:
+        _on_cluster(tasks, waiting, dask, done)
+    elif waiting:
+        _here(tasks, waiting, workers, done)
+    return [results[number] for number in range(len(tasks))]
+
+
+def _here(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone) -> None:
+    while waiting:
+        left = _round(tasks, waiting, workers, done)
+        if len(left) == len(waiting):  # one of them ends its worker each time
+            for number in left:
+                if _round(tasks, [number], 1, done):
+                    done(number, {"run": str(tasks[number].path), "error": "the worker was killed, twice"})
+            return
+        waiting = left
+
+
+def _round(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
+    """Run some tasks and return those that were lost: when a worker dies, with all that had not ended."""
+    left = []
+    pool = ProcessPoolExecutor(min(workers, len(waiting)), mp_context=get_context("spawn"))
+    try:
+        futures = {pool.submit(analyse_task, tasks[number]): number for number in waiting}
+        for future in as_completed(futures):
+            try:
+                done(futures[future], future.result())
+            except BrokenProcessPool:
+                left.append(futures[future])
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return left
+
+
+def _on_cluster(tasks: Sequence[Task], waiting: list[int], address: str, done: _OnDone) -> None:
+    from distributed import Client
+    from distributed import as_completed as as_distributed
+
+    try:
+        client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise StudyError(f"dask: got {address!r}, expected the address of a scheduler ({error})") from None
+    with client:
+        futures = {client.submit(analyse_task, tasks[number], pure=False, retries=2): number for number in waiting}
+        for future in as_distributed(list(futures), loop=client.loop):
+            number = futures[future]
+            try:
+                done(number, future.result())
+            except Exception as error:  # whatever became of the worker
+                done(number, {"run": str(tasks[number].path), "error": f"{tasks[number].path}: {error!r}"})
