@@ -326,6 +326,26 @@ def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_ref
         assert not bridge.connected
 
 
+def test_what_the_system_refuses_is_a_warning_and_the_rest_is_done() -> None:
+    code = """
+import os, resource
+from plow_twin.live.parameters import settings
+from plow_twin.live.realtime import apply_realtime
+for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
+    resource.setrlimit(limit, (0, 0))
+if os.getuid() == 0:
+    os.setresuid(65534, 65534, 65534)
+one = min(os.sched_getaffinity(0))
+print(*apply_realtime(settings({"priority": 50, "cpu_affinity": str(one), "lock_memory": True})), sep="\\n")
+print(*apply_realtime(settings({"cpu_affinity": "0,x"})), sep="\\n")
+print(os.sched_getaffinity(0) == {one})
+"""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    said = done.stdout.splitlines()
+    assert [line.partition(" ")[0].rstrip(":") for line in said] == ["priority", "lock_memory", "cpu_affinity", "True"]
+
+
 @pytest.mark.parametrize(
     "url", ["mqtt://plough.example:1883", "http://localhost", "mqtt://user:secret@localhost", "mqtt://localhost/topic"]
 )

@@ -55,6 +55,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
     """Run the twin on SOURCE: CSV files (a folder, or one file), - for standard input, or mqtt[s]://HOST:PORT."""
     from plow_twin.live.front import BridgeFront
+    from plow_twin.live.realtime import apply_realtime
     from plow_twin.live.solver_start import Preparation, leave
     from plow_twin.live.stop import StopRequested, StopSignals
 
@@ -62,6 +63,8 @@ def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | 
     try:
         settings = _settings(options)
         bridge = _bridge(source, options)
+        for refused in apply_realtime(settings):
+            click.echo(f"plow-twin: refused by the system: {refused}", err=True)
         with busy("preparing the solver", quiet or not error_console().is_terminal):
             prepared = Preparation(settings).result(lambda: stop.stopped)
 

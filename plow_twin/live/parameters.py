@@ -57,6 +57,16 @@ class Settings:
 
     autostart: bool = _plain(True, Effect.START, "configure and activate at start; false: wait for lifecycle requests")
     hardware_id: str = _plain("plough_head", Effect.START, "serial of the head, in status and diagnostics")
+    priority: int = _number(
+        0,
+        "SCHED_FIFO",
+        0,
+        99,
+        Effect.START,
+        "priority of the thread that computes; 0: as any other; what the system refuses is a warning",
+    )
+    cpu_affinity: str = _plain("", Effect.START, "processors to run on, e.g. 2,3; empty: all; refused: a warning")
+    lock_memory: bool = _plain(False, Effect.START, "keep all memory from being paged out; refused: a warning")
     scene: str = _plain("paper", Effect.CONFIGURE, "scene file, or the name of a preset: paper, bench_kv, bench_hc")
     tolerance: float = _number(1e-9, "1", 1e-13, 1e-3, Effect.CONFIGURE, "relative tolerance of the solver")
     excitation_source: str = _choice(

@@ -17,6 +17,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from plow_twin.errors import PlowTwinError
 from plow_twin.live import diagnostics
 from plow_twin.live.parameters import Settings
+from plow_twin.live.realtime import apply_realtime
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Preparation, key
 from plow_twin.record import messages as plain
@@ -57,6 +58,8 @@ class TwinNode(LifecycleNode):
         self._health = diagnostics.Health()
         self._published_status: tuple[Any, ...] = ()
         self._table = ParameterServer(self, lambda: self.runtime is None, self._parameter_changed, self._refusals)
+        for refused in apply_realtime(self._table.settings):
+            self.get_logger().warning(f"refused by the system: {refused}")
         self._status = self.create_publisher(DiagnosticStatus, "status", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         # steady: reports go on when /clock is paused

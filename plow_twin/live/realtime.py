@@ -1,0 +1,36 @@
+"""Priority, processors and locked memory of this process: each is asked for, and its refusal is a warning."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from typing import Final
+
+from plow_twin.live.parameters import Settings
+
+#: `mlockall`: what is mapped now, and what will be.
+_MCL_CURRENT: Final = 1
+_MCL_FUTURE: Final = 2
+
+
+def apply_realtime(settings: Settings) -> list[str]:
+    """Ask the system for what the settings say; return in words what it refused."""
+    refused = []
+    if settings.priority:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(settings.priority))
+        except OSError as error:
+            hint = "allow it by ulimit -r or LimitRTPRIO="
+            refused.append(f"priority {settings.priority}: {error.strerror}; {hint}")
+    if settings.cpu_affinity:
+        try:
+            os.sched_setaffinity(0, {int(number) for number in settings.cpu_affinity.split(",")})
+        except (OSError, ValueError) as error:
+            there = ",".join(map(str, sorted(os.sched_getaffinity(0))))
+            refused.append(f"cpu_affinity {settings.cpu_affinity!r}: {error}; expected numbers among {there}")
+    if settings.lock_memory:
+        library = ctypes.CDLL(None, use_errno=True)
+        if library.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+            reason = os.strerror(ctypes.get_errno())
+            refused.append(f"lock_memory: {reason}; allow it by ulimit -l or LimitMEMLOCK=")
+    return refused

@@ -1,0 +1,307 @@
+"""Faults with real processes: whatever happens, every sample sent is accounted for, and the twin goes on."""
+
+from __future__ import annotations
+
+import gc
+import json
+import math
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from geometry_msgs.msg import WrenchStamped
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
+from ros_processes import Bench, bench, value
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from plow_twin.model.scene import Wear
+from plow_twin.record.replay import replay
+from plow_twin.ros.messages import set_stamp
+from plow_twin.ros.node import TwinNode
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
+
+pytestmark = [pytest.mark.stress, pytest.mark.timeout(600)]
+
+T0 = 1_795_000_000_000_000_000
+MS = 1_000_000
+RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
+
+
+def _accounted(figures: dict[str, str]) -> int:
+    dropped = sum(int(count) for key, count in figures.items() if key.startswith("dropped_"))
+    return int(figures["samples_used"]) + dropped + int(figures["samples_lost"])
+
+
+def _until_accounted(running: Bench, sent: int) -> dict[str, str]:
+    """Wait until all that was sent is accounted for; what is lost at the very end shows with a sample after it."""
+    figures: dict[str, str] = {}
+
+    def reached() -> bool:
+        figures.update(running.probe.figures("input"))
+        return _accounted(figures) >= sent
+
+    running.probe.until(reached, f"{sent} samples accounted for")
+    assert _accounted(figures) == sent
+    return figures
+
+
+def _sent(publisher: Any) -> int:
+    assert publisher.wait() == 0, publisher.output()
+    return int(json.loads(publisher.output().splitlines()[-1])["sent"])
+
+
+def test_late_samples_of_a_publisher_that_was_stopped_are_used(tmp_path: Path) -> None:
+    with bench(tmp_path, rollback_span=30.0, jump_forward=60.0, **RELIABLE_INPUT) as running:
+        publisher = running.publisher("--rate", "500", "--seconds", "8")
+        running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 500, "samples")
+        publisher.send_signal(signal.SIGSTOP)
+        running.probe.until(lambda: value(running.probe.status[-1], "stream") == "stale", "the silence")
+        running.probe.pause(2.0)
+        publisher.send_signal(signal.SIGCONT)
+        figures = _until_accounted(running, _sent(publisher))
+        # all at once, some may overrun the publisher's own queue
+        assert int(figures["samples_used"]) + int(figures["samples_lost"]) == 4000
+        assert int(figures["rolled_back"]) > 0
+
+
+def test_a_publisher_that_is_killed_is_followed_by_the_next_one(tmp_path: Path) -> None:
+    with bench(tmp_path, **RELIABLE_INPUT) as running:
+        first = running.publisher("--rate", "500", "--seconds", "60")
+        running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 500, "samples")
+        first.send_signal(signal.SIGKILL)
+        first.wait()
+        used = int(running.probe.figures("input")["samples_used"])
+        second = running.publisher("--rate", "500", "--seconds", "40")
+        running.probe.until(
+            lambda: int(running.probe.figures("input")["samples_used"]) > used + 500, "the second one to be followed"
+        )
+        second.stop()
+
+
+def test_a_node_that_is_stopped_counts_what_overran_its_queue_and_goes_on(tmp_path: Path) -> None:
+    with bench(tmp_path, input_depth=200, jump_forward=60.0) as running:
+        publisher = running.publisher("--rate", "1000", "--seconds", "8")
+        running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 500, "samples")
+        running.twin.send_signal(signal.SIGSTOP)
+        time.sleep(3.0)
+        running.twin.send_signal(signal.SIGCONT)
+        figures = _until_accounted(running, _sent(publisher))
+        assert int(figures["samples_lost"]) > 1000
+        assert running.twin.stop() == 0
+
+
+def test_after_a_kill_the_recording_replays_and_the_wear_goes_on(tmp_path: Path) -> None:
+    wear = Wear(coefficient_m2_n=1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(dump_scene(replace(load_scene(scene_path("paper")), wear=wear)))
+    run, kept = tmp_path / "run", tmp_path / "wear"
+    settings = {"scene": scene, "record_path": run, "wear_state_path": kept, "wear_save_period": 0.2, **RELIABLE_INPUT}
+    with bench(tmp_path, **settings) as running:
+        running.publisher("--scene", str(scene), "--rate", "1000", "--seconds", "30")
+        running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 3000, "samples")
+        running.probe.until((kept / "wear.json").is_file, "the wear on disk")
+        running.twin.send_signal(signal.SIGKILL)
+        running.twin.wait()
+    report = replay(run)
+    assert report.first_divergence is None and report.exit_code == 3 and report.samples > 1000
+    saved = json.loads((kept / "wear.json").read_text())["depth_m"]
+    assert max(saved.values()) > 0.0
+    with bench(tmp_path, **settings) as running:
+        clearances = running.probe.listen(JointState, "clearance")
+        running.probe.excitation()(T0, (0.0, 0.0, 0.0))
+        running.probe.until(lambda: clearances, "the clearance")
+        found = dict(zip(clearances[0].name, clearances[0].position, strict=True))
+        assert all(found[f"pad_{name}"] >= depth for name, depth in saved.items())
+
+
+def test_a_disk_that_takes_no_more_stops_the_recording_and_not_the_twin(tmp_path: Path) -> None:
+    with bench(tmp_path, record_path=tmp_path / "run", **RELIABLE_INPUT) as running:
+        # as good as a full disk: a write beyond that size fails
+        resource.prlimit(running.twin._process.pid, resource.RLIMIT_FSIZE, (200_000, 200_000))
+        publisher = running.publisher("--rate", "1000", "--seconds", "120")
+        running.probe.until(lambda: value(running.probe.status[-1], "recorder") == "trouble", "the full disk in status")
+        assert running.probe.status[-1].level == b"\x02"
+        assert running.probe.figures("recorder")["error"]
+        used = int(running.probe.figures("input")["samples_used"])
+        running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > used, "the twin to go on")
+        assert publisher.stop() == 0
+        _until_accounted(running, _sent(publisher))
+
+
+def test_one_corrupt_sample_in_a_hundred_is_counted_to_the_last_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    expected = dict.fromkeys(("non_finite", "implausible", "unstamped", "duplicate"), 0)
+    with bench(tmp_path, excitation_timeout=3600.0, **RELIABLE_INPUT) as running:
+        send = running.probe.excitation()
+        for index in range(10_000):
+            stamp, wrench = T0 + index * MS, (30e3 * math.sin(2e-3 * index), 0.0, 0.0)
+            if index and rng.random() < 0.01:
+                kind = str(rng.choice(list(expected)))
+                expected[kind] += 1
+                if kind == "non_finite":
+                    wrench = (0.0, float(rng.choice([np.nan, np.inf])), 0.0)
+                elif kind == "implausible":
+                    wrench = (1e8, 0.0, 0.0)
+                elif kind == "duplicate":
+                    send(stamp, wrench)
+                else:
+                    stamp = 0
+            send(stamp, wrench)
+            running.probe.pace(index)
+        sent = 10_000 + expected["duplicate"]
+        figures = _until_accounted(running, sent)
+        assert {key: int(figures[f"dropped_{key}"]) for key in expected} == expected
+        assert int(figures["samples_used"]) == sent - sum(expected.values())
+    assert sum(expected.values()) > 60
+
+
+@pytest.mark.parametrize("step_s", [-10.0, 30.0])
+def test_a_step_of_the_sender_s_clock_is_one_reset_and_no_loss(tmp_path: Path, step_s: float) -> None:
+    with bench(tmp_path, excitation_timeout=3600.0, **RELIABLE_INPUT) as running:
+        send = running.probe.excitation()
+        for index in range(1000):
+            send(T0 + index * MS + (round(step_s * 1e9) if index >= 500 else 0), (30e3, 0.0, 0.0))
+            running.probe.pace(index)
+        figures = _until_accounted(running, 1000)
+        assert figures["samples_used"] == "1000"
+        assert running.probe.figures("state")["resets"] == "1"
+
+
+def test_a_clock_that_is_paused_looped_and_fast_moves_the_twin_with_its_samples(tmp_path: Path) -> None:
+    with bench(tmp_path, use_sim_time="true", **RELIABLE_INPUT) as running:
+        probe = running.probe
+        clock = probe.node.create_publisher(Clock, "/clock", 100)
+        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
+        send = probe.excitation()
+        message = Clock()
+
+        def play(first: int, last: int, every: int) -> None:
+            for index in range(first, last):
+                if index % every == 0:
+                    message.clock.sec, message.clock.nanosec = divmod(T0 + index * MS, 10**9)
+                    clock.publish(message)
+                send(T0 + index * MS, (30e3, 0.0, 0.0))
+                probe.pace(index)
+
+        play(0, 500, 10)
+        _until_accounted(running, 500)
+        busy = psutil.Process(running.twin._process.pid).cpu_times()
+        probe.pause(3.0)  # /clock stands still, and so does everything else
+        idle = psutil.Process(running.twin._process.pid).cpu_times()
+        assert (idle.user + idle.system) - (busy.user + busy.system) < 1.0
+        play(500, 3000, 500)  # in large steps
+        play(0, 500, 10)  # and from the beginning again
+        figures = _until_accounted(running, 3500)
+        assert (figures["samples_used"], figures["holds"]) == ("3500", "0")
+        assert probe.figures("state")["resets"] == "1"
+
+
+SUBSCRIBER = """
+import rclpy
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import JointState
+rclpy.init()
+node = rclpy.create_node("slow", namespace={namespace!r})
+node.create_subscription(JointState, "contact_forces", lambda _: None, QoSProfile(depth=10))
+print("ready", flush=True)
+rclpy.spin(node)
+"""
+
+
+def test_a_subscriber_that_stands_still_does_not_hold_up_the_twin(tmp_path: Path) -> None:
+    with bench(tmp_path, jump_forward=60.0, **RELIABLE_INPUT) as running:
+        slow = subprocess.Popen(
+            [sys.executable, "-c", SUBSCRIBER.format(namespace=running.namespace)], stdout=subprocess.PIPE
+        )
+        try:
+            assert slow.stdout is not None and slow.stdout.readline() == b"ready\n"
+            publisher = running.publisher("--rate", "1000", "--seconds", "6")
+            running.probe.until(lambda: int(running.probe.figures("input")["samples_used"]) > 500, "samples")
+            slow.send_signal(signal.SIGSTOP)
+            figures = _until_accounted(running, _sent(publisher))
+            assert figures["samples_used"] == "6000"
+        finally:
+            slow.kill()
+            slow.communicate()
+
+
+@contextmanager
+def _context() -> Iterator[Context]:
+    context = Context()
+    context.init(args=[])
+    try:
+        yield context
+    finally:
+        context.try_shutdown()
+
+
+def test_a_hundred_lifecycles_leave_nothing_behind(tmp_path: Path) -> None:
+    done = TransitionCallbackReturn.SUCCESS
+    process = psutil.Process()
+    sizes: list[tuple[int, int, int]] = []
+    with _context() as context:
+        overrides = [Parameter("record_path", value=str(tmp_path / "run"))]
+        node = TwinNode(namespace=f"/l{os.getpid()}", context=context, parameter_overrides=overrides)
+        for cycle in range(100):
+            assert node.trigger_configure() == done and node.trigger_activate() == done
+            assert node.trigger_deactivate() == done and node.trigger_cleanup() == done
+            if cycle % 10 == 9:
+                gc.collect()
+                sizes.append((process.memory_info().rss, process.num_fds(), threading.active_count()))
+        node.destroy_node()
+    first, last = sizes[2], sizes[-1]
+    assert last[1:] == first[1:]
+    assert last[0] - first[0] < 8 * 2**20, f"grown by {(last[0] - first[0]) / 2**20:.1f} MiB in 70 cycles"
+
+
+def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
+    with _context() as context:
+        spaces = [f"/p{os.getpid()}_{index}" for index in range(2)]
+        nodes = [TwinNode(namespace=space, context=context) for space in spaces]
+        executor = SingleThreadedExecutor(context=context)
+        for node in nodes:
+            executor.add_node(node)
+            assert node.start()
+        senders = [node.create_publisher(WrenchStamped, "excitation", QoSProfile(depth=100)) for node in nodes]
+        heard: list[list[JointState]] = [[], []]
+        for node, messages in zip(nodes, heard, strict=True):
+            node.create_subscription(JointState, "contact_forces", messages.append, QoSProfile(depth=1000))
+
+        def spin_until(reached: Callable[[], bool]) -> None:
+            give_up = time.monotonic() + 60.0
+            while not reached():
+                assert time.monotonic() < give_up, [len(messages) for messages in heard]
+                executor.spin_once(timeout_sec=0.05)
+
+        spin_until(lambda: all(sender.get_subscription_count() == 1 for sender in senders))
+        message = WrenchStamped()
+        for index in range(50):
+            set_stamp(message.header, T0 + index * MS)
+            for sender, force in zip(senders, (3e4, -3e4), strict=True):
+                message.wrench.force.x = force
+                sender.publish(message)
+            spin_until(lambda index=index: all(len(messages) == index + 1 for messages in heard))  # type: ignore[misc]
+        first, second = (np.array(messages[-1].position) for messages in heard)
+        assert not np.allclose(first, second)
+        for node in nodes:
+            executor.remove_node(node)
+            node.release()
+            node.destroy_node()
