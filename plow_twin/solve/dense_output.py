@@ -42,10 +42,10 @@ def sum_series(state, w, sigma, out) -> None:
 
 
 @kernel(inline=True)
-def evaluate(p, parts, state, w, sigma, out) -> None:
+def evaluate(p, harmonics, flight, state, w, sigma, out) -> None:
     """Write the body-coordinate state at sigma to `out`, shape (8,)."""
     if state.in_flight == 1:
-        fly(p, parts.harmonics, parts.terms.flight, state, w, sigma, out)
+        fly(p, harmonics, flight, state, w, sigma, out)
     else:
         sum_series(state, w, sigma, out)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.friction import friction_force
@@ -10,7 +11,24 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.kinematics import penetration_at, rate_at, row_rate, row_value, to_body_axes, to_world_axes
 from plow_twin.solve.loads import load_at
-from plow_twin.solve.state import ON
+from plow_twin.solve.state import ON, Harmonics, Segments
+
+
+class Acting(NamedTuple):
+    """What the equations of motion take beside the law: few types, so that scenes share what is compiled for them."""
+
+    harmonics: Harmonics | None
+    segments: Segments | None
+    offset: int | None
+    free: int | None
+    slip: int | None
+
+
+@kernel(inline=True)
+def acting(parts):
+    """Return what acts in a scene beside its law."""
+    terms = parts.terms
+    return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip)
 
 
 @kernel()
@@ -42,14 +60,14 @@ def about_mass(p, c, s, load):
 
 
 @kernel()
-def accelerate(p, parts, frozen, state, t, z, load, out) -> None:
+def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
     """Write the rate of z = (x, y, theta, vx, vy, omega).
 
-    `frozen`: the pairs that are on act by their law, also where it would pull; else those that penetrate push.
+    `acts` is an `Acting`. `frozen`: the pairs that are on act by their law, also where it would pull; else those that
+    penetrate push.
     """
-    terms = parts.terms
-    load_at(p, parts.harmonics, parts.segments, t, load)
-    _accelerate(p, terms.offset, terms.free, terms.slip, frozen, state, z, load, out)
+    load_at(p, acts.harmonics, acts.segments, t, load)
+    _accelerate(p, acts.offset, acts.free, acts.slip, frozen, state, z, load, out)
 
 
 @kernel()

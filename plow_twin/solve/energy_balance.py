@@ -152,13 +152,13 @@ def balance_step(p, parts, wear, flight, state, w, balance) -> None:
     for panel in range(panels):
         for i in range(balance.nodes.size):
             sigma = width * (panel + balance.nodes[i])
-            evaluate(p, parts, state, w, sigma, y)
+            evaluate(p, parts.harmonics, flight, state, w, sigma, y)
             if wear is not None:
                 wear_depth_at(state, w, sigma, wear_depth)
             t = state.step_start + time_along(state.alpha, state.beta, sigma)
             _powers(p, parts, state, wear_depth, y, t, balance, balance.now)
             _add(balance, balance.now, balance.weights[i] * width * (state.alpha + state.beta * sigma))
-    evaluate(p, parts, state, w, end, y)
+    evaluate(p, parts.harmonics, flight, state, w, end, y)
     _balance(p, y, balance, False)
 
 

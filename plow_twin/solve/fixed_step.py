@@ -11,7 +11,7 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import pair_outputs
-from plow_twin.solve.dynamics import accelerate
+from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.energy_balance import balance_fixed_step, start_balance
 from plow_twin.solve.kinematics import pose_of, to_body, to_world
 from plow_twin.solve.modes import mode_inside, touch, within_range
@@ -53,14 +53,14 @@ def _add_to_totals(state, force_before, force, dt, totals) -> None:
 
 
 @kernel()
-def _runge_kutta(p, parts, state, t, dt, z, trial, k, load) -> None:
+def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
     """Take one step of the classical Runge-Kutta method; z (6,) in place, the four stages stay in k (4, 6)."""
-    accelerate(p, parts, False, state, t, z, load, k[0])
+    accelerate(p, acts, False, state, t, z, load, k[0])
     for stage in range(1, 4):
         part = dt if stage == 3 else 0.5 * dt
         for j in range(6):
             trial[j] = z[j] + part * k[stage - 1, j]
-        accelerate(p, parts, False, state, t + part, trial, load, k[stage])
+        accelerate(p, acts, False, state, t + part, trial, load, k[stage])
     for j in range(6):
         z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
     state.evaluations += 4
@@ -74,7 +74,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     the velocity counted over the time left; and where a pair has touched or parted within a step the impulse in doubt,
     F dt / 2, over the time in which the largest load crosses the clearance.
     """
-    y, z, k = state.y, bound.z[0], bound.z[2:]
+    acts, y, z, k = acting(parts), state.y, bound.z[0], bound.z[2:]
     pen, rate, now, before = bound.pairs[0], bound.pairs[1], bound.pairs[2], bound.pairs[3]
     start = state.step_start
     dt = (target - start) / bound.steps
@@ -85,7 +85,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1
     for n in range(bound.steps):
-        _runge_kutta(p, parts, state, start + n * dt, dt, z, bound.z[1], k, bound.load)
+        _runge_kutta(p, acts, state, start + n * dt, dt, z, bound.z[1], k, bound.load)
         left = target - start - (n + 1) * dt
         for j in range(3):
             radius = p.radius if j == 2 else 1.0
@@ -126,7 +126,7 @@ def integrate_fixed(
     z (6,) keeps what is integrated from one call to the next: converted there and back it would lose its last bits.
     """
     trial, k = np.empty(6), np.empty((4, 6))
-    load, y = np.empty(3), state.y
+    load, y, acts = np.empty(3), state.y, acting(parts)
     pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
     if done[0] == 0:
         to_world(y, z)
@@ -149,13 +149,13 @@ def integrate_fixed(
             return _LOG_FULL
         t = n * dt
         if euler:
-            accelerate(p, parts, False, state, t, z, load, k[0])
+            accelerate(p, acts, False, state, t, z, load, k[0])
             for j in range(3):
                 z[3 + j] += dt * k[0, 3 + j]
                 z[j] += dt * z[3 + j]
             state.evaluations += 1
         else:
-            _runge_kutta(p, parts, state, t, dt, z, trial, k, load)
+            _runge_kutta(p, acts, state, t, dt, z, trial, k, load)
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.steps += 1

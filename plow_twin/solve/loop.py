@@ -32,7 +32,7 @@ def _unowned_loads(parts):
 @kernel(inline=True)
 def _end(p, parts, state, w, totals, log) -> None:
     terms = parts.terms
-    complete_step(p, parts, state, w, totals, log, terms.wear, terms.fraction)
+    complete_step(p, parts.harmonics, terms.flight, state, w, totals, log, terms.wear, terms.fraction)
 
 
 @kernel(inline=True)
@@ -48,10 +48,10 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
 
 
 @kernel()
-def _present(p, parts, state, w, y) -> None:
+def _present(p, harmonics, flight, state, w, y) -> None:
     """Write the body coordinates at the present time to y, also within a step."""
     if state.step_size >= 0.0:
-        evaluate(p, parts, state, w, sigma_at(state, state.elapsed), y)
+        evaluate(p, harmonics, flight, state, w, sigma_at(state, state.elapsed), y)
     else:
         set_row(y, 0, row(state.y, 0))
 
@@ -70,7 +70,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if target < t0 + state.step_size:
             add_to_totals(state, w, low, sigma_at(state, target - t0), totals)
             state.elapsed, state.time = target - t0, target
-            _present(p, parts, state, w, w.moved)
+            _present(p, parts.harmonics, parts.terms.flight, state, w, w.moved)
             return _OK if within_range(p, state, w.moved) else _RANGE
         add_to_totals(state, w, low, sigma_at(state, state.step_size), totals)
         _end(p, parts, state, w, totals, None)
@@ -124,7 +124,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
     """
     state = states[index]
     saved[0] = state
-    _present(p, parts, state, w, w.saved[0])
+    _present(p, parts.harmonics, parts.terms.flight, state, w, w.saved[0])
     _worn_now(state, w, parts.terms.wear, w.saved[1])
     before = state.steps
     code = _proceed(p, parts, state, w, totals, target, stop_time, before + budget)
@@ -144,7 +144,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
 def _read_row(p, parts, state, w, totals, out) -> None:
     """Write a `ROW`: the state at the present time and the totals, which are cleared."""
     y = w.moved
-    _present(p, parts, state, w, y)
+    _present(p, parts.harmonics, parts.terms.flight, state, w, y)
     pose_of(p, y, parts.terms.offset, out.q, out.v)
     _worn_now(state, w, parts.terms.wear, out.wear_depth)
     pair_outputs(p, state, out.wear_depth, y, out.penetration, out.rate, out.force)
@@ -260,7 +260,7 @@ def lay_out_again(p, parts, state, w) -> None:
 
 
 @kernel()
-def _rows_in_flight(p, parts, flight, state, w, t, i, q, v, penetration, force):
+def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, force):
     """Fill the rows within a step of free flight from row i on; return the first row after it.
 
     Apart from `integrate`, whose loop over rows is a tenth faster without the choice.
@@ -268,7 +268,7 @@ def _rows_in_flight(p, parts, flight, state, w, t, i, q, v, penetration, force):
     if flight is not None:
         t0, y, rate = state.step_start, np.empty(8), np.empty(8)
         while i < t.size and t[i] < t0 + state.step_size:
-            fly(p, parts.harmonics, flight, state, w, max(t[i] - t0, 0.0), y)
+            fly(p, harmonics, flight, state, w, max(t[i] - t0, 0.0), y)
             pose_of(p, y, None, q[i], v[i])
             if force is not None:
                 pair_outputs(p, state, state.wear_depth, y, penetration[i], rate, force[i])
@@ -299,7 +299,9 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
         t0 = state.step_start
         end = t0 + state.step_size
         if state.in_flight == 1:
-            i = _rows_in_flight(p, parts, parts.terms.flight, state, w, t, i, q, v, penetration, force)
+            i = _rows_in_flight(
+                p, parts.harmonics, parts.terms.flight, state, w, t, i, q, v, pair_penetration, pair_force
+            )
         while i < t.size and t[i] < end:
             sigma = sigma_at(state, max(t[i] - t0, 0.0))
             sum_series(state, w, sigma, y)

@@ -34,7 +34,7 @@ _BISECTIONS = 60
 LARGEST_ANGLE = 0.25 * math.pi
 
 
-@kernel(inline=True)
+@kernel()
 def penetration_and_rate(p, state, pair):
     """Return penetration and its rate of one pair at the step's start."""
     return penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y)

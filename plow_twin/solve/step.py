@@ -99,13 +99,13 @@ def _end_at_event(p, state, w, span, penetrating, viscous, hysteretic, integer, 
 
 
 @kernel()
-def complete_step(p, parts, state, w, totals, log, wear, fraction) -> None:
+def complete_step(p, harmonics, flight, state, w, totals, log, wear, fraction) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
     y = state.y
     sigma = state.sigma_end
     if wear is not None:
         wear_depth_at(state, w, sigma, state.wear_depth)
-    evaluate(p, parts, state, w, sigma, y)
+    evaluate(p, harmonics, flight, state, w, sigma, y)
     y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
     before = state.step_start
     state.step_start = before + state.step_size

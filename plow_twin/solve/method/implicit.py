@@ -21,7 +21,7 @@ from plow_twin.kernel.simd import row, set_row, splat
 from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
-from plow_twin.solve.dynamics import accelerate
+from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
 from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y, new_record
 
@@ -159,16 +159,16 @@ def note_decay(state, decay, step_size) -> None:
 
 
 @kernel()
-def _jacobian(p, parts, state, t, z, implicit, base, out) -> None:
+def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
     """Write the accelerations at z to `base` (3,), their derivatives by place and by velocity to `out` (2, 3, 3)."""
     rate, moved = implicit.rate[0], implicit.rate[1]
-    accelerate(p, parts, True, state, t, z, implicit.load, rate)
+    accelerate(p, acts, True, state, t, z, implicit.load, rate)
     for j in range(6):
         # where the law is linear any difference will do that rounding does not spoil
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
-        accelerate(p, parts, True, state, t, z, implicit.load, moved)
+        accelerate(p, acts, True, state, t, z, implicit.load, moved)
         z[j] = saved
         for i in range(3):
             out[j // 3, i, j % 3] = (moved[3 + i] - rate[3 + i]) / delta
@@ -264,7 +264,7 @@ def _wear_at_nodes(p, state, h, implicit) -> float:
 
 
 @kernel()
-def _solve(p, parts, state, t, h, implicit, wear) -> bool:
+def _solve(p, acts, state, t, h, implicit, wear) -> bool:
     """Find the velocities at the nodes by Newton's method; return whether it converged.
 
     The derivatives are taken at every node: as the head turns, so does the direction that is damped. Down to rounding:
@@ -282,7 +282,7 @@ def _solve(p, parts, state, t, h, implicit, wear) -> bool:
             at = t + h * implicit.nodes[i]
             if wear is not None:
                 set_row(state.wear_depth, 0, row(implicit.wear_depth, i + 1))
-            _jacobian(p, parts, state, at, z[i + 1], implicit, implicit.accelerations[i], implicit.jacobians[i])
+            _jacobian(p, acts, state, at, z[i + 1], implicit, implicit.accelerations[i], implicit.jacobians[i])
             if wear is not None:
                 set_row(state.wear_depth, 0, row(implicit.wear_depth, 0))
         _newton_matrix(implicit, h)
@@ -443,7 +443,7 @@ def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear) -> float:
     while h >= least:
         for i in range(implicit.nodes.size + 1):
             set_row(implicit.wear_depth, i, row(state.wear_depth, 0))
-        if _solve(p, parts, state, state.step_start, h, implicit, wear):
+        if _solve(p, acting(parts), state, state.step_start, h, implicit, wear):
             size = _write_series(p, state, h, w, implicit, ramp, wear)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:

@@ -15,7 +15,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
-from plow_twin.solve.dynamics import accelerate
+from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 from plow_twin.solve.state import OFF, OMEGA, ON, VX, VY
 
@@ -42,18 +42,18 @@ def _held(p, state, y, least) -> bool:
 
 
 @kernel()
-def _stiffness(p, parts, state, w, gyration) -> None:
+def _stiffness(p, acts, state, w, gyration) -> None:
     """Write the accelerations at `w.rest[0]` to `w.rest[1]`, minus their derivatives by place to `w.hessian` (3, 3).
 
     The angle times the radius of gyration counts as a place: the matrix is symmetric then.
     """
     z, rate, moved, t = w.rest[0], w.rest[1], w.rest[2], state.step_start
-    accelerate(p, parts, True, state, t, z, w.rest[3, :3], rate)
+    accelerate(p, acts, True, state, t, z, w.rest[3, :3], rate)
     for j in range(3):
         unit = gyration if j == 2 else 1.0
         saved, delta = z[j], 1e-9 / unit
         z[j] = saved + delta
-        accelerate(p, parts, True, state, t, z, w.rest[3, :3], moved)
+        accelerate(p, acts, True, state, t, z, w.rest[3, :3], moved)
         z[j] = saved
         for i in range(3):
             scale = gyration if i == 2 else 1.0
@@ -97,7 +97,7 @@ def _to_equilibrium(h, rate, z, gyration) -> None:
 
 
 @kernel()
-def _still(p, parts, state, w) -> bool:
+def _still(p, acts, state, w) -> bool:
     """Tell whether the head stays within the share of the tolerances for all time; bring it to rest then."""
     y, z, rate = state.y, w.rest[0], w.rest[1]
     gyration = math.sqrt(p.inverse_mass / p.inverse_inertia)
@@ -107,7 +107,7 @@ def _still(p, parts, state, w) -> bool:
         return False
     to_world(y, z)
     z[3] = z[4] = z[5] = 0.0
-    _stiffness(p, parts, state, w, gyration)
+    _stiffness(p, acts, state, w, gyration)
     push = math.hypot(math.hypot(rate[3], rate[4]), gyration * rate[5])
     # energy bounds the distance from the equilibrium by v / sqrt(least) + 2 a / least, the speed by v + a / sqrt(least)
     least = max((2.0 * speed / way) ** 2, 4.0 * push / way, (2.0 * push / fast) ** 2)
@@ -118,11 +118,11 @@ def _still(p, parts, state, w) -> bool:
 
 
 @kernel()
-def _still_as_before(p, parts, state, w) -> bool:
+def _still_as_before(p, acts, state, w) -> bool:
     """Tell whether nothing has changed since the head was found at rest: neither its place nor its load."""
     z, rate = w.rest[0], w.rest[1]
     to_world(state.y, z)
-    accelerate(p, parts, True, state, state.step_start, z, w.rest[3, :3], rate)
+    accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
     state.evaluations += 1
     push = math.hypot(math.hypot(rate[3], rate[4]), p.radius * rate[5])
     return push <= 1e-12 * p.threshold[0] * p.weight / p.radius
@@ -134,7 +134,7 @@ def lay_out(p, parts, rest, state, w, span, penetrating) -> bool:
     if rest is None:
         return False
     steady = penetrating and w.wrench[1, 0] == 0.0 and w.wrench[1, 1] == 0.0 and w.wrench[1, 2] == 0.0
-    state.at_rest = 1 if steady and _settle(p, parts, state, w) else 0
+    state.at_rest = 1 if steady and _settle(p, acting(parts), state, w) else 0
     if state.at_rest == 0:
         return False
     write_rest(p, state, w)
@@ -143,10 +143,10 @@ def lay_out(p, parts, rest, state, w, span, penetrating) -> bool:
 
 
 @kernel()
-def _settle(p, parts, state, w) -> bool:
+def _settle(p, acts, state, w) -> bool:
     """Bring the head to rest where it is found at rest; tell whether it is."""
-    if not (state.at_rest == 1 and _still_as_before(p, parts, state, w)):
-        if not _still(p, parts, state, w):
+    if not (state.at_rest == 1 and _still_as_before(p, acts, state, w)):
+        if not _still(p, acts, state, w):
             return False
         to_body(w.rest[0], state.y)
     return True
