@@ -13,8 +13,11 @@ import pytest
 from scenes import preset
 
 from plow_twin import Wear, simulate
+from plow_twin.cli.app import run as cli
+from plow_twin.estimate.coefficient import History, coefficient
 from plow_twin.estimate.forecast import Plan, forecast
 from plow_twin.estimate.life import LifeError, mean_forces, period_of, wear_path
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
 from plow_twin.scene_file import dump_scene
 
 #: Wear so fast that a life fits into a simulation of a minute: 1 mm in some 20 s.
@@ -70,3 +73,43 @@ def test_a_scene_without_wear_or_period_is_refused() -> None:
         forecast(scene, Plan(0.03, 0.03, 100.0))
     with pytest.raises(LifeError, match="loads: got no harmonic"):
         mean_forces(replace(scene, loads=()), np.zeros(8))
+
+
+def test_a_history_of_clearances_tells_the_coefficient(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The truth is a direct run, which shares no jump with the estimate; its coefficient is not the prior's middle."""
+    true_k = 1.8e-9
+    scene = replace(preset("paper"), wear=replace(FAST, prior_m2_n=(2.5e-10, 4e-9)))
+    worn = replace(scene, wear=replace(FAST, coefficient_m2_n=true_k))
+    spans = np.arange(0.0, 25.0, 4.0) * period_of(scene)
+    depth = np.array([np.zeros(8), *(simulate(worn, span, span, 1e-6).wear_depth for span in spans[1:])])
+    grown = 0.5 * np.stack([depth @ np.abs(NORMAL_X), depth @ np.abs(NORMAL_Y)], axis=1)
+    noise = 5e-5
+    rng = np.random.default_rng(4)
+    clearance = np.array([0.025, 0.030]) + grown + noise * rng.standard_normal(grown.shape)
+    history = History(spans * FAST.travel_speed_m_s, clearance, np.full(grown.shape, noise))
+    known = coefficient(scene, history)
+    found = known.interval()
+    assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
+    assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
+    # what is known narrows the forecast
+    plan = Plan(0.030, 0.035, 1.0, load_deviation=0.0)
+    prior, posterior = (forecast(scene, plan, known=knowledge) for knowledge in (None, known))
+    ratios = [life.quantile(0.9) / life.quantile(0.1) for life in (prior, posterior)]  # type: ignore[operator]
+    assert ratios[1] < 1.5 < ratios[0]
+
+    rows = np.column_stack([1e-3 * history.travel, 1e3 * clearance, np.full((len(spans), 2), 1e3 * noise)])
+    lines = [",".join(map(repr, map(float, row[[0, 1, 3, 2, 4]]))) for row in rows]
+    csv, file = tmp_path / "history.csv", tmp_path / "scene.yaml"
+    csv.write_text("\n".join(["km,horizontal_mm,horizontal_sd_mm,vertical_mm,vertical_sd_mm", *lines]))
+    file.write_text(dump_scene(scene))
+    limits = ["--limit-horizontal", "30", "--limit-vertical", "35", "--horizon", "1", "--json", "--history", str(csv)]
+    capsys.readouterr()
+    assert cli(["forecast", str(file), *limits]) == 0
+    assert json.loads(capsys.readouterr().out)["coefficient_m2_n"]["mean"] == pytest.approx(found.mean)
+
+
+def test_a_history_that_cannot_be_used_is_refused() -> None:
+    with pytest.raises(LifeError, match="at least 2 rows"):
+        History(np.zeros(1), np.zeros((1, 2)), np.ones((1, 2)))
+    with pytest.raises(LifeError, match="back in travel"):
+        History(np.array([1.0, 0.0]), np.zeros((2, 2)), np.ones((2, 2)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +14,7 @@ from plow_twin.cli.console import DONE, POSITIVE, busy, json_option, output_cons
 from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
+    from plow_twin.estimate.coefficient import History
     from plow_twin.model.scene import Scene
 
 
@@ -30,6 +33,12 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="estimate.json of `plow-twin estimate --out`: the clearances now, with their intervals.",
 )
+@click.option(
+    "--history",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="CSV of clearances over time (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm): they tell "
+    "the wear coefficient and the clearances now.",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
 @json_option
 @quiet_option
@@ -41,19 +50,33 @@ def forecast(
     stop: float | None,
     face_length: float,
     estimated: Path | None,
+    history: Path | None,
     seed: int,
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Forecast when a clearance of SCENE, which has a section `wear`, reaches its limit."""
-    from plow_twin.estimate.forecast import Plan
-    from plow_twin.estimate.forecast import forecast as run
-    from plow_twin.scene_file import load_scene
+    """Forecast when a clearance of SCENE, which has a section `wear`, reaches its limit.
 
-    model, deviation = _now(load_scene(scene_path(scene)), estimated)
+    SCENE is a scene file, a preset, or a run of ours: of that the scene, and the newest estimate of its node.
+    """
+    from plow_twin.estimate.coefficient import coefficient
+    from plow_twin.estimate.forecast import Plan, with_clearances
+    from plow_twin.estimate.forecast import forecast as run
+
+    model, facts_now = _scene(scene)
+    if estimated is not None:
+        facts_now = json.loads(estimated.read_text(encoding="utf-8"))
     plan = Plan(1e-3 * limit_horizontal, 1e-3 * limit_vertical, horizon, stop, face_length, seed=seed)
     with busy("forecasting", quiet or as_json):
-        facts = run(model, plan, deviation).as_dict()
+        if history is None:
+            model, deviation = _now(model, facts_now)
+            facts = run(model, plan, deviation).as_dict()
+        else:
+            known = coefficient(model, _history(history))
+            low, high = (float(value) for value in known.deviation)
+            model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]))
+            facts = run(model, plan, (low, high), known).as_dict()
+            facts["coefficient_m2_n"] = asdict(known.interval())
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:
@@ -61,18 +84,61 @@ def forecast(
     return DONE
 
 
-def _now(scene: Scene, estimated: Path | None) -> tuple[Scene, tuple[float, float]]:
+def _scene(name: str) -> tuple[Scene, dict[str, Any] | None]:
+    """Return the scene, and of a run the newest estimate."""
+    from plow_twin.record.reader import RunReader, own_run
+    from plow_twin.scene_file import load_scene
+    from plow_twin.stream.journal import Estimated
+
+    if not Path(name).exists() or own_run(Path(name)) is None:
+        return load_scene(scene_path(name)), None
+    reader = RunReader(Path(name))
+    newest = None
+    for batch in reader.batches(outputs=False):
+        for entry in batch.entries.others.values():
+            newest = entry if isinstance(entry, Estimated) else newest
+    return reader.header.scene(reader.path), None if newest is None else json.loads(newest.result)
+
+
+def _history(path: Path) -> History:
+    """Read a history.
+
+    Raises
+    ------
+    LifeError
+        When it cannot be used.
+    """
+    import numpy as np
+
+    from plow_twin.estimate.coefficient import History
+    from plow_twin.estimate.life import LifeError
+
+    names = ("km", "horizontal_mm", "horizontal_sd_mm", "vertical_mm", "vertical_sd_mm")
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = csv.DictReader(file)
+        missing = [name for name in names if name not in (rows.fieldnames or ())]
+        if missing:
+            raise LifeError(f"{path}: got no {', '.join(missing)}, expected the columns {', '.join(names)}")
+        try:
+            table = np.array([[float(row[name]) for name in names] for row in rows], dtype=np.float64).reshape(-1, 5)
+        except (TypeError, ValueError) as error:
+            raise LifeError(f"{path}: {error}, expected numbers") from error
+    if not len(table):
+        raise LifeError(f"{path}: got no row, expected at least 2")
+    return History(1e3 * (table[:, 0] - table[0, 0]), 1e-3 * table[:, [1, 3]], 1e-3 * table[:, [2, 4]])
+
+
+def _now(scene: Scene, facts: dict[str, Any] | None) -> tuple[Scene, tuple[float, float]]:
     """Return the scene with the clearances estimated, if there is an estimate, and their standard deviations."""
     from plow_twin.estimate.forecast import with_clearances
     from plow_twin.estimate.result import NORMAL_P95
 
-    if estimated is None:
+    if facts is None:
         return scene, (0.0, 0.0)
-    facts = json.loads(estimated.read_text(encoding="utf-8"))
     values = [facts[name] for name in ("horizontal", "vertical")]
     withdrawn = [name for name in ("horizontal", "vertical") if facts[name]["state"] == "withdrawn"]
     if withdrawn:
-        raise click.UsageError(f"--estimate: got a withdrawn {withdrawn[0]} clearance, expected one that holds")
+        raise click.UsageError(f"estimate: got a withdrawn {withdrawn[0]} clearance, expected one that holds")
     low, high = ((value["p95_m"] - value["p05_m"]) / (2.0 * NORMAL_P95) for value in values)
     return with_clearances(scene, values[0]["mean_m"], values[1]["mean_m"]), (low, high)
 
@@ -85,5 +151,8 @@ def _show(facts: dict[str, Any]) -> None:
     console = output_console()
     console.print(view)
     console.print(f"not reached in {facts['horizon_h']:g} h: {100 * facts['not_reached_in_horizon']:.0f} %")
+    if "coefficient_m2_n" in facts:
+        found = facts["coefficient_m2_n"]
+        console.print(f"wear coefficient {found['mean']:.3g} m^2/N ({found['p05']:.3g} .. {found['p95']:.3g})")
     if facts["probability_before_stop"] is not None:
         console.print(f"reached before the stop: {100 * facts['probability_before_stop']:.0f} %")

@@ -43,7 +43,9 @@ _MOST_WORK = 3_500_000
 #: Drawn: logarithm of the penetration under the reference force [m] and its bounds; deviations of the damping's
 #: logarithm, of the gains, of the clearance [m].
 _LN_PENETRATION, _BOUNDS = (math.log(3e-5), 1.2), (5e-6, 6e-4)
-_DAMPING, _GAIN, _CLEARANCE = 0.7, 0.06, 3e-4
+_DAMPING, _GAIN, _CLEARANCE = 0.7, 0.06, (1.2e-3, 3e-4, 3e-4)
+#: Correction of the last round in m from which on nothing has been found.
+_ASTRAY = 1.5e-4
 #: What the range of motion overrates a clearance by: noise, and bounces against it [m].
 _OVERRATED: Final = np.array([0.8e-3, 1.0e-3])
 #: Scatter of the logarithm of the noise as it is told by neighbours.
@@ -58,7 +60,7 @@ _FEWEST = 30
 class Bounced:
     """What the comparison tells.
 
-    clearance, clearance_deviation : (2,) in m
+    clearance, clearance_deviation : (2,) in m; infinite where it could not be found
     bias : (2,) of x and y in m with its deviation
     ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
     noise : (3,) standard deviation of the measurements
@@ -106,13 +108,13 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
     features: list[Array] = []
     targets: list[Array] = []
     found: _Regressed | None = None
-    for count in _DRAWS:
+    for count, about in zip(_DRAWS, _CLEARANCE, strict=True):
         for _ in range(count):
             if forward.work > _MOST_WORK:
                 break
             numbers = mean + spread * rng.standard_normal(5)
             numbers[0] = np.clip(numbers[0], *np.log(_BOUNDS))
-            clearance = np.maximum(centre + _CLEARANCE * rng.standard_normal(2), 5e-4)
+            clearance = np.maximum(centre + about * rng.standard_normal(2), 5e-4)
             seen = eye.look(forward, clearance, numbers, rng)
             if seen is not None:
                 features.append(seen)
@@ -128,6 +130,7 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
     assert found is not None
     # what still moves has not been found
     deviation = np.hypot(_WIDENED * found.deviation[:2], 2.0 * moved)
+    deviation[np.abs(moved) > _ASTRAY] = np.inf
     return Bounced(
         centre,
         deviation,

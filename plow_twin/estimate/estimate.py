@@ -105,7 +105,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         observed = deviation < OBSERVED
         value = Interval.normal(bounced.clearance[index], deviation)
         if not observed:
-            value = _unobserved(unknowns, np.full(2, deviation), index, 0.0, bounced.noise)
+            value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
         states.append(State.WITHDRAWN if reasons else State.ESTIMATED if observed else State.NOT_OBSERVABLE)
     exponent = unknowns.scene.contact.exponent

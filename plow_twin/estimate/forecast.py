@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.coefficient import Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95
 from plow_twin.model.scene import Clearance, Scene
@@ -79,7 +80,12 @@ class Forecast:
         }
 
 
-def forecast(scene: Scene, plan: Plan, deviation_m: tuple[float, float] = (0.0, 0.0)) -> Forecast:
+def forecast(
+    scene: Scene,
+    plan: Plan,
+    deviation_m: tuple[float, float] = (0.0, 0.0),
+    known: Coefficient | None = None,
+) -> Forecast:
     """Forecast when a clearance of `scene` reaches its limit.
 
     Parameters
@@ -90,6 +96,9 @@ def forecast(scene: Scene, plan: Plan, deviation_m: tuple[float, float] = (0.0, 
     plan : Plan
     deviation_m : tuple of float
         Standard deviations of the clearances now, in m.
+    known : Coefficient or None
+        What clearances over time have told of the wear coefficient; it holds the size of the load too, so no other
+        scatter of the load is drawn. None: the prior.
 
     Raises
     ------
@@ -104,6 +113,8 @@ def forecast(scene: Scene, plan: Plan, deviation_m: tuple[float, float] = (0.0, 
     rng = np.random.default_rng(plan.seed)
     coefficient = np.exp(rng.normal(0.5 * (low + high), (high - low) / (2.0 * NORMAL_P95), plan.draws))
     load = np.maximum(1.0 + plan.load_deviation * rng.standard_normal(plan.draws), 0.1)
+    if known is not None:
+        coefficient, load = known.draw(plan.draws, rng), np.ones(plan.draws)
     now = rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a clearance that is smaller now has further to go: the path must reach that far

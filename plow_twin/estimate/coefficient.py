@@ -1,0 +1,125 @@
+"""The wear coefficient from clearances that were estimated over weeks.
+
+The clearance grows along one path h(E) of the exposure E = k_s s / A (s the travel), whatever the coefficient k_s is.
+So a history of clearances against travel tells k_s: its posterior is computed on a grid of ln k_s, the clearance at the
+beginning integrated out, from the log-normal prior of the scene's wear.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.life import LifeError, Path, wear_path
+from plow_twin.estimate.result import NORMAL_P95, Interval
+from plow_twin.model.scene import Clearance, Scene
+
+Array = NDArray[np.float64]
+
+#: Points of the grid, and how far it reaches in standard deviations of the prior.
+_POINTS, _REACH = 801, 4.0
+#: How much further than the history the path is followed, as a multiple of what the clearance has grown, and in m.
+_FURTHER, _FURTHER_M = 2.0, 5e-4
+
+
+@dataclass(frozen=True, eq=False)
+class History:
+    """Clearances as they were estimated.
+
+    travel : (n,) along the face since the first one, in m, never falling
+    clearance, deviation : (n, 2) horizontal and vertical with their standard deviations, in m
+    """
+
+    travel: Array
+    clearance: Array
+    deviation: Array
+
+    def __post_init__(self) -> None:
+        """Raise LifeError where the rows cannot be used."""
+        shape, count = self.clearance.shape, len(self.travel)
+        if shape != (count, 2) or self.deviation.shape != (count, 2) or count < 2:
+            raise LifeError(f"history: got {count} travels and clearances {shape}, expected at least 2 rows of both")
+        if not (
+            np.isfinite(self.clearance).all() and (self.deviation > 0.0).all() and (np.diff(self.travel) >= 0.0).all()
+        ):
+            raise LifeError(
+                "history: got a row that is not finite, without a deviation or back in travel, expected none"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Coefficient:
+    """Posterior of the wear coefficient, and the clearances at the end of the history.
+
+    value, weight : (m,) k_s in m^2/N on a grid, and its probabilities
+    clearance, deviation : (2,) in m
+    """
+
+    value: Array
+    weight: Array
+    clearance: Array
+    deviation: Array
+
+    def interval(self) -> Interval:
+        """Return median and 5 % and 95 % points in m^2/N."""
+        low, middle, high = np.interp([0.05, 0.5, 0.95], np.cumsum(self.weight), self.value)
+        return Interval(float(middle), float(low), float(high))
+
+    def draw(self, count: int, rng: np.random.Generator) -> Array:
+        """Return coefficients drawn from the posterior, shape (count,)."""
+        drawn: Array = np.interp(rng.random(count), np.cumsum(self.weight), self.value)
+        return drawn
+
+
+def coefficient(scene: Scene, history: History) -> Coefficient:
+    """Return what a history tells of the wear coefficient.
+
+    Parameters
+    ----------
+    scene : Scene
+        With wear, whose `prior_m2_n` is the prior; its clearances are replaced by those the history begins with.
+    history : History
+
+    Raises
+    ------
+    LifeError
+        Where the scene has no wear or no period, or the history cannot be used.
+    """
+    wear = scene.wear
+    if wear is None:
+        raise LifeError("wear: got none, expected its parameters")
+    weight = 1.0 / history.deviation**2
+    first = history.clearance[0]
+    growth = np.ptp(history.clearance, axis=0)
+    begin = replace(scene, clearance=Clearance(float(first[0]), float(first[1])))
+    low, high = (math.log(value) for value in wear.prior_m2_n)
+    middle, spread = 0.5 * (low + high), max((high - low) / (2.0 * NORMAL_P95), 1e-6)
+    grid = middle + spread * np.linspace(-_REACH, _REACH, _POINTS)
+    most = math.exp(float(grid[-1])) * float(history.travel[-1]) / wear.pad_area_m2
+    limit = first + _FURTHER * growth + _FURTHER_M
+    path = wear_path(begin, (float(limit[0]), float(limit[1])), most)
+    likely, means = np.empty(len(grid)), np.empty((len(grid), 2))
+    for index, ln_k in enumerate(grid):
+        grown = _growth(path, math.exp(float(ln_k)) * history.travel / wear.pad_area_m2)
+        start = (weight * (history.clearance - grown)).sum(axis=0) / weight.sum(axis=0)
+        misfit = history.clearance - grown - start
+        likely[index] = -0.5 * float((weight * misfit**2).sum() + ((ln_k - middle) / spread) ** 2)
+        means[index] = start + grown[-1]
+    share = np.exp(likely - likely.max())
+    share /= share.sum()
+    now = share @ means
+    variance = share @ (means - now) ** 2 + 1.0 / weight.sum(axis=0)
+    return Coefficient(np.exp(grid), share, now, np.sqrt(variance))
+
+
+def _growth(path: Path, exposure: Array) -> Array:
+    """Return how much the clearances have grown at each exposure, shape (n, 2); beyond the path by its last slope."""
+    grown = path.clearance_growth()
+    out = np.stack([np.interp(exposure, path.exposure, column) for column in grown.T], axis=1)
+    if len(path.exposure) > 1:
+        slope = (grown[-1] - grown[-2]) / (path.exposure[-1] - path.exposure[-2])
+        out += np.maximum(exposure - path.exposure[-1], 0.0)[:, None] * slope
+    return out
