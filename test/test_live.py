@@ -33,8 +33,10 @@ from plow_twin.live.front import BridgeFront
 from plow_twin.live.part import Part
 from plow_twin.live.solver_start import Preparation
 from plow_twin.record.mapping import read_map, time_ns
+from plow_twin.record.reader import EntryRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import Arrived
+from plow_twin.stream.journal import Gaps, Pose
 
 ROOT = Path(__file__).resolve().parent.parent
 START_S = 200.0
@@ -79,6 +81,27 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(tmp_path: 
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
     assert report.compared["contact_forces"] == 1000
+
+
+def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> None:
+    rows = [",".join(map(repr, _row(index))) + ",,,," for index in range(100)]
+    rows.insert(50, "0.0302,,,,0.001,0.002,0.003,0.004")
+    rows.insert(60, "0.0405,,,,,,,0.005")
+    rows.insert(61, "0.0205,,,,0.001,,0.003,")  # y was not measured
+    path = tmp_path / "all.csv"
+    path.write_text("t,fx,fy,m,x,y,theta,top_left_top\n" + "\n".join(rows) + "\n")
+    (tmp_path / "map.yaml").write_text("excitation: {topic: all}\nhead_pose: {topic: all}\ngaps: {topic: all}\n")
+    values = _run(path, tmp_path / "map.yaml", record_path=str(tmp_path / "run"))["input"][2]
+    assert (values["samples_used"], values["head_pose_used"], values["gaps_used"]) == ("100", "1", "2")
+    assert values["head_pose_dropped"] == "1"
+    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    assert [entry for entry in entries if isinstance(entry, Pose | Gaps)] == [
+        Pose(1_030_200_000, (0.001, 0.002, 0.003)),
+        Gaps(1_030_200_000, (0,), (0.004,)),
+        Gaps(1_040_500_000, (0,), (0.005,)),
+    ]
+    report = replay(tmp_path / "run")
+    assert (report.samples, report.exit_code) == (100, 0)
 
 
 def test_the_senders_own_numbers_tell_loss_repetition_and_a_new_start(tmp_path: Path) -> None:

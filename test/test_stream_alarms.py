@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from plow_twin.stream.alarms import Alarms, Level, Thresholds
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import Publication, Slow
 
 MS = 1_000_000
 ZERO = np.zeros(8)
@@ -48,3 +50,35 @@ def test_a_threshold_of_zero_is_no_alarm() -> None:
     alarms.take(_publication(0, 199.0))
     assert alarms.worst is Level.NONE
     assert alarms.take(_publication(1, 201.0))
+
+
+def test_a_residual_is_that_at_the_stamp_of_the_pose_early_and_late_alike() -> None:
+    alarms = Alarms({"residual": Thresholds(0.004, 0.0)})
+
+    def moved(stamp_ms: int) -> Publication:
+        publication = _publication(stamp_ms, 0.0)
+        publication.q[0] = 1e-3 * stamp_ms
+        return publication
+
+    for stamp_ms in range(0, 100, 10):
+        alarms.take(moved(stamp_ms))
+    # between two publications, where the model was then and not where it is now
+    assert not alarms.take_pose(35 * MS, (0.036, 0.0, 0.0))
+    assert abs(alarms.alarms["residual"].value - 0.001) < 1e-12
+    # ahead of the model: it waits for it
+    assert not alarms.take_pose(105 * MS, (0.110, 0.0, 0.0))
+    assert not alarms.take(moved(100))
+    assert alarms.take(moved(110))
+    assert alarms.levels["residual"] == (Level.WARN, Level.WARN)
+    assert abs(alarms.alarms["residual"].value - 0.005) < 1e-12
+
+
+def test_the_growth_of_the_clearance_is_that_of_ten_seconds() -> None:
+    alarms = Alarms({"clearance_rate": Thresholds(1e-3, 0.0)})
+    for tenth in range(200):
+        clearance = np.zeros(30)
+        clearance[0] = 0.03 + 2e-4 * tenth
+        publication = replace(_publication(100 * tenth, 0.0), slow=Slow(clearance, ZERO))
+        changed = alarms.take(publication)
+        assert changed == (tenth == 100)
+    assert abs(alarms.alarms["clearance_rate"].value - 2e-3) < 1e-9

@@ -175,4 +175,4 @@ def _roles(bridge: Bridge, mapping: Path | None, source: str, modelled: bool) ->
     return roles
 
 
-_TAKEN: Final = ("excitation", "drive", "travel", "head_pose")
+_TAKEN: Final = ("excitation", "drive", "travel", "head_pose", "gaps")

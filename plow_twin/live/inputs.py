@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from plow_twin.stream.limits import Limits
 from plow_twin.stream.senders import Senders
 
 #: The inputs, as topics are named.
-TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose")
+TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
 #: Another sender counts as there for so long after its last sample [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
 #: An optional input that has been heard counts as silent after so long [ns].
@@ -36,6 +36,8 @@ class Inputs:
     on_pose
         Receives stamp [ns] and x, y [m], theta [rad] of measured poses, late ones up to `pose_span_s` too; None: only
         the newest is kept.
+    on_gaps
+        Receives stamp [ns] and measured gaps [m] by number of their pairs, in order and late ones as poses.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class Inputs:
         depth: int,
         on_pose: Callable[[int, tuple[float, float, float]], None] | None = None,
         pose_span_s: float = 0.0,
+        on_gaps: Callable[[int, Mapping[int, float]], None] = lambda stamp_ns, gaps: None,
     ) -> None:
         self._intake = intake
         self._on_pose = on_pose
@@ -66,6 +69,9 @@ class Inputs:
         self.lost = 0
         self.travel = Intake()
         self.head_pose = Intake()
+        self.gaps = Intake()
+        self._on_gaps = on_gaps
+        self._gap_stamps = RecentStamps(pose_span_s)
         #: newest measured pose x, y [m], theta [rad]
         self.measured: tuple[float, float, float] | None = None
         self.refused_publishers = 0
@@ -124,6 +130,15 @@ class Inputs:
                 self._poses.clear()
             self._poses.add(stamp_ns)
             self._on_pose(stamp_ns, pose)
+
+    def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
+        """Take in measured gaps [m] by number of their pairs."""
+        verdict = self._judged("gaps", self.gaps, stamp_ns, tuple(gaps.values()), self._gap_stamps)
+        if verdict.used:
+            if verdict.resets:
+                self._gap_stamps.clear()
+            self._gap_stamps.add(stamp_ns)
+            self._on_gaps(stamp_ns, gaps)
 
     def _judged(
         self, topic: str, intake: Intake, stamp_ns: int, values: tuple[float, ...], history: RecentStamps | None = None

@@ -219,6 +219,23 @@ class Settings:
         "most evaluations of the equations of motion in an advance, at least 16; the rest of it is coarse then, and "
         "its error is estimated; 0: as many as it takes",
     )
+    head_pose_deviation: tuple[float, ...] = _list(
+        (0.0, 0.0, 0.0),
+        "m, m, rad",
+        0.0,
+        1.0,
+        Effect.CONFIGURE,
+        "standard deviation of head_pose, x, y, theta, in the recording's header; 0: not known",
+    )
+    gaps_deviation: float = _number(0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "the same of gaps")
+    excitation_deviation: tuple[float, ...] = _list(
+        (0.0, 0.0, 0.0),
+        "N, N, N m",
+        0.0,
+        1e12,
+        Effect.CONFIGURE,
+        "the same of the excitation, Fx, Fy, M",
+    )
     alarm_force: tuple[float, ...] = _list(
         (0.0, 0.0),
         "N",
@@ -232,6 +249,17 @@ class Settings:
     )
     alarm_wear_rate: tuple[float, ...] = _list(
         (0.0, 0.0), "m/s", 0.0, 1.0, Effect.CONFIGURE, "the same of the fastest wear of a pad"
+    )
+    alarm_clearance_rate: tuple[float, ...] = _list(
+        (0.0, 0.0), "m/s", 0.0, 1.0, Effect.CONFIGURE, "the same of the growth of that clearance over 10 s"
+    )
+    alarm_residual: tuple[float, ...] = _list(
+        (0.0, 0.0),
+        "m",
+        0.0,
+        10.0,
+        Effect.CONFIGURE,
+        "the same of the distance of head_pose from the model at its stamp",
     )
     alarm_duration: float = _number(
         0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "how long a level must last before there is an alarm"

@@ -28,7 +28,7 @@ from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Entry, Pose, Snapshot
+from plow_twin.stream.journal import Entry, Gaps, Pose, Snapshot
 from plow_twin.stream.limits import Limits, excitation_limits
 from plow_twin.stream.model_changes import changed_twin
 from plow_twin.stream.outputs import Publication
@@ -138,7 +138,9 @@ class Runtime:
         thresholds = {
             "force": Thresholds(*settings.alarm_force),
             "clearance": Thresholds(*settings.alarm_clearance),
+            "clearance_rate": Thresholds(*settings.alarm_clearance_rate),
             "wear_rate": Thresholds(*settings.alarm_wear_rate),
+            **({"residual": Thresholds(*settings.alarm_residual)} if any(settings.alarm_residual) else {}),
         }
         self.alarms = Alarms(thresholds, settings.alarm_duration)
         if settings.estimate and settings.excitation_source == "scene":
@@ -162,8 +164,9 @@ class Runtime:
             self.driver.intake,
             self.driver.travel,
             settings.input_depth,
-            self._pose if self.estimation else None,
+            self._pose,
             settings.rollback_span,
+            self._gaps,
         )
         self.inputs.without_clock = lambda: self._start_due and self.without_clock
         self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
@@ -440,6 +443,12 @@ class Runtime:
 
     def _pose(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
         self.driver.session.apply(Pose(stamp_ns, pose))
+        latched = self.alarms.latched
+        if self.alarms.take_pose(stamp_ns, pose):
+            self._alarms_changed(stamp_ns, latched)
+
+    def _gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
+        self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))
 
     def _look_for_estimate(self) -> None:
         assert self.estimation is not None
@@ -504,10 +513,13 @@ class Runtime:
             if publication.marked:
                 self.recording.message(QUALITY, publication.stamp_ns, messages[QUALITY])
         if changed:
-            self._publish_alarms(publication.stamp_ns)
-            risen = [name for name, level in self.alarms.latched.items() if level > latched[name]]
-            if risen:
-                self.mark(f"alarm: {', '.join(risen)}")
+            self._alarms_changed(publication.stamp_ns, latched)
+
+    def _alarms_changed(self, stamp_ns: int, latched: Mapping[str, int]) -> None:
+        self._publish_alarms(stamp_ns)
+        risen = [name for name, level in self.alarms.latched.items() if level > latched[name]]
+        if risen:
+            self.mark(f"alarm: {', '.join(risen)}")
 
     def _publish_alarms(self, stamp_ns: int) -> None:
         head = self._settings.hardware_id

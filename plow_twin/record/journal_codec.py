@@ -15,6 +15,7 @@ from plow_twin.stream.journal import (
     Digest,
     Entry,
     Estimated,
+    Gaps,
     Hold,
     Loss,
     Mark,
@@ -52,6 +53,7 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "spread": Spread,
     "parameter": Parameter,
     "pose": Pose,
+    "gaps": Gaps,
     "estimated": Estimated,
     "snapshot": Snapshot,
     "digest": Digest,
@@ -121,11 +123,17 @@ def _floats(value: Any) -> tuple[float, ...]:
     return tuple(read(item) for item in value)
 
 
+def _ints(value: Any) -> tuple[int, ...]:
+    read = _exactly(int)
+    return tuple(read(item) for item in value)
+
+
 _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "int": _exactly(int),
     "float": _exactly(float, int),
     "str": _exactly(str),
     "bytes": _bytes,
     "tuple[float, ...]": _floats,
+    "tuple[int, ...]": _ints,
     "ParameterValue": _exactly(bool, int, float, str),
 }

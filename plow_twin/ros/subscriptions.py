@@ -16,6 +16,7 @@ from sensor_msgs.msg import JointState
 
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.tool_forces import ToolForces
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.messages import read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
@@ -58,6 +59,7 @@ class Subscriptions:
                     self._queue = InputQueue(node, subscription, depth, self._taken)
             self._subscribe(TwistStamped, "travel", self._travel_speed, _SLOW_DEPTH)
             self._subscribe(PoseStamped, "head_pose", self._measured_pose, _SLOW_DEPTH)
+            self._subscribe(JointState, "gaps", self._measured_gaps, _SLOW_DEPTH)
         except BaseException:  # an override of the quality of service may be wrong for any of them
             self.close()
             raise
@@ -149,6 +151,15 @@ class Subscriptions:
 
     def _travel_speed(self, message: TwistStamped) -> None:
         self._inputs.take_travel(stamp_ns(message.header), message.twist.linear.z)
+
+    def _measured_gaps(self, message: JointState) -> None:
+        numbers = {name: number for number, name in enumerate(PAIR_NAMES)}
+        named = set(message.name)
+        if len(message.position) != len(message.name) or len(named) != len(message.name) or not named <= numbers.keys():
+            self._inputs.gaps.refuse(Verdict.MALFORMED)
+            return
+        gaps = {numbers[name]: gap for name, gap in zip(message.name, message.position, strict=True)}
+        self._inputs.take_gaps(stamp_ns(message.header), gaps)
 
     def _measured_pose(self, message: PoseStamped) -> None:
         position, turn = message.pose.position, message.pose.orientation

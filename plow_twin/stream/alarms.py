@@ -5,7 +5,10 @@ They follow from the publications and the acknowledgements alone, so that a repl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -15,6 +18,12 @@ from plow_twin.stream.outputs import Publication
 
 #: A level is left below this share of its threshold.
 HYSTERESIS: Final = 0.95
+#: The rate of change of the clearance is that over this time [ns]: its steps of a tenth of a second say little.
+RATE_SPAN_NS: Final = 10 * NS_PER_S
+#: Poses of the model are kept for a measured one that is late by so much [ns].
+_KEPT_NS: Final = 2 * NS_PER_S
+_PRUNED: Final = 500
+_MOST_WAITING: Final = 1000
 
 
 class Level(IntEnum):
@@ -66,6 +75,45 @@ class Alarm:
             self.latched = max(self.latched, level)
 
 
+class _Model:
+    """The latest poses of the model, and measured ones that wait for it."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: list[int] = []
+        self._q: list[tuple[float, float]] = []
+        self._waiting: list[tuple[int, float, float]] = []
+
+    def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
+        """Take in where the model is; return stamps and residuals [m] of the poses that have waited for it."""
+        place = bisect_left(self._stamps_ns, stamp_ns)
+        # late samples have been worked in: what came after them is computed again
+        del self._stamps_ns[place:], self._q[place:]
+        self._stamps_ns.append(stamp_ns)
+        self._q.append((x, y))
+        kept = bisect_left(self._stamps_ns, stamp_ns - _KEPT_NS)
+        if kept > _PRUNED:
+            del self._stamps_ns[:kept], self._q[:kept]
+        due, self._waiting = (
+            [pose for pose in self._waiting if pose[0] <= stamp_ns],
+            [pose for pose in self._waiting if pose[0] > stamp_ns],
+        )
+        return [found for pose in due if (found := self.residual(*pose)) is not None]
+
+    def residual(self, stamp_ns: int, x: float, y: float) -> tuple[int, float] | None:
+        """Return stamp and distance [m] of a measured pose from the model at its stamp; None: not known, or not yet."""
+        if not self._stamps_ns or stamp_ns > self._stamps_ns[-1]:
+            if len(self._waiting) < _MOST_WAITING:
+                self._waiting.append((stamp_ns, x, y))
+            return None
+        place = bisect_left(self._stamps_ns, stamp_ns)
+        if place == 0 and stamp_ns < self._stamps_ns[0]:
+            return None
+        after_ns, before_ns = self._stamps_ns[place], self._stamps_ns[max(place - 1, 0)]
+        share = 1.0 if after_ns == before_ns else (stamp_ns - before_ns) / (after_ns - before_ns)
+        (x0, y0), (x1, y1) = self._q[max(place - 1, 0)], self._q[place]
+        return stamp_ns, math.hypot(x0 + share * (x1 - x0) - x, y0 + share * (y1 - y0) - y)
+
+
 class Alarms:
     """The alarms of one run.
 
@@ -73,7 +121,8 @@ class Alarms:
     ----------
     thresholds
         By name: `force` [N], the largest of a pair since the publication before; `clearance` [m], the larger of
-        horizontal and vertical; `wear_rate` [m/s], the largest of a pad.
+        horizontal and vertical; `clearance_rate` [m/s], its growth over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest
+        of a pad; `residual` [m], the distance of a measured pose from the model at its stamp.
     duration_s
         How long a level must last before there is an alarm [s].
     """
@@ -81,20 +130,46 @@ class Alarms:
     def __init__(self, thresholds: Mapping[str, Thresholds], duration_s: float = 0.0) -> None:
         self.alarms = {name: Alarm(found) for name, found in thresholds.items()}
         self._duration_ns = round(duration_s * NS_PER_S)
+        self._model = _Model() if "residual" in self.alarms else None
+        self._clearances: deque[tuple[int, float]] = deque()
 
     def take(self, publication: Publication) -> bool:
         """Take in a publication; True when a level has changed. One without samples says nothing of the machine."""
         if publication.held:
             return False
         before = self.levels
+        if self._model is not None:
+            for stamp_ns, residual in self._model.add(publication.stamp_ns, *publication.q[:2].tolist()):
+                self.alarms["residual"].take(residual, stamp_ns, self._duration_ns)
         values = {"force": float(publication.peak.max())}
         if publication.slow is not None:
             values["clearance"] = float(publication.slow.clearance[:2].max())
             values["wear_rate"] = float(publication.slow.wear_rate.max())
+            values["clearance_rate"] = self._growth(publication.stamp_ns, values["clearance"])
         for name, value in values.items():
             if name in self.alarms:
                 self.alarms[name].take(value, publication.stamp_ns, self._duration_ns)
         return self.levels != before
+
+    def take_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
+        """Take in a measured pose (x, y [m], theta [rad]); True when a level has changed."""
+        found = None if self._model is None else self._model.residual(stamp_ns, pose[0], pose[1])
+        if found is None:
+            return False
+        before = self.levels
+        self.alarms["residual"].take(found[1], found[0], self._duration_ns)
+        return self.levels != before
+
+    def _growth(self, stamp_ns: int, clearance: float) -> float:
+        """Return by how much the clearance has grown a second [m/s] over the span, or 0 while it has not lasted."""
+        if self._clearances and stamp_ns <= self._clearances[-1][0]:
+            self._clearances.clear()
+        self._clearances.append((stamp_ns, clearance))
+        while len(self._clearances) > 1 and self._clearances[1][0] <= stamp_ns - RATE_SPAN_NS:
+            self._clearances.popleft()
+        first_ns, first = self._clearances[0]
+        span_ns = stamp_ns - first_ns
+        return (clearance - first) / (span_ns * 1e-9) if span_ns >= RATE_SPAN_NS else 0.0
 
     @property
     def levels(self) -> dict[str, tuple[Level, Level]]:

@@ -114,6 +114,15 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class Gaps:
+    """Sensors have measured gaps [m] of the pairs numbered `pairs` at `stamp_ns`: kept for the estimate."""
+
+    stamp_ns: int
+    pairs: tuple[int, ...]
+    gaps: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Estimated:
     """An estimate of the window from `start_ns` to before `end_ns` has come.
 
@@ -167,6 +176,7 @@ Entry = (
     | Spread
     | Parameter
     | Pose
+    | Gaps
     | Estimated
     | Snapshot
     | Digest

@@ -17,6 +17,7 @@ from plow_twin.stream.journal import (
     Digest,
     Entry,
     Estimated,
+    Gaps,
     Hold,
     Loss,
     Mark,
@@ -164,7 +165,7 @@ class Session:
             case Restore(_, data):
                 self._on_entry(entry)
                 self._restore_motion(data)
-            case Parameter() | Pose() | Mark() | Spread():
+            case Parameter() | Pose() | Gaps() | Mark() | Spread():
                 # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from plow_twin.live.load_model import LoadModel
 from plow_twin.live.runtime import Runtime
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.mapping import Role
 from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
@@ -43,7 +44,11 @@ class Feeder:
         self._number = 0
         self._sender = 0
         inputs = runtime.inputs
-        self._optional: dict[str, Intake] = {"travel": inputs.travel, "head_pose": inputs.head_pose}
+        self._optional: dict[str, Intake] = {
+            "travel": inputs.travel,
+            "head_pose": inputs.head_pose,
+            "gaps": inputs.gaps,
+        }
         inputs.senders.start([self._name])
         inputs.senders.alive([self._name])
 
@@ -115,6 +120,9 @@ class Feeder:
             intake.refuse(Verdict.IMPLAUSIBLE)
         elif name == "travel":
             inputs.take_travel(found[0], found[1]["speed"])
+        elif name == "gaps":
+            told = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
+            inputs.take_gaps(found[0], told)
         else:
             values = found[1]
             inputs.take_pose(found[0], (values["x"], values.get("y", math.nan), values.get("theta", math.nan)))
