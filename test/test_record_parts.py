@@ -10,6 +10,7 @@ import yaml
 from record_support import chunk_spans, paper_sample, record_run
 from rosbags.highlevel import AnyReader
 
+from plow_twin.errors import RecordingError
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.doctor import examine, repair
 from plow_twin.record.header import RunHeader
@@ -83,6 +84,15 @@ def test_a_recording_that_was_cut_off_is_repaired(share: float, tmp_path: Path) 
     assert replay(run.folder).exit_code == 0
     with AnyReader([run.folder]) as reader:
         assert reader.message_count == len(found)
+
+
+def test_a_recording_that_is_being_written_is_not_repaired(tmp_path: Path) -> None:
+    scene = dump_scene(load_scene(scene_path("paper")))
+    with Recorder(tmp_path / "run", RunHeader(scene)) as recorder:
+        recorder.journal(paper_sample(0))
+        with pytest.raises(RecordingError, match="is being written"):
+            repair(tmp_path / "run")
+    assert repair(tmp_path / "run") == [] and RunReader(tmp_path / "run").parts
 
 
 def test_a_damaged_chunk_is_left_out_by_a_repair_and_the_gap_is_named(tmp_path: Path) -> None:

@@ -12,8 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.chunks import ChunkReader, Messages
+from plow_twin.record.follow import is_claimed
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
@@ -172,9 +174,12 @@ def repair(path: Path) -> list[Path]:
     Raises
     ------
     RecordingError, OSError
-        There is no recording of ours, or no room.
+        There is no recording of ours, it is still being written, or there is no room.
     """
     reader = RunReader(path)
+    with reader.parts[-1].open("rb") as stream:
+        if is_claimed(stream.fileno()):
+            raise RecordingError(f"{path}: is being written, expected a recording that has ended")
     rewritten, facts = [], []
     for part in reader.parts:
         report = _part(part)
