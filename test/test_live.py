@@ -386,6 +386,7 @@ def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(ur
         (["load.csv", "--set", "excitation_timeout=-1"], 2, "a number from 0.01"),
         (["load.csv", "--set", "excitation_source=tool_forces"], 1, "expected 'excitation' or 'scene'"),
         (["other.csv"], 1, "expected the columns fx, fy, m"),
+        (["junk.csv"], 1, "\\x1b"),
         (["mqtt://localhost:1"], 1, "expected one that names the topics"),
     ],
 )
@@ -400,5 +401,6 @@ def test_a_wrong_call_says_what_was_expected(
     monkeypatch.chdir(tmp_path)
     _csv(tmp_path / "load.csv", 3)
     (tmp_path / "other.csv").write_text("t,a,b\n1,2,3\n")
+    (tmp_path / "junk.csv").write_bytes(b"\x1b[31m" + bytes(range(256)) * 100)
     assert run_cli(["live", *arguments, "--quiet"]) == code
     assert said in " ".join(capfd.readouterr().err.split())

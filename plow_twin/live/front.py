@@ -170,7 +170,8 @@ def _roles(bridge: Bridge, mapping: Path | None, source: str, modelled: bool) ->
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
-        there = "; ".join(f"{topic} ({kind.partition(':')[2]})" for topic, kind in (topics or {}).items())
+        # whatever stands there: it may be no text at all
+        there = "; ".join(f"{topic} ({ascii(kind.partition(':')[2])[:120]})" for topic, kind in (topics or {}).items())
         raise BridgeError(f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m")
     return roles
 
