@@ -1,8 +1,8 @@
 """Replay beside plain reading of the same file, and what a recording costs: `python benchmark/replay.py [SECONDS]`.
 
 Records the paper's head at 1 kHz with all outputs, then prints size, replay multiples (all messages, digests alone),
-and the time that `mcap` and `rosbags` take to read the same file. Times are processor time of one thread, the least of
-some runs.
+the same for a drawing thinned as that of an hour, and the time that `mcap` and `rosbags` take to read the same file.
+Times are processor time of one thread, the least of some runs.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Sample
 from plow_twin.stream.session import Session
+from plow_twin.view import to_rrd
 
 _AMPLITUDE = np.array([32_000.0, -11_000.0, -45_495.0])
 _START_NS = 1_800_000_000_000_000_000
@@ -90,9 +91,11 @@ def main() -> None:
             "replay, every message": lambda: replay(full),
             "replay, digests alone": lambda: replay(full, digests_only=True),
             "replay of the journal": lambda: replay(bare, digests_only=True),
+            "view, thinned": lambda: to_rrd(full, Path(name) / "full.rrd", most_rows=round(200_000 * seconds / 3600)),
             "read with mcap": lambda: read_mcap(full / "full_0.mcap"),
             "read with rosbags": lambda: read_rosbags(full),
         }
+        to_rrd(full, Path(name) / "full.rrd")  # compiles
         for title, work in works.items():
             spent = least(work)
             print(f"{title:24} {spent:8.3f} s {seconds / spent:8.0f} x real time")
