@@ -37,6 +37,9 @@ WIDENED = 1.15
 HARD_SCATTER = 4e-4
 #: The same where bounces were compared; and how far, in that of drawn ones, a motion may be from those drawn.
 BOUNCED_LEAST, MOST_DISTANCE = 4e-5, 4.0
+#: Largest standard deviation in m there: beyond it the wall was touched too seldom, and the answer is a wrong one.
+#: Seen on seeds 108 and 109, added after seed 1009 of the benchmark; see docs/estimate.md.
+BOUNCED_MOST = 4.5e-4
 #: Widening of a fit that had not come to its end.
 UNFINISHED = 1.3
 #: Pairs of the left, right, top and bottom walls of the cavity.
@@ -102,7 +105,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
     clearances, states = [], []
     for index in (GX, GY):
         deviation = float(np.hypot(bounced.clearance_deviation[index], BOUNCED_LEAST))
-        observed = deviation < OBSERVED
+        observed = deviation < BOUNCED_MOST
         value = Interval.normal(bounced.clearance[index], deviation)
         if not observed:
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)

@@ -1,6 +1,6 @@
 """Whether what is left over looks like noise: if not, the model or the sensor is not what it is taken for.
 
-The thresholds were set on truths with seeds below 1000 and proven on others; see docs/estimate.md.
+The thresholds were set on truths with seeds below 1000 and tried on others; see docs/estimate.md for what they miss.
 """
 
 from __future__ import annotations

@@ -1,0 +1,149 @@
+"""Forecasts on synthetic lives: inside 20 % at shares of the life, coverage of the 80 % interval, CRPS, horizon.
+
+    python benchmark/lives.py --lives 8
+
+Each life has a wear coefficient drawn from the prior and a load whose size the forecast does not know; the clearances
+of each of some ten visits are measured with noise. The truth follows the wear in steps a quarter as long as those of
+the forecast.
+
+Definitions: alpha-lambda accuracy and prognostic horizon as Saxena et al., Int. J. Prognostics Health Management 1
+(2010) 1; CRPS as Gneiting and Raftery, J. Am. Stat. Assoc. 102 (2007) 359.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin import Clearance, Scene, Wear, load_scene
+from plow_twin.estimate import life
+from plow_twin.estimate.coefficient import History, coefficient
+from plow_twin.estimate.forecast import HOUR_S, Plan, forecast, with_clearances
+from plow_twin.model.scene import Harmonic
+
+Array = NDArray[np.float64]
+RESULTS = Path(__file__).resolve().parent / "results"
+#: 5 % and 95 % points of the prior, and of the drawn truth [m^2/N].
+PRIOR = (1e-15, 1e-14)
+#: Growth of a clearance that ends a life [m], noise of an estimate [m], visits in a life, shares of it.
+GROWTH, NOISE, VISITS, SHARES = 3e-3, 5e-5, 20, (0.3, 0.5, 0.7)
+#: The inner 80 % lie between these.
+_INNER = (0.1, 0.9)
+#: Relative error within which a forecast counts as right.
+ALPHA = 0.2
+
+
+def truth(rng: np.random.Generator) -> tuple[Scene, float, life.Path]:
+    """Draw a machine, its coefficient, and the path of its wear."""
+    paper = load_scene("paper")
+    gain = 1.0 + 0.05 * rng.standard_normal()
+    loads = tuple(
+        replace(load, force_n=(gain * load.force_n[0], gain * load.force_n[1])) if isinstance(load, Harmonic) else load
+        for load in paper.loads
+    )
+    clearance = Clearance(*rng.uniform(0.020, 0.030, 2))
+    nominal = replace(paper, clearance=clearance, wear=Wear(1e-15, 0.015, 2.0, prior_m2_n=PRIOR))
+    low, high = np.log(PRIOR)
+    known = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
+    step, life.LARGEST_CHANGE = life.LARGEST_CHANGE, life.LARGEST_CHANGE / 4.0
+    try:
+        path = life.wear_path(replace(nominal, loads=loads), limits(nominal), np.inf)
+    finally:
+        life.LARGEST_CHANGE = step
+    return nominal, known, path
+
+
+def limits(scene: Scene) -> tuple[float, float]:
+    """Return the clearances at which a life ends [m]."""
+    return scene.clearance.horizontal_m + GROWTH, scene.clearance.vertical_m + GROWTH
+
+
+def one_life(seed: int) -> list[dict[str, Any]]:
+    """Forecast one life at several shares of it."""
+    rng = np.random.default_rng([20261121, seed])
+    scene, k_s, path = truth(rng)
+    wear = scene.wear
+    assert wear is not None
+    grown = path.clearance_growth()
+    end = min(float(np.interp(GROWTH, column, path.exposure, right=np.inf)) for column in grown.T)
+    hours = end * wear.pad_area_m2 / (k_s * wear.travel_speed_m_s) / HOUR_S
+    rows = []
+    for share in SHARES:
+        exposure = np.linspace(0.0, share * end, max(3, round(share * VISITS)))
+        true = np.stack([np.interp(exposure, path.exposure, column) for column in grown.T], axis=1)
+        start = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
+        history = History(
+            exposure * wear.pad_area_m2 / k_s,
+            start + true + NOISE * rng.standard_normal(true.shape),
+            np.full(true.shape, NOISE),
+        )
+        known = coefficient(scene, history)
+        now = with_clearances(scene, *map(float, known.clearance))
+        plan = Plan(*limits(scene), horizon_h=50.0 * hours, draws=2000, seed=seed)
+        found = np.sort(forecast(now, plan, (float(known.deviation[0]), float(known.deviation[1])), known).hours)
+        left = (1.0 - share) * hours
+        median, low, high = np.quantile(found, [0.5, *_INNER])
+        spread = np.abs(found - found[rng.permutation(len(found))]).mean()
+        rows.append(
+            {
+                "seed": seed, "share": share, "life_h": hours, "error": float(median / left - 1.0),
+                "inside_80": bool(low <= left <= high), "width": float((high - low) / left),
+                "crps": float((np.abs(found - left).mean() - 0.5 * spread) / hours),
+                "coefficient_ratio": float(known.interval().mean / k_s),
+                "coefficient_p95_ratio": float(known.interval().p95 / k_s),
+            }
+        )  # fmt: skip
+    return rows
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Return the table of the page."""
+    lines = [
+        f"| share of the life | lives | within {100 * ALPHA:.0f} % | 80 % interval holds | its width | CRPS / life | "
+        "coefficient within 1.3 |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for share in SHARES:
+        own = [row for row in rows if row["share"] == share]
+        right = np.mean([abs(row["error"]) <= ALPHA for row in own])
+        near = np.mean([abs(np.log(row["coefficient_ratio"])) <= np.log(1.3) for row in own])
+        inside, width, crps = (np.mean([row[key] for row in own]) for key in ("inside_80", "width", "crps"))
+        lines.append(
+            f"| {share:g} | {len(own)} | {100 * right:.0f} % | {100 * inside:.0f} % | {width:.2f} | {crps:.3f} | "
+            f"{100 * near:.0f} % |"
+        )
+    horizons = []
+    for seed in {row["seed"] for row in rows}:
+        wrong = [row["share"] for row in rows if row["seed"] == seed and abs(row["error"]) > ALPHA]
+        horizons.append(next((share for share in SHARES if share > max(wrong, default=0.0)), np.nan))
+    lines.append("")
+    lines.append(f"Prognostic horizon (share of the life from which all stay within {ALPHA:g}), median: ")
+    lines[-1] += f"{np.nanmedian(horizons):g}."
+    return "\n".join(lines)
+
+
+@click.command()
+@click.option("--lives", default=20, show_default=True)
+@click.option("--seed", default=1000, show_default=True, help="First seed.")
+@click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "lives.jsonl", show_default=True)
+def main(lives: int, seed: int, out: Path) -> None:
+    """Run the lives; each is written as soon as it is done, and what is there is not run again."""
+    rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
+    for number in range(seed, seed + lives):
+        if any(row["seed"] == number for row in rows):
+            continue
+        own = one_life(number)
+        rows += own
+        with out.open("a", encoding="utf-8") as file:
+            file.writelines(json.dumps(row) + "\n" for row in own)
+    click.echo(summary([row for row in rows if row["seed"] in range(seed, seed + lives)]))
+
+
+if __name__ == "__main__":
+    main()
