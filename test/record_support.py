@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap import records
 from mcap.reader import make_reader
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from plow_twin.model.scene import Wear
@@ -128,11 +129,15 @@ def rewrite(
     return target
 
 
-def chunk_spans(file: Path) -> list[tuple[int, int]]:
-    """Offset and length of the data of each chunk of a file."""
-    spans = []
+def chunk_spans(file: Path, *, journal: bool | None = None) -> list[tuple[int, int]]:
+    """Offset and length of the data of each chunk of a file; of those of the journal only, or of all others."""
+    spans, topics = [], {}
     with file.open("rb") as stream:
         for record in StreamReader(stream, emit_chunks=True).records:
-            if type(record).__name__ == "Chunk":
-                spans.append((stream.tell() - len(record.data), len(record.data)))
+            inside = breakup_chunk(record) if isinstance(record, records.Chunk) else [record]
+            topics.update({item.id: item.topic for item in inside if isinstance(item, records.Channel)})
+            if isinstance(record, records.Chunk):
+                found = [topics[item.channel_id] for item in inside if isinstance(item, records.Message)]
+                if journal in (None, any("/journal/" in topic for topic in found)):
+                    spans.append((stream.tell() - len(record.data), len(record.data)))
     return spans

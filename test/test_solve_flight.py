@@ -64,9 +64,9 @@ def test_a_drifting_head_meets_the_same_walls_as_the_series_find(seed: int) -> N
     until = int(first[0]) + 1 if len(first) else len(flown.q)
     assert until < len(flown.q), "the head should meet a wall"
     assert np.abs(flown.q - expanded.q)[:until].max() < 1e-11
-    assert flown.log.pair[0] == expanded.log.pair[0]
-    assert flown.log.time[0] == pytest.approx(expanded.log.time[0], rel=1e-9)
-    assert flown.log.rate[0] == pytest.approx(expanded.log.rate[0], rel=1e-6)
+    assert flown.log["pair"][0] == expanded.log["pair"][0]
+    assert flown.log["time"][0] == pytest.approx(expanded.log["time"][0], rel=1e-9)
+    assert flown.log["rate"][0] == pytest.approx(expanded.log["rate"][0], rel=1e-6)
 
 
 def test_long_linear_pieces_and_harmonics_are_flown_together() -> None:

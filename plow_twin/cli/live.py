@@ -26,6 +26,7 @@ from plow_twin.cli.console import (
 if TYPE_CHECKING:
     from plow_twin.live.bridge.source import Bridge
     from plow_twin.live.parameters import Settings
+    from plow_twin.live.stop import StopSignals
 
 _LEVELS = ("OK", "WARN", "ERROR")
 #: Counters that say that something of the input was not used.
@@ -54,12 +55,27 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @quiet_option
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
     """Run the twin on SOURCE: CSV files (a folder, or one file), - for standard input, or mqtt[s]://HOST:PORT."""
+    from plow_twin.live.stop import StopSignals
+
+    with StopSignals() as stop:
+        return _live(source, stop, options, as_json=as_json, quiet=quiet, lines=lines, seconds=seconds)
+
+
+def _live(
+    source: str,
+    stop: StopSignals,
+    options: dict[str, Any],
+    *,
+    as_json: bool,
+    quiet: bool,
+    lines: bool,
+    seconds: float | None,
+) -> int:
     from plow_twin.live.front import BridgeFront
     from plow_twin.live.realtime import apply_realtime
     from plow_twin.live.solver_start import Preparation, leave
-    from plow_twin.live.stop import StopRequested, StopSignals
+    from plow_twin.live.stop import StopRequested
 
-    stop = StopSignals()
     try:
         settings = _settings(options)
         bridge = _bridge(source, options)

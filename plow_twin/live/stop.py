@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from types import FrameType
+from types import FrameType, TracebackType
+from typing import Self
 
 
 class StopRequested(BaseException):
@@ -11,13 +12,24 @@ class StopRequested(BaseException):
 
 
 class StopSignals:
-    """SIGINT and SIGTERM as a flag; while `interrupt` is set (a long start), as `StopRequested`."""
+    """SIGINT and SIGTERM as a flag; while `interrupt` is set (a long start), as `StopRequested`.
+
+    A context: when it is left, the signals do what they did before.
+    """
 
     def __init__(self) -> None:
         self.stopped = False
         self.interrupt = True
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._handle)
+        self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.stopped = True

@@ -162,10 +162,14 @@ class Outputs:
 
 @dataclass(frozen=True)
 class Batch:
-    """Entries, and all messages that were sent after one of them and before the next batch."""
+    """Entries, and all messages that were sent after one of them and before the next batch.
+
+    `damaged` : chunks could not be read since the batch before; what they held may be missing anywhere in this one.
+    """
 
     entries: Entries
     outputs: list[Outputs]
+    damaged: bool = False
 
 
 @dataclass
@@ -236,6 +240,7 @@ class RunReader:
             before += reader.position
             finished = finished and reader.finished
             self.damaged_chunks += reader.damaged
+            merger.end()
         yield from merger.finish()
         if self.tail is not None and self.tail.stopped:
             return
@@ -300,11 +305,16 @@ class _Merger:
         self._part = reader.path
         self._chunks: ChunkReader | None = None
         self._topics: dict[int, tuple[str, str]] = {}
+        self._damaged = 0
 
     def begin(self, part: Path, chunks: ChunkReader) -> None:
         """Go on with the next part."""
         self._part, self._chunks = part, chunks
         self._topics = {}
+
+    def end(self) -> None:
+        """Note that the part has been read."""
+        self._chunks = None
 
     def is_journal(self, part: Path, numbers: set[int]) -> bool:
         """Tell whether one of these channels is the journal's."""
@@ -362,7 +372,9 @@ class _Merger:
             kept += [part[place:]] if place < len(part) else []
         self._outputs = kept
         if len(entries) or outputs:
-            yield Batch(entries, outputs)
+            damaged = self._run.damaged_chunks + (self._chunks.damaged if self._chunks is not None else 0)
+            yield Batch(entries, outputs, damaged > self._damaged)
+            self._damaged = damaged
 
     def _read(self, messages: Messages, samples: int) -> Entries:
         """Return the entries that journal messages stand for."""

@@ -196,6 +196,7 @@ class _Replay:
         self.next_sequence = 0
         self.synced = False  # the session is where the live one was
         self.outputs_synced = False  # and so are its windows between two messages
+        self.outputs_whole = True  # no message of the batch under way may be missing unsaid
         self.resumed = False  # no advance yet since the state was taken from a snapshot
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
@@ -204,6 +205,8 @@ class _Replay:
 
     def batch(self, batch: Batch) -> None:
         """Apply and compare a batch: runs of samples at once, all else entry by entry."""
+        self.outputs_whole = not batch.damaged
+        self.outputs_synced = self.outputs_synced and self.outputs_whole
         entries = batch.entries
         sent = _Sent.of(batch.outputs, self.topics if self.sink is None else _other_topics(batch, self.topics))
         count = len(entries)
@@ -395,7 +398,8 @@ class _Replay:
             self.gaps += missing
             self.synced = self.outputs_synced = False
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
-            self.synced, self.outputs_synced = True, self.all_outputs  # from the scene's own initial state
+            # from the scene's own initial state
+            self.synced, self.outputs_synced = True, self.all_outputs and self.outputs_whole
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one publication
             self.messages = self.publications = None
@@ -444,7 +448,8 @@ class _Replay:
         if before is not None:  # only messages were lost: the motion must be the same
             self._compare("snapshot", snapshot.stamp_ns, "state", self.session.twin.digest(), before)
         self.synced = self.resumed = True
-        self.outputs_synced = self.all_outputs  # without messages nobody takes the outputs' windows
+        # without messages nobody takes the outputs' windows
+        self.outputs_synced = self.all_outputs and self.outputs_whole
 
     def output(self, record: OutputRecord) -> None:
         """Compare one recorded message with the one that the model gives at that place."""
