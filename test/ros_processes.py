@@ -33,6 +33,8 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 100.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
+#: Long enough for a process to start and to be discovered, as a rule [s].
+DISCOVERY_S = 25.0
 _numbers = itertools.count()
 
 
@@ -198,6 +200,19 @@ class Bench:
         self._publishers.append(Process("plow_twin.ros.excitation_publisher", given, self.folder / "publisher.log"))
         return self._publishers[-1]
 
+    def until_heard(self) -> None:
+        """Wait for a first status, which comes before the solver is compiled.
+
+        On a busy machine the middleware may lose what one side should discover; another participant finds it.
+        """
+        for _ in range(3):
+            try:
+                self.probe.until(lambda: self.probe.status or not self.twin.running, "a first status", DISCOVERY_S)
+                return
+            except AssertionError:
+                self.probe.close()
+                self.probe = Probe(self.namespace)
+
     def close(self) -> None:
         """End what still runs."""
         self.probe.close()
@@ -210,6 +225,7 @@ def bench(folder: Path, lifecycle: str = "active", arguments: Sequence[str] = ()
     """Start a twin and wait until it is in the given state."""
     running = Bench(folder, parameters, arguments)
     try:
+        running.until_heard()
         running.probe.until_lifecycle(lifecycle, START_S)
         yield running
     finally:

@@ -158,7 +158,8 @@ def test_a_long_run_is_thinned_without_losing_a_peak(run: Run, tmp_path: Path) -
     tables = read(thin.path)
     for pair, name in enumerate(PAIR_NAMES):
         values = scalars(tables[f"/force/{name}"])
-        assert len(values) <= 600 < COUNT and values.max() == efforts[:, pair].max() / 1e3
+        # at most three of each span; where a batch of the file ends, so does a span
+        assert len(values) <= 750 < COUNT and values.max() == efforts[:, pair].max() / 1e3
     assert thin.section_rows < COUNT // 10
 
 
