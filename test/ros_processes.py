@@ -11,6 +11,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,6 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 100.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
-#: Long enough for a process to start and to be discovered, as a rule [s].
-DISCOVERY_S = 25.0
 _numbers = itertools.count()
 
 
@@ -79,12 +78,19 @@ class Process:
         self._process.wait()
 
 
+@cache
+def _context() -> Context:
+    """Return the one participant of this process: on localhost only its first 32 are discovered."""
+    context = Context()
+    context.init(args=[])
+    return context
+
+
 class Probe:
     """A node of the test process: publishes, listens, calls, waits."""
 
     def __init__(self, namespace: str) -> None:
-        self.context = Context()
-        self.context.init(args=[])
+        self.context = _context()
         self.node = rclpy.create_node("probe", namespace=namespace, context=self.context)
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
@@ -177,7 +183,6 @@ class Probe:
     def close(self) -> None:
         self._executor.remove_node(self.node)
         self.node.destroy_node()
-        self.context.try_shutdown()
 
 
 class Bench:
@@ -200,19 +205,6 @@ class Bench:
         self._publishers.append(Process("plow_twin.ros.excitation_publisher", given, self.folder / "publisher.log"))
         return self._publishers[-1]
 
-    def until_heard(self) -> None:
-        """Wait for a first status, which comes before the solver is compiled.
-
-        On a busy machine the middleware may lose what one side should discover; another participant finds it.
-        """
-        for _ in range(3):
-            try:
-                self.probe.until(lambda: self.probe.status or not self.twin.running, "a first status", DISCOVERY_S)
-                return
-            except AssertionError:
-                self.probe.close()
-                self.probe = Probe(self.namespace)
-
     def close(self) -> None:
         """End what still runs."""
         self.probe.close()
@@ -225,7 +217,6 @@ def bench(folder: Path, lifecycle: str = "active", arguments: Sequence[str] = ()
     """Start a twin and wait until it is in the given state."""
     running = Bench(folder, parameters, arguments)
     try:
-        running.until_heard()
         running.probe.until_lifecycle(lifecycle, START_S)
         yield running
     finally:
