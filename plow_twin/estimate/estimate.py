@@ -110,7 +110,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         if not observed:
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
         clearances.append(value.above(0.0))
-        states.append(State.WITHDRAWN if reasons else State.ESTIMATED if observed else State.NOT_OBSERVABLE)
+        states.append(_state(bool(reasons), observed))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
@@ -134,6 +134,10 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         lost=lost,
         figures={"distance": bounced.distance, "work": float(work)},
     )
+
+
+def _state(suspect: bool, observed: bool) -> State:
+    return State.WITHDRAWN if suspect else State.ESTIMATED if observed else State.NOT_OBSERVABLE
 
 
 def _next_guess(fit: Fit) -> Guess:
@@ -180,7 +184,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
         if not observed:
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
         clearances.append(value.above(0.0))
-        states.append(State.WITHDRAWN if suspect else State.ESTIMATED if observed else State.NOT_OBSERVABLE)
+        states.append(_state(suspect, observed))
     normal = [Interval.normal(value, spread) for value, spread in zip(shared, deviation, strict=True)]
     gain_fx, gain_fy, gain_m = normal[GAIN]
     bias_x, bias_y, bias_theta = normal[BIAS]

@@ -83,7 +83,7 @@ def run_events(
             motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
         )  # fmt: skip
         if code == Status.LOG_FULL:
-            motion.log = np.concatenate([motion.log, np.zeros_like(motion.log)])
+            motion.log = _grown(motion.log)
         elif code == Status.BUDGET and allowed < budget and look is not None:
             look(motion)
             size = _next_slice(size, _time.perf_counter() - begin)
@@ -117,7 +117,7 @@ def run_fixed(
         ))  # fmt: skip
         motion.fixed_time, motion.first[0] = float(done[0]) * dt, int(done[0]) // stride + 1
         if code == Status.LOG_FULL:
-            motion.log = np.concatenate([motion.log, np.zeros_like(motion.log)])
+            motion.log = _grown(motion.log)
         elif code == Status.OK and allowed < steps:
             if allowed == budget:
                 return int(Status.BUDGET)
@@ -126,3 +126,7 @@ def run_fixed(
             size = _next_slice(size, _time.perf_counter() - begin)
         else:
             return code
+
+
+def _grown(log: Log) -> Log:
+    return np.concatenate([log, np.zeros_like(log)])
