@@ -32,10 +32,12 @@ from plow_twin.live.bridge.source import BridgeError
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.part import Part
 from plow_twin.live.solver_start import Preparation
+from plow_twin.record.doctor import examine
 from plow_twin.record.mapping import read_map, time_ns
 from plow_twin.record.reader import EntryRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import Arrived
+from plow_twin.record.unused import unused_messages
 from plow_twin.stream.journal import Gaps, Pose
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -65,7 +67,9 @@ def _run(path: Path, mapping: Path | None = None, **values: Any) -> dict[str, Pa
     return front.parts()
 
 
-def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(tmp_path: Path) -> None:
+def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bad = "no numbers at all\n1.1,1e9,0,0\n1.2,nan,0,0\n1.3,1,2\n0.5,1,2,3\n1.4,true,0,0\n1.5,1_0,0,0\n"
     bad += "x" * 70000 + "\n"
     path = _csv(tmp_path / "load.csv", 1000, bad)
@@ -81,6 +85,19 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(tmp_path: 
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code, report.first_divergence) == (1000, 0, None)
     assert report.compared["contact_forces"] == 1000
+    # the file tells the same of what was not used as the counters, and what it was
+    told = {key.removeprefix("dropped_"): int(count) for key, count in dropped.items()}
+    assert report.inputs == examine(tmp_path / "run").inputs == {"excitation": {"used": 1000, **told}}
+    unused = {found["reason"]: found for found in unused_messages(tmp_path / "run")}
+    assert unused["implausible"]["values"] == (1e9, 0.0, 0.0)
+    assert repr(unused["non_finite"]["values"]) == "(nan, 0.0, 0.0)"
+    assert unused["duplicate"] == {
+        "input": "excitation", "sender": "load", "reason": "duplicate", "count": 1, "stamp_ns": 1_500_000_000,
+        "values": (1.0, 2.0, 3.0),
+    }  # fmt: skip
+    assert run_cli(["info", str(tmp_path / "run"), "--unused"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert len(printed) == 9 and "excitation,load,non_finite,1,2200000000,nan 0.0 0.0" in printed
 
 
 def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> None:

@@ -40,6 +40,7 @@ from plow_twin.stream.journal import (
     Sample,
     Snapshot,
     Travel,
+    Unused,
 )
 
 stamps = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9)
@@ -53,6 +54,15 @@ entries = st.one_of(
     st.builds(Snapshot, stamps, st.binary()),
     st.builds(Digest, stamps, st.text("0123456789abcdef", min_size=16, max_size=16)),
     st.builds(Loss, st.integers(1)),
+    st.builds(
+        Unused,
+        st.text(),
+        st.text(),
+        st.text(),
+        st.integers(),
+        st.lists(stamps).map(tuple),
+        st.lists(st.lists(st.floats(allow_subnormal=True).map(lambda number: number or 0.0)).map(tuple)).map(tuple),
+    ),
     st.builds(Dropped, st.text(), st.integers(1)),
 )
 

@@ -29,6 +29,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene, Wear
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
+from plow_twin.record.unused import unused_messages
 from plow_twin.ros.messages import stamp_ns
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
@@ -174,7 +175,7 @@ def test_a_queue_that_overruns_is_loss_and_said(tmp_path: Path) -> None:
 
 
 def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for(tmp_path: Path) -> None:
-    with bench(tmp_path, excitation_timeout=60.0) as running:
+    with bench(tmp_path, excitation_timeout=60.0, record_path=tmp_path / "run") as running:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
         first, second = probe.excitation(), probe.excitation()
@@ -191,6 +192,15 @@ def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for
         second(T0 + 41 * MS, (30e3, 0.0, 0.0))
         probe.until(lambda: len(forces) == 41, "an answer to the second")
         assert stamp_ns(forces[-1].header) == T0 + 41 * MS
+        running.twin.stop()
+    # who sent what is in the file, to the message
+    unused = list(unused_messages(tmp_path / "run"))
+    assert {found["reason"] for found in unused} == {"not_followed"} and len(unused) == 41
+    told = [(found["stamp_ns"], found["values"][0]) for found in unused]
+    assert told == [(T0 + index * MS - 1_500_000_000, -30e3) for index in range(40)] + [(T0 + 40 * MS, 30e3)]
+    senders = [found["sender"] for found in unused]
+    assert all(name.startswith(f"{running.namespace}/probe ") for name in senders)
+    assert senders[0] == senders[39] != senders[40]
 
 
 def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(tmp_path: Path) -> None:
@@ -322,7 +332,7 @@ def test_wear_outlives_reset_clock_step_cleanup_and_restart_and_is_set_by_its_se
 
 
 def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> None:
-    with bench(tmp_path, excitation_timeout=60.0) as running:
+    with bench(tmp_path, excitation_timeout=60.0, record_path=tmp_path / "run") as running:
         probe = running.probe
         forces = probe.listen(JointState, "contact_forces")
         send = probe.excitation()
@@ -337,9 +347,14 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
         send(T0 + 2 * MS, good)  # late, and worked in
         send(T0 + 4 * MS, (1e8, 0.0, 0.0))
         other.publish(JointState(name=["fx1"], effort=[1.0]))
+        # bytes that are no such message
+        for kind, topic in ((TwistStamped, "travel"), (PoseStamped, "head_pose"), (JointState, "gaps")):
+            probe.publisher(kind, topic).publish(b"\x00\x01\x00\x00" + b"\xff" * 12)
         send(T0 + 4 * MS, good)
         probe.until(lambda: len(forces) == 4, "four good samples")
         probe.until_figure("input", "samples_in", "11")
+        for topic in ("travel", "head_pose", "gaps"):
+            probe.until_figure("input", f"{topic}_dropped", "1")
         figures = probe.figures("input")
         levels = {
             status.level for report in probe.reports for name, status in report.items() if name.endswith(": input")
@@ -354,6 +369,13 @@ def test_bad_samples_are_dropped_counted_and_never_published(tmp_path: Path) -> 
     }
     assert figures["rolled_back"] == "1"
     assert figures["out_of_plane"] == "1"
+    told = {key.removeprefix("dropped_"): count for key, count in dropped.items() if count}
+    del told["not_selected"]
+    assert replay(tmp_path / "run").inputs == {
+        "excitation": {"used": 4, **told},
+        "tool_forces": {"not_selected": 1},
+        **{topic: {"malformed": 1} for topic in ("travel", "head_pose", "gaps")},
+    }
     assert b"\x02" in levels  # an unstamped sample is an error
     assert [stamp_ns(message.header) - T0 for message in forces] == [0, 3 * MS, 3 * MS, 4 * MS]
     for quantity in ("position", "velocity", "effort"):

@@ -20,9 +20,11 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from rclpy.serialization import serialize_message
 
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
+from plow_twin.ros.input_queue import Taken
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -90,7 +92,7 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             message.pose.orientation.z, message.pose.orientation.w = sign * math.sin(5e-3), sign * math.cos(5e-3)
             front = node._front
             assert front is not None
-            front.subscriptions._measured_pose(message)
+            front.subscriptions._measured_poses([Taken(b"", number, 0, serialize_message(message))])
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
             found.append(residual[2])

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,9 +21,12 @@ from plow_twin.scene_file.presets import PRESETS
 
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 a recording with loss.")
 @click.argument("target", required=False)
+@click.option("--unused", is_flag=True, help="Of a recording: each message that came and was not used, one a line.")
 @json_option
-def info(target: str | None, as_json: bool) -> int:
+def info(target: str | None, unused: bool, as_json: bool) -> int:
     """Describe TARGET: a scene (file or preset) or a recording (.mcap); without it, this installation."""
+    if unused and target is not None:
+        return _unused(Path(target), as_json)
     if target is None:
         return _show(_environment(), as_json)
     if Path(target).suffix == ".mcap" or Path(target).is_dir():
@@ -95,3 +101,19 @@ def _recording(path: Path, as_json: bool) -> int:
     facts, lossy = read_recording(path)
     _show(facts, as_json)
     return DONE_WITH_LOSS if lossy else DONE
+
+
+def _unused(path: Path, as_json: bool) -> int:
+    """Print what was not used as CSV, or as an object of JSON a line."""
+    from plow_twin.record.unused import unused_messages
+
+    table = csv.writer(sys.stdout, lineterminator="\n")
+    if not as_json:
+        table.writerow(("input", "sender", "reason", "count", "stamp_ns", "values"))
+    for found in unused_messages(path):
+        if as_json:
+            values = [value if math.isfinite(value) else repr(value) for value in found["values"]]
+            click.echo(json.dumps(found | {"values": values}))
+        else:
+            table.writerow((found | {"values": " ".join(map(repr, found["values"]))}).values())
+    return DONE

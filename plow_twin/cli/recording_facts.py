@@ -7,6 +7,7 @@ from typing import Any
 
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Loss
 
 
@@ -21,9 +22,12 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     reader = RunReader(path)
     first = last = None
     lost: dict[str, int] = {}
+    inputs = InputCounts(reader.header.excitation_source)
     for record in reader:
         first = record.log_time_ns if first is None else first
         last = record.log_time_ns
+        if isinstance(record, EntryRecord):
+            inputs.add_entry(record.entry)
         if isinstance(record, EntryRecord) and isinstance(record.entry, Loss | Dropped):
             where = record.entry.topic if isinstance(record.entry, Dropped) else "journal"
             lost[where] = lost.get(where, 0) + record.entry.count
@@ -36,6 +40,7 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
         "stop_reason": reader.stop_reason,
         "duration_s": 0.0 if first is None or last is None else (last - first) * 1e-9,
         "messages": dict(sorted(reader.counts.items())),
+        "inputs": inputs.facts(),
         "lost": lost,
         "damaged_chunks": reader.damaged_chunks,
         "package_version": header.package_version,

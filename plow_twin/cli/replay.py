@@ -62,6 +62,7 @@ def _facts(report: ReplayReport) -> dict[str, Any]:
         "messages_not_compared": dict(report.not_compared),
         "divergences": report.divergences,
         "first_divergence": None if diverged is None else vars(diverged),
+        "inputs": report.inputs,
         "lost": report.lost,
         "damaged_chunks": report.damaged_chunks,
         "build_differences": {key: list(pair) for key, pair in report.build_differences.items()},

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from numpy.typing import NDArray
 
+from plow_twin.live.unused import UnusedMessages
 from plow_twin.stream.history import RecentStamps
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.limits import Limits
@@ -27,8 +28,10 @@ class Inputs:
 
     Parameters
     ----------
+    source
+        The input that the excitation comes on.
     intake
-        Where samples that go no further are counted.
+        What judges its samples; those that go no further are counted there.
     on_travel
         Receives stamp [ns] and speed along the face [m/s].
     depth
@@ -42,6 +45,7 @@ class Inputs:
 
     def __init__(
         self,
+        source: str,
         intake: Intake,
         on_travel: Callable[[int, float], None],
         depth: int,
@@ -49,7 +53,11 @@ class Inputs:
         pose_span_s: float = 0.0,
         on_gaps: Callable[[int, Mapping[int, float]], None] = lambda stamp_ns, gaps: None,
     ) -> None:
-        self._intake = intake
+        self._source, self._intake = source, intake
+        #: what is not used, for the journal
+        self.unused = UnusedMessages()
+        #: topic and sender of the message that is being taken in, where it is not one of the source
+        self.arriving = ("", b"")
         self._on_pose = on_pose
         self._poses = None if on_pose is None else RecentStamps(pose_span_s)
         self._on_travel = on_travel
@@ -67,9 +75,9 @@ class Inputs:
         self._other_heard_ns = -_OTHER_SENDER_NS
         #: messages that the transport reports as lost before they could be read
         self.lost = 0
-        self.travel = Intake()
-        self.head_pose = Intake()
-        self.gaps = Intake()
+        self.travel, self.head_pose, self.gaps = Intake(), Intake(), Intake()
+        for judge in (intake, self.travel, self.head_pose, self.gaps):
+            judge.on_unused = self._sample_unused if judge is intake else self._unused
         self._on_gaps = on_gaps
         self._gap_stamps = RecentStamps(pose_span_s)
         #: newest measured pose x, y [m], theta [rad]
@@ -102,16 +110,24 @@ class Inputs:
         peak, self._queue_peak = self._queue_peak, (0, 0.0)
         return peak
 
-    def wanted(self, sender: bytes, number: int) -> bool:
-        """Take in that message `number` (from 1) of a sender has come; False, and counted, when it is not used."""
-        if not self.senders.hear(sender, number):
+    def wanted(self, sender: bytes, number: int, stamp_ns: int, values: Sequence[float], fits: bool = True) -> bool:
+        """Take in that message `number` (from 1) of a sender has come; False, and counted, when it is not used.
+
+        `fits` : whether a sample could be made of it; `values` are all its numbers.
+        """
+        lost = self.senders.lost
+        followed = self.senders.hear(sender, number)
+        self.unused.note_lost(self._source, sender, self.senders.lost - lost)
+        if not followed:
             if not self.other_sender:
                 self.look_for_senders()
             self._other_heard_ns = time.monotonic_ns()
-            return False
-        if not self.active:
-            self._intake.refuse(Verdict.INACTIVE)
-        return self.active
+            self.unused.note(self._source, sender, "not_followed", stamp_ns, values)
+        elif not self.active:
+            self._intake.refuse(Verdict.INACTIVE, stamp_ns, values)
+        elif not fits:
+            self._intake.refuse(Verdict.MALFORMED, stamp_ns, values)
+        return followed and self.active and fits
 
     def take_travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Take in a speed along the face."""
@@ -145,12 +161,21 @@ class Inputs:
     ) -> Verdict:
         if not self.active or self.without_clock():
             refused = Verdict.NO_CLOCK if self.active else Verdict.INACTIVE
-            intake.refuse(refused)
+            intake.refuse(refused, stamp_ns, values)
             return refused
         verdict = intake.judge(stamp_ns, values, history=history)
         if verdict.used:
             self._heard_ns[topic] = time.monotonic_ns()
         return verdict
+
+    def _sample_unused(self, verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
+        if verdict is Verdict.NOT_SELECTED:
+            self._unused(verdict, stamp_ns, values)
+        else:
+            self.unused.note(self._source, self.senders.followed or b"", verdict.value, stamp_ns, values)
+
+    def _unused(self, verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
+        self.unused.note(*self.arriving, verdict.value, stamp_ns, values)
 
     def residual(self, q: NDArray[Any]) -> tuple[float, float, float] | None:
         """Return model minus measured pose, or None without a measurement."""

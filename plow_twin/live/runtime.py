@@ -44,6 +44,8 @@ QUALITY: Final = "quality"
 ESTIMATE: Final = "estimate"
 _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
+#: What is not used goes into the journal so often [Hz].
+_UNUSED_HZ: Final = 5.0
 
 
 class Front(Protocol):
@@ -161,6 +163,7 @@ class Runtime:
         every_sample = settings.publish_mode == "on_sample"
         self.driver = Driver(session, self._intake(), policy(settings), every_sample=every_sample)
         self.inputs = Inputs(
+            self.source,
             self.driver.intake,
             self.driver.travel,
             settings.input_depth,
@@ -170,6 +173,8 @@ class Runtime:
         )
         self.inputs.without_clock = lambda: self._start_due and self.without_clock
         self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
+        if self.recording:
+            self.inputs.unused.journal = session.emit
 
     def start(self) -> None:
         """Open the journal; nothing of the front can fail any more. Without a clock the first sample opens it."""
@@ -262,6 +267,7 @@ class Runtime:
     def deactivate(self) -> None:
         """Stop taking samples."""
         self.inputs.active = False
+        self._journal_unused()
 
     def close(self) -> list[str]:
         """Save the wear, end journal and recording; return what was lost, in words."""
@@ -291,6 +297,8 @@ class Runtime:
             periodic.append((settings.publish_rate, self.publish_due))
         if self.wear_keeper:
             periodic.append((1.0 / settings.wear_save_period, self._save_wear))
+        if self.recording:
+            periodic.append((_UNUSED_HZ, self._journal_unused))
         if self.without_clock:
             periodic.append((_LOOK_FOR_CLOCK_HZ, self._look_for_clock))
         if self.estimation:
@@ -323,8 +331,8 @@ class Runtime:
             # kept until the clock comes: one that plays a recording may hear it a little later
             room = self._settings.input_depth - len(self._early)
             self._early += arrived[:room]
-            for _ in arrived[room:]:
-                self.driver.intake.refuse(Verdict.NO_CLOCK)
+            for stamp_ns, wrench in arrived[max(room, 0) :]:
+                self.driver.intake.refuse(Verdict.NO_CLOCK, stamp_ns, wrench)
             return
         if self._early:
             arrived, self._early = self._early + arrived, []
@@ -462,6 +470,11 @@ class Runtime:
     def _look_for_clock(self) -> None:
         if self._start_due and not self.without_clock:
             self.samples([])
+
+    def _journal_unused(self) -> None:
+        """Put what was not used into the journal, once there is one."""
+        if not self._start_due:
+            self.inputs.unused.flush()
 
     def _save_wear(self) -> None:
         if self.wear_keeper:

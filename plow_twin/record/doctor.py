@@ -22,6 +22,7 @@ from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
 from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Loss, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
@@ -57,6 +58,7 @@ class RunReport:
     entries: Counter[str] = field(default_factory=Counter)
     gaps: int = 0
     lost: dict[str, int] = field(default_factory=dict)
+    inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     span_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
@@ -83,6 +85,7 @@ class RunReport:
             "entries": dict(self.entries),
             "missing_entries": self.gaps,
             "lost": self.lost,
+            "inputs": self.inputs,
             "parts": parts,
         }
 
@@ -101,8 +104,10 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     first = last = None
+    inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
+        inputs.add(entries)
         for index, sequence in enumerate(entries.sequence.tolist()):
             if expected is not None and sequence > expected:
                 report.gaps += sequence - expected
@@ -116,6 +121,7 @@ def examine(path: Path) -> RunReport:
                 where = entry.topic if isinstance(entry, Dropped) else "journal"
                 report.lost[where] = report.lost.get(where, 0) + entry.count
     report.lost = {topic: count for topic, count in (reader.lost or report.lost).items() if count}
+    report.inputs = inputs.facts()
     report.span_s = 0.0 if first is None or last is None else (last - first) * 1e-9
     report.status = reader.status.value
     report.layout_version = _layout(reader)

@@ -30,6 +30,7 @@ from plow_twin.stream.journal import (
     Spread,
     Travel,
     Unload,
+    Unused,
 )
 
 
@@ -54,6 +55,7 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "parameter": Parameter,
     "pose": Pose,
     "gaps": Gaps,
+    "unused": Unused,
     "estimated": Estimated,
     "snapshot": Snapshot,
     "digest": Digest,
@@ -71,6 +73,11 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     values = {spec.name: getattr(entry, spec.name) for spec in fields(entry)}
     if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
+    elif isinstance(entry, Unused):
+        # JSON has no number that is not finite
+        values["values"] = [
+            [number if math.isfinite(number) else repr(number) for number in row] for row in entry.values
+        ]
     return Text(json.dumps({"kind": _NAMES[type(entry)], **values}, allow_nan=False))
 
 
@@ -128,6 +135,13 @@ def _ints(value: Any) -> tuple[int, ...]:
     return tuple(read(item) for item in value)
 
 
+def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
+    """Return rows of numbers; one that is not finite stands there as a text."""
+    read = _exactly(float, str)
+    rows = tuple(tuple(float(read(item)) for item in row) for row in value)
+    return rows
+
+
 _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "int": _exactly(int),
     "float": _exactly(float, int),
@@ -135,5 +149,6 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "bytes": _bytes,
     "tuple[float, ...]": _floats,
     "tuple[int, ...]": _ints,
+    "tuple[tuple[float, ...], ...]": _rows,
     "ParameterValue": _exactly(bool, int, float, str),
 }

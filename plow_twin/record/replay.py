@@ -43,9 +43,10 @@ from plow_twin.record.reader import (
     sample_template,
 )
 from plow_twin.record.template import Bytes, Indexes, Template, differs, read_numbers
+from plow_twin.record.unused import InputCounts
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
-from plow_twin.stream.journal import Digest, Gaps, Hold, Loss, Pose, Sample, Snapshot, Unload
+from plow_twin.stream.journal import Digest, Gaps, Hold, Loss, Pose, Sample, Snapshot, Unload, Unused
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.session import Session
 
@@ -81,7 +82,10 @@ class Divergence:
 
 @dataclass
 class ReplayReport:
-    """What a replay found. `compared` and `not_compared` count messages by base name of their topic."""
+    """What a replay found. `compared` and `not_compared` count messages by base name of their topic.
+
+    `inputs` counts what came, by input, used and not used.
+    """
 
     path: Path
     entries: int = 0
@@ -98,6 +102,7 @@ class ReplayReport:
     stop_reason: str | None = None
     damaged_chunks: int = 0
     lost: dict[str, int] = field(default_factory=dict)
+    inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     build_differences: dict[str, tuple[str, str]] = field(default_factory=dict)
     span_s: float = 0.0
     wall_s: float = 0.0
@@ -202,19 +207,21 @@ class _Replay:
         self.first_ns: int | None = None
         self.gaps = 0
         self.noted: Counter[str] = Counter()  # losses, as noted at their place in the journal
+        self.inputs = InputCounts(header.excitation_source)
 
     def batch(self, batch: Batch) -> None:
         """Apply and compare a batch: runs of samples at once, all else entry by entry."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
         entries = batch.entries
+        self.inputs.add(entries)
         sent = _Sent.of(batch.outputs, self.topics if self.sink is None else _other_topics(batch, self.topics))
         count = len(entries)
         breaks = np.ones(count, bool)  # entries that no run goes on into
         breaks[1:] = np.diff(entries.sequence) != 1
         for index, entry in sorted(entries.others.items()):
             goes_on = not breaks[index] and (index - 1 not in entries.others or not breaks[index - 1])
-            if not (goes_on and isinstance(entry, Digest | Pose | Gaps)):
+            if not (goes_on and isinstance(entry, Digest | Pose | Gaps | Unused)):
                 breaks[index : index + 2] = True
         samples = np.flatnonzero(entries.sample)
         late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # worked in one by one
@@ -498,7 +505,7 @@ class _Replay:
         """Complete the report once the file has been read."""
         report = self.report
         report.status, report.damaged_chunks, report.wall_s = reader.status, reader.damaged_chunks, wall_s
-        report.stop_reason = reader.stop_reason
+        report.stop_reason, report.inputs = reader.stop_reason, self.inputs.facts()
         report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
         if self.gaps > self.noted["journal"]:
             report.lost["journal, unaccounted"] = self.gaps - self.noted["journal"]

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any, Final
 
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
-from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from plow_twin.live.runtime import Runtime
@@ -21,10 +21,15 @@ from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.messages import read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
-from plow_twin.stream.intake import Verdict
+from plow_twin.stream.intake import Intake, Verdict
 
 #: Depth of the optional inputs' queues.
-_SLOW_DEPTH = 200
+_SLOW_DEPTH: Final = 200
+_PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
+#: Stamp [ns] and numbers of a message, whether they are a load, and whether one outside the plane is not zero.
+_Read = tuple[int, tuple[float, ...], bool, bool]
+#: What cannot be read at all.
+_UNREADABLE: Final[_Read] = (0, (), False, False)
 
 
 class Subscriptions:
@@ -48,42 +53,47 @@ class Subscriptions:
         self._on_matched = on_matched
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.source, self._inputs.depth
-        self._subscriptions: list[Any] = []
-        self._queue: InputQueue | None = None
+        self._queues: list[InputQueue] = []
+        self._names: dict[tuple[str, bytes], str] = {}
+        self._inputs.unused.name_of = self._name_of
+        read_sample = {"excitation": self._read_wrench, "tool_forces": self._read_tool_forces}
         try:
             for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
-                subscription = self._subscribe(kind, topic, self._not_selected, depth, raw=True)
-                if topic == self._source:
-                    self._inputs.senders.start(self._present())
-                    self._subscriptions.remove(subscription)
-                    self._queue = InputQueue(node, subscription, depth, self._taken)
-            self._subscribe(TwistStamped, "travel", self._travel_speed, _SLOW_DEPTH)
-            self._subscribe(PoseStamped, "head_pose", self._measured_pose, _SLOW_DEPTH)
-            self._subscribe(JointState, "gaps", self._measured_gaps, _SLOW_DEPTH)
+                take = self._samples if topic == self._source else self._not_selected
+                self._subscribe(kind, topic, depth, partial(take, topic, read_sample[topic]))
+            self._subscribe(TwistStamped, "travel", _SLOW_DEPTH, self._travel_speeds)
+            self._subscribe(PoseStamped, "head_pose", _SLOW_DEPTH, self._measured_poses)
+            self._subscribe(JointState, "gaps", _SLOW_DEPTH, self._measured_gaps)
         except BaseException:  # an override of the quality of service may be wrong for any of them
             self.close()
             raise
 
     def look_for_senders(self) -> None:
         """Find out whether the followed publisher is still there."""
-        if self._queue is not None:
-            self._inputs.senders.alive(self._present())
+        if self._source != "scene":
+            self._inputs.senders.alive(self._present(self._source))
 
     def close(self) -> None:
         """Take the subscriptions off the node."""
-        if self._queue is not None:
-            self._queue.close()
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
+        for queue in self._queues:
+            queue.close()
 
-    def _present(self) -> list[bytes]:
-        """Return the publishers of the selected source that there are."""
-        topic = self._node.resolve_topic_name(self._source)
-        return [bytes(found.endpoint_gid) for found in self._node.get_publishers_info_by_topic(topic)]
+    def _present(self, topic: str) -> list[bytes]:
+        """Return the publishers of an input that there are."""
+        found = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+        present = [bytes(publisher.endpoint_gid) for publisher in found]
+        for gid, publisher in zip(present, found, strict=True):
+            space = publisher.node_namespace.rstrip("/")
+            self._names[topic, gid] = f"{space}/{publisher.node_name} {gid.hex()}"
+        return present
 
-    def _subscribe(
-        self, kind: type, topic: str, callback: Callable[[Any], None], depth: int, *, raw: bool = False
-    ) -> Subscription:
+    def _name_of(self, topic: str, sender: bytes) -> str:
+        """Return node and identity of a publisher; of one that has gone unseen the identity alone."""
+        if (topic, sender) not in self._names:
+            self._present(topic)
+        return self._names.setdefault((topic, sender), sender.hex())
+
+    def _subscribe(self, kind: type, topic: str, depth: int, take: Callable[[list[Taken]], None]) -> None:
         events = SubscriptionEventCallbacks(
             message_lost=self._message_lost,
             incompatible_qos=lambda event: self._incompatible(topic, event),
@@ -92,14 +102,15 @@ class Subscriptions:
         subscription = self._node.create_subscription(
             kind,
             topic,
-            callback,
+            lambda message: None,  # the queue below takes the messages, with their publishers
             sensor_input(depth),
             event_callbacks=events,
             qos_overriding_options=OVERRIDABLE,
-            raw=raw,
+            raw=True,
         )
-        self._subscriptions.append(subscription)
-        return subscription
+        if topic == self._source:
+            self._inputs.senders.start(self._present(topic))
+        self._queues.append(InputQueue(self._node, subscription, depth, take))
 
     def _message_lost(self, event: Any) -> None:
         self._inputs.lost += event.total_count_change
@@ -117,51 +128,83 @@ class Subscriptions:
             self.look_for_senders()
         self._on_matched()
 
-    def _taken(self, batch: list[Taken]) -> None:
+    def _samples(self, topic: str, read: Callable[[bytes], _Read], batch: list[Taken]) -> None:
         """Take in what has been in the queue of the selected source."""
-        self._inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
-        read = self._read_wrench if self._source == "excitation" else self._read_tool_forces
+        inputs = self._inputs
+        inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
         arrived: list[Arrival] = []
+        followed = inputs.senders.followed
         for message in batch:
-            if not self._inputs.wanted(message.sender, message.number):
-                continue
-            arrival = read(message.data)
-            if arrival is None:
-                self._intake.refuse(Verdict.MALFORMED)
-            else:
-                arrived.append(arrival)
+            stamp, values, fits, out_of_plane = read(message.data)
+            wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
+            if inputs.senders.followed != followed:
+                # those before were another publisher's
+                arrived, followed = self._hand_over(arrived), inputs.senders.followed
+            if wanted:
+                self._intake.out_of_plane += out_of_plane
+                fx, fy, moment = values
+                arrived.append((stamp, (fx, fy, moment)))
+        self._hand_over(arrived)
+
+    def _hand_over(self, arrived: list[Arrival]) -> list[Arrival]:
         if arrived:
             self._on_samples(arrived)
+        return []
 
-    def _read_wrench(self, data: bytes) -> Arrival | None:
+    def _not_selected(self, topic: str, read: Callable[[bytes], _Read], batch: list[Taken]) -> None:
+        for message in batch:
+            stamp, values, _, _ = read(message.data)
+            self._inputs.arriving = (topic, message.sender)
+            self._intake.refuse(Verdict.NOT_SELECTED, stamp, values)
+
+    def _read_wrench(self, data: bytes) -> _Read:
         found = read_wrench(data)
         if found is None:
-            return None
+            return _UNREADABLE
         stamp, wrench, out_of_plane = found
-        self._intake.out_of_plane += out_of_plane
-        return stamp, wrench
+        return stamp, wrench, True, out_of_plane
 
-    def _read_tool_forces(self, data: bytes) -> Arrival | None:
-        message = deserialize_message(data, JointState)
+    def _read_tool_forces(self, data: bytes) -> _Read:
+        message = _message(data, JointState)
+        if message is None:
+            return _UNREADABLE
         wrench = self._tool_forces.wrench(message.name, message.effort)
-        return None if wrench is None else (stamp_ns(message.header), wrench)
+        values = tuple(message.effort) if wrench is None else wrench
+        return stamp_ns(message.header), values, wrench is not None, False
 
-    def _not_selected(self, message: Any) -> None:
-        self._intake.refuse(Verdict.NOT_SELECTED)
+    def _travel_speeds(self, batch: list[Taken]) -> None:
+        for message in self._messages("travel", TwistStamped, self._inputs.travel, batch):
+            self._inputs.take_travel(stamp_ns(message.header), message.twist.linear.z)
 
-    def _travel_speed(self, message: TwistStamped) -> None:
-        self._inputs.take_travel(stamp_ns(message.header), message.twist.linear.z)
+    def _measured_gaps(self, batch: list[Taken]) -> None:
+        for message in self._messages("gaps", JointState, self._inputs.gaps, batch):
+            named, stamp = set(message.name), stamp_ns(message.header)
+            if len(message.position) == len(message.name) == len(named) and named <= _PAIR_NUMBERS.keys():
+                gaps = {_PAIR_NUMBERS[name]: gap for name, gap in zip(message.name, message.position, strict=True)}
+                self._inputs.take_gaps(stamp, gaps)
+            else:
+                self._inputs.gaps.refuse(Verdict.MALFORMED, stamp, tuple(message.position))
 
-    def _measured_gaps(self, message: JointState) -> None:
-        numbers = {name: number for number, name in enumerate(PAIR_NAMES)}
-        named = set(message.name)
-        if len(message.position) != len(message.name) or len(named) != len(message.name) or not named <= numbers.keys():
-            self._inputs.gaps.refuse(Verdict.MALFORMED)
-            return
-        gaps = {numbers[name]: gap for name, gap in zip(message.name, message.position, strict=True)}
-        self._inputs.take_gaps(stamp_ns(message.header), gaps)
+    def _measured_poses(self, batch: list[Taken]) -> None:
+        for message in self._messages("head_pose", PoseStamped, self._inputs.head_pose, batch):
+            position, turn = message.pose.position, message.pose.orientation
+            theta = 2.0 * math.atan2(turn.z, turn.w)
+            self._inputs.take_pose(stamp_ns(message.header), (position.x, position.y, theta))
 
-    def _measured_pose(self, message: PoseStamped) -> None:
-        position, turn = message.pose.position, message.pose.orientation
-        theta = 2.0 * math.atan2(turn.z, turn.w)
-        self._inputs.take_pose(stamp_ns(message.header), (position.x, position.y, theta))
+    def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
+        """Yield the messages of an input besides the load; what cannot be read is counted."""
+        for taken in batch:
+            self._inputs.arriving = (topic, taken.sender)
+            message = _message(taken.data, kind)
+            if message is None:
+                intake.refuse(Verdict.MALFORMED)
+            else:
+                yield message
+
+
+def _message(data: bytes, kind: type) -> Any | None:
+    """Return the message that CDR bytes hold, or None."""
+    try:
+        return deserialize_message(data, kind)
+    except (RuntimeError, UnicodeDecodeError):
+        return None

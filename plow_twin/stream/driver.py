@@ -129,7 +129,7 @@ class Driver:
                 yield from self._use(run, now_ns)
                 run, late = [], False
             if late and any(sample.stamp_ns == stamp_ns for sample in run):
-                self.intake.refuse(Verdict.DUPLICATE)
+                self.intake.refuse(Verdict.DUPLICATE, stamp_ns, wrench)
                 continue
             verdict = self._judge(stamp_ns, wrench, now_ns)
             if not verdict.used:

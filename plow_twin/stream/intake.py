@@ -6,7 +6,7 @@ The clock is passed in: nothing here reads one.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Protocol
 
@@ -98,6 +98,8 @@ class Intake:
         self.expected_rate_hz = expected_rate_hz
         self.limits = limits
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
+        #: receives reason, stamp [ns] and values of each sample that is not used
+        self.on_unused: Callable[[Verdict, int, Sequence[float]], object] = _ignore
         #: samples that were used although a component outside the plane was not zero
         self.out_of_plane = 0
         self._newest_ns: int | None = None
@@ -152,19 +154,22 @@ class Intake:
         if verdict.resets and not may_reset:
             verdict = Verdict.UNSTEADY
         self.counts[verdict] += 1
-        if verdict.used:
-            if self._newest_ns is None or verdict.resets:
-                self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            self._since_first += 1
-            if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
-                self._newest_ns, self._newest_values = stamp_ns, values
+        if not verdict.used:
+            self.on_unused(verdict, stamp_ns, values)
+            return verdict
+        if self._newest_ns is None or verdict.resets:
+            self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
+        self._since_first += 1
+        if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
+            self._newest_ns, self._newest_values = stamp_ns, values
         return verdict
 
-    def refuse(self, verdict: Verdict) -> None:
-        """Count a sample that was dropped before it could be judged."""
+    def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
+        """Count a sample that was dropped before it could be judged; what could not be read has no values."""
         if verdict.used:
             raise ValueError(f"verdict: got {verdict.value}, expected a reason to drop")
         self.counts[verdict] += 1
+        self.on_unused(verdict, stamp_ns, values)
 
     def restart(self) -> None:
         """Forget the newest stamp: the next sample is a first one. The counts go on."""
@@ -201,3 +206,7 @@ class Intake:
         if self.limits is None or self._newest_ns is None:
             return False
         return self.limits.too_fast(self._newest_values, values, (stamp_ns - self._newest_ns) * 1e-9)
+
+
+def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
+    """Let a sample go that is not used: it is counted."""

@@ -123,6 +123,24 @@ class Gaps:
 
 
 @dataclass(frozen=True)
+class Unused:
+    """`count` messages of `sender` came on the input `topic` and were not used; kept for a dispute, moves nothing.
+
+    `reason` is that of the counters `dropped_<reason>`, or `not_followed`, or `lost`: sent and never arrived (a `count`
+    below 0: so many of them came after all). `stamps_ns` and `values` have an item for each message in order of
+    arrival, the first ones only where there were too many at once; what could not be read has no values and stamp 0.
+    A value need not be finite.
+    """
+
+    topic: str
+    sender: str
+    reason: str
+    count: int
+    stamps_ns: tuple[int, ...]
+    values: tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
 class Estimated:
     """An estimate of the window from `start_ns` to before `end_ns` has come.
 
@@ -177,6 +195,7 @@ Entry = (
     | Parameter
     | Pose
     | Gaps
+    | Unused
     | Estimated
     | Snapshot
     | Digest

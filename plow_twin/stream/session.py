@@ -32,6 +32,7 @@ from plow_twin.stream.journal import (
     Spread,
     Travel,
     Unload,
+    Unused,
 )
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import Outputs
@@ -165,7 +166,7 @@ class Session:
             case Restore(_, data):
                 self._on_entry(entry)
                 self._restore_motion(data)
-            case Parameter() | Pose() | Gaps() | Mark() | Spread():
+            case Parameter() | Pose() | Gaps() | Mark() | Spread() | Unused():
                 # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):

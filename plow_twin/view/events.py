@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import DiagnosticStatus
-from plow_twin.stream.journal import Entry, Hold, Loss, Mark, Parameter, Reset, SetWear, Travel, Unload
+from plow_twin.stream.journal import Entry, Hold, Loss, Mark, Parameter, Reset, SetWear, Travel, Unload, Unused
 from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
 _LEVELS = ("INFO", "WARN", "ERROR", "WARN")
@@ -58,6 +58,8 @@ class Events:
                 self.add(stamp_ns, step, f"parameter {name} = {value}")
             case Mark(_, text):
                 self.add(stamp_ns, step, f"mark: {text}", "WARN")
+            case Unused(topic, sender, reason, count):
+                self.add(stamp_ns, step, f"{count} on {topic} from {sender} not used: {reason}", "WARN")
             case Loss(count):
                 self.add(stamp_ns, step, f"{count} journal entries were lost before this", "ERROR")
             case Dropped(topic, count):

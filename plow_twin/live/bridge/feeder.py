@@ -43,6 +43,7 @@ class Feeder:
         self.newest_ns = 0
         self._number = 0
         self._sender = 0
+        self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
         inputs = runtime.inputs
         self._optional: dict[str, Intake] = {
             "travel": inputs.travel,
@@ -70,29 +71,27 @@ class Feeder:
 
     @property
     def _name(self) -> bytes:
-        return b"%d" % self._sender
+        return f"{self._source}#{self._sender}".encode() if self._sender else self._source.encode()
 
     def _sample(self, role: Role, arrived: Arrived) -> list[Arrival]:
         sender, number, again = self._numbered(role, arrived)
         intake = self._runtime.driver.intake
-        if again:
-            intake.refuse(Verdict.DUPLICATE)
-            return []
-        if not self._runtime.inputs.wanted(sender, number):
-            return []
         found = role.read(arrived)
-        if found is None:
-            intake.refuse(Verdict.MALFORMED)
+        stamp_ns, values = (0, {}) if found is None else found
+        numbers = tuple(values.values())
+        if again:
+            intake.refuse(Verdict.DUPLICATE, stamp_ns, numbers)
             return []
-        stamp_ns, values = found
+        if not self._runtime.inputs.wanted(sender, number, stamp_ns, numbers, found is not None):
+            return []
         if not role.plausible(values):
-            intake.refuse(Verdict.IMPLAUSIBLE)
+            intake.refuse(Verdict.IMPLAUSIBLE, stamp_ns, numbers)
             return []
         if self._model is None:
             return [(stamp_ns, (values["fx"], values["fy"], values["m"]))]
         load = self._model.wrench(values)
         if load is None:
-            intake.refuse(Verdict.MALFORMED)
+            intake.refuse(Verdict.MALFORMED, stamp_ns, numbers)
             return []
         wrench, deviation = load
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
@@ -114,10 +113,11 @@ class Feeder:
 
     def _measured(self, name: str, role: Role, arrived: Arrived) -> None:
         found, intake, inputs = role.read(arrived), self._optional[name], self._runtime.inputs
+        inputs.arriving = (name, arrived.topic.encode())
         if found is None:
             intake.refuse(Verdict.MALFORMED)
         elif not role.plausible(found[1]):
-            intake.refuse(Verdict.IMPLAUSIBLE)
+            intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))
         elif name == "travel":
             inputs.take_travel(found[0], found[1]["speed"])
         elif name == "gaps":

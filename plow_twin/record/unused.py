@@ -1,0 +1,74 @@
+"""What came on the inputs of a run, by its journal: how much was used, and how much was not, why and from whom."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from plow_twin.record.journal_codec import Dropped
+from plow_twin.record.reader import Entries, RunReader
+from plow_twin.stream.journal import Entry, Gaps, Pose, Sample, Travel, Unused
+
+
+@dataclass
+class InputCounts:
+    """Messages by input and by what became of them: `used`, or a reason of `Unused`.
+
+    What the followed publisher of `source` has sent is the sum of its counts, but for `not_followed`.
+    """
+
+    source: str
+    counts: dict[str, Counter[str]] = field(default_factory=dict)
+
+    def add(self, entries: Entries) -> None:
+        """Count entries of a journal."""
+        self._count(self.source, "used", int(entries.sample.sum()))
+        for entry in entries.others.values():
+            self.add_entry(entry)
+
+    def add_entry(self, entry: Entry | Dropped) -> None:
+        """Count an entry."""
+        match entry:
+            case Sample():
+                self._count(self.source, "used", 1)
+            case Unused(topic, _, reason, count):
+                self._count(topic, reason, count)
+            case Travel():
+                self._count("travel", "used", 1)
+            case Pose():
+                self._count("head_pose", "used", 1)
+            case Gaps():
+                self._count("gaps", "used", 1)
+
+    def facts(self) -> dict[str, dict[str, int]]:
+        """Return all counts that are not zero."""
+        return {topic: {why: count for why, count in found.items() if count} for topic, found in self.counts.items()}
+
+    def _count(self, topic: str, what: str, count: int) -> None:
+        if count:
+            self.counts.setdefault(topic, Counter())[what] += count
+
+
+def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield each message that the journal of a run says was not used: input, sender, reason, stamp, values.
+
+    Those of one line of the journal of which only the count is known come last, with a `count` and no stamp.
+
+    Raises
+    ------
+    RecordingError
+        There is no recording of ours, or its journal cannot be understood.
+    """
+    for batch in RunReader(path).batches(outputs=False):
+        for _, entry in sorted(batch.entries.others.items()):
+            if not isinstance(entry, Unused):
+                continue
+            common = {"input": entry.topic, "sender": entry.sender, "reason": entry.reason}
+            for stamp_ns, values in zip(entry.stamps_ns, entry.values, strict=True):
+                yield common | {"count": 1, "stamp_ns": stamp_ns, "values": values}
+            untold = entry.count - len(entry.stamps_ns)
+            if untold:
+                yield common | {"count": untold, "stamp_ns": None, "values": ()}
