@@ -21,7 +21,7 @@ import paho.mqtt.client as paho
 import pytest
 from paho.mqtt.enums import CallbackAPIVersion
 from pwdlib import PasswordHash
-from record_support import PAPER_AMPLITUDE
+from record_support import PAPER_AMPLITUDE, rewrite
 
 from plow_twin.cli.app import run as run_cli
 from plow_twin.errors import RecordingError
@@ -119,6 +119,58 @@ def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> N
     ]
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code) == (100, 0)
+
+
+def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> None:
+    rows = [",".join(map(repr, _row(index))) + ",,," for index in range(1200)]
+    for index in range(50, 1200, 50):
+        rows[index] += f"\n{index * 1e-3 + 2e-4!r},,,,{0.02 if index in (300, 350) else 0.0},0.0,0.0"
+    path = tmp_path / "all.csv"
+    path.write_text("t,fx,fy,m,x,y,theta\n" + "\n".join(rows) + "\n")
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text("excitation: {topic: all}\nhead_pose: {topic: all}\n")
+    given = {"alarm_force": [1e3, 1e9], "alarm_residual": [0.015, 0.0], "alarm_duration": 0.002}
+    settings = parameters.settings(given | {"record_path": str(tmp_path / "run")})
+    said: list[tuple[str, Part]] = []
+    front = BridgeFront(
+        Files([path], follow=False), mapping, settings, Preparation(settings).result(lambda: False),
+        lambda name, part: said.append((name, part)), pytest.fail,
+    )  # fmt: skip
+    acknowledged: list[tuple[bool, str]] = []
+
+    def acknowledge() -> bool:
+        if front.runtime.alarms.worst and not acknowledged:
+            acknowledged.append(front.runtime.acknowledge_alarms())
+        return False
+
+    assert front.run(acknowledge) == [] and acknowledged
+    alarms = [part for name, part in said if name == "alarms"]
+    assert any(part[2]["residual_latched"] == "warn" for part in alarms)
+    report = replay(tmp_path / "run")
+    assert (report.exit_code, report.compared["alarms"], report.first_divergence) == (0, len(alarms), None)
+
+    def other_thresholds(record: dict[str, str]) -> dict[str, str]:
+        return {key: text.replace("0.015", "0.025") for key, text in record.items()}
+
+    file = next((tmp_path / "run").glob("*.mcap"))
+    report = replay(rewrite(file, tmp_path / "other.mcap", metadata=other_thresholds))
+    assert report.exit_code == 1 and report.first_divergence is not None
+    # the alarm of the residual is none any more: it was raised, and went
+    found = report.first_divergence
+    assert (report.divergences, found.topic, found.recorded, found.computed) == (2, "alarms", "a message", "none")
+
+    def other_level(topic: str, message: Any) -> bytes | None:
+        return bytes(message.data).replace(b"warn", b"none") if topic == "/alarms" else None
+
+    report = replay(rewrite(file, tmp_path / "told.mcap", other_level))
+    assert report.first_divergence is not None
+    found = report.first_divergence
+    assert (found.topic, found.recorded, found.computed) == ("alarms", "none", "warn") and "_l" in found.field
+    # where the outputs are not all there nothing is said of alarms
+    few = given | {"record_path": str(tmp_path / "few"), "record_outputs": "none"}
+    _run(path, mapping, **few)
+    report = replay(tmp_path / "few")
+    assert (report.exit_code, report.compared["alarms"]) == (0, 0) and report.not_compared["alarms"] > 0
 
 
 def test_the_senders_own_numbers_tell_loss_repetition_and_a_new_start(tmp_path: Path) -> None:

@@ -228,6 +228,8 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(t
     assert (before.exit_code, after.exit_code) == (0, 0)
     # at the alarm and not at the end; what follows it lies in the second one
     assert 0 < before.samples < 600 and before.samples + after.samples == 601
+    # the first one, which holds the beginning, tells the alarm again; what led to the second one's is not in it
+    assert (before.compared["alarms"], after.compared["alarms"]) == (1, 0) and after.not_compared["alarms"] > 0
     kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
     assert (kinds.count("Parameter"), kinds.count("Mark")) == (1, 1)  # the acknowledgement and the mark
 

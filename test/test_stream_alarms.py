@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from plow_twin.stream.alarms import Alarms, Level, Thresholds
-from plow_twin.stream.outputs import Publication, Slow
+from plow_twin.stream.outputs import Publication, Publications, Slow
 
 MS = 1_000_000
 ZERO = np.zeros(8)
@@ -82,3 +83,22 @@ def test_the_growth_of_the_clearance_is_that_of_ten_seconds() -> None:
         changed = alarms.take(publication)
         assert changed == (tenth == 100)
     assert abs(alarms.alarms["clearance_rate"].value - 2e-3) < 1e-9
+
+
+@pytest.mark.parametrize("names", [("force",), ("wear_rate",), ("clearance", "clearance_rate"), ()])
+def test_many_publications_at_once_raise_what_they_raise_one_by_one(names: tuple[str, ...]) -> None:
+    rng = np.random.default_rng(len(names))
+    run = []
+    for index in range(4000):
+        slow = Slow(rng.random(30), rng.random(8)) if index % 100 == 0 else None
+        run.append(replace(_publication(10 * index, float(rng.random() ** 20)), slow=slow))
+    quantities = ("force", "clearance", "clearance_rate", "wear_rate")
+    thresholds = {name: Thresholds(0.05, 0.97) if name in names else Thresholds() for name in quantities}
+    one, many = Alarms(thresholds, 0.02), Alarms(thresholds, 0.02)
+    expected = [(index, one.levels) for index, publication in enumerate(run) if one.take(publication)]
+    found = []
+    for first in range(0, len(run), 250):
+        changes = many.take_many(Publications.of(run[first : first + 250]))
+        found += [(first + index, many.levels) for index in changes]
+        assert first + 250 < len(run) or many.alarms == one.alarms
+    assert found == expected and bool(names) == bool(expected)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Protocol
@@ -21,10 +22,10 @@ from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_cha
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import WearKeeper
 from plow_twin.model.scene import Scene
+from plow_twin.record.alarms import ACKNOWLEDGED, ALARMS, alarms_message, alarms_of
 from plow_twin.record.messages import DiagnosticStatus, JointState, Message
 from plow_twin.record.outputs import publication_messages, quality
 from plow_twin.record.wear_state import scene_identity
-from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake, Verdict
@@ -137,14 +138,7 @@ class Runtime:
         if settings.wear_state_path:
             self.wear_keeper = WearKeeper(Path(settings.wear_state_path), settings.hardware_id, self.scene)
             depth = self.wear_keeper.load() or depth
-        thresholds = {
-            "force": Thresholds(*settings.alarm_force),
-            "clearance": Thresholds(*settings.alarm_clearance),
-            "clearance_rate": Thresholds(*settings.alarm_clearance_rate),
-            "wear_rate": Thresholds(*settings.alarm_wear_rate),
-            **({"residual": Thresholds(*settings.alarm_residual)} if any(settings.alarm_residual) else {}),
-        }
-        self.alarms = Alarms(thresholds, settings.alarm_duration)
+        self.alarms = alarms_of(asdict(settings))
         if settings.estimate and settings.excitation_source == "scene":
             raise ParameterError([Problem("estimate", True, "false where excitation_source is scene: no load comes")])
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
@@ -387,7 +381,7 @@ class Runtime:
     def acknowledge_alarms(self) -> tuple[bool, str]:
         """Let go the alarms that are latched."""
         left = self.alarms.acknowledge()
-        self.driver.parameter("alarms_acknowledged", self._stamp_ns())
+        self.driver.parameter(ACKNOWLEDGED, self._stamp_ns())
         self._publish_alarms(self._stamp_ns())
         return True, f"still there: {', '.join(left)}" if left else "no alarm is left"
 
@@ -535,28 +529,10 @@ class Runtime:
             self.mark(f"alarm: {', '.join(risen)}")
 
     def _publish_alarms(self, stamp_ns: int) -> None:
-        head = self._settings.hardware_id
-        alarms = self.alarms.alarms.items()
-        there = [name for name, alarm in alarms if alarm.level or alarm.latched]
-        values = {
-            key: text
-            for name, alarm in alarms
-            for key, text in (
-                (name, f"{alarm.value:.6g}"),
-                (f"{name}_level", alarm.level.name.lower()),
-                (f"{name}_latched", alarm.latched.name.lower()),
-            )
-        }
-        status = DiagnosticStatus(
-            int(self.alarms.worst),
-            f"{self._front.name}: alarms",
-            ", ".join(there) or "none",
-            head,
-            tuple(values.items()),
-        )
+        status = alarms_message(self.alarms, self._front.name, self._settings.hardware_id)
         self._front.publish_alarms(status)
         if self.recording:
-            self.recording.message("alarms", stamp_ns, status)
+            self.recording.message(ALARMS, stamp_ns, status)
 
     def _forces_sent(self) -> None:
         if self._received_ns:

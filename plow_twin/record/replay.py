@@ -20,6 +20,7 @@ import numpy as np
 from plow_twin.build import build_fingerprint
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
+from plow_twin.record.alarms import ALARMS, AlarmCheck
 from plow_twin.record.cdr import decode, encode
 from plow_twin.record.chunks import scan
 from plow_twin.record.header import RunHeader
@@ -46,7 +47,7 @@ from plow_twin.record.template import Bytes, Indexes, Template, differs, read_nu
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
-from plow_twin.stream.journal import Digest, Gaps, Hold, Loss, Pose, Sample, Snapshot, Unload, Unused
+from plow_twin.stream.journal import Digest, Gaps, Hold, Loss, Parameter, Pose, Sample, Snapshot, Unload, Unused
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.session import Session
 
@@ -208,11 +209,14 @@ class _Replay:
         self.gaps = 0
         self.noted: Counter[str] = Counter()  # losses, as noted at their place in the journal
         self.inputs = InputCounts(header.excitation_source)
+        self.alarms = AlarmCheck(header, self.all_outputs)
 
     def batch(self, batch: Batch) -> None:
         """Apply and compare a batch: runs of samples at once, all else entry by entry."""
         self.outputs_whole = not batch.damaged
         self.outputs_synced = self.outputs_synced and self.outputs_whole
+        if batch.damaged:
+            self.alarms.give_up()
         entries = batch.entries
         self.inputs.add(entries)
         sent = _Sent.of(batch.outputs, self.topics if self.sink is None else _other_topics(batch, self.topics))
@@ -244,11 +248,23 @@ class _Replay:
                 begin = stop
             place = end
         self._messages(sent, begin, len(sent))
+        if not self.digests_only:
+            self._compare_alarms(batch)
 
     def _is_run(self, entries: Entries, place: int) -> bool:
         expected = (int(entries.sequence[place]) - self.next_sequence) & _SEQUENCE_MASK == 0
         plain = self.session.plain and self.session.twin.excitation == "sampled"
         return self.synced and expected and bool(entries.sample[place]) and plain
+
+    def _compare_alarms(self, batch: Batch) -> None:
+        """Compare the messages of the alarms of a batch."""
+        topic = self.header.topic(ALARMS)
+        parts = [part for part in batch.outputs if any(name == topic for name, _ in part.topics.values())]
+        said = _Sent.of(parts, {topic: ALARMS})
+        for index in range(len(said)):
+            self.alarms.recorded(said.record(index))
+        for difference in self.alarms.differences():
+            self._note(Divergence(*difference))
 
     def _messages(self, sent: _Sent, begin: int, end: int) -> None:
         for index in range(begin, end):
@@ -346,6 +362,13 @@ class _Replay:
         publications = self.session.outputs.take_rows(stamps, rows, taken)
         if len(taken) and taken[-1] == len(stamps) - 1:
             self.publications = publications
+        poses = [
+            (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
+            for index, entry in sorted(entries.others.items())
+            if isinstance(entry, Pose)
+        ]
+        places = sent.sequence[begin:end][changed] & _SEQUENCE_MASK
+        self.alarms.publications(places, first_step + taken, publications, poses)
         numbers = publication_numbers(publications)
         different: list[tuple[int, int]] = []
         for name, indexes, buffer, starts, lengths in sent.by_topic(begin, end):
@@ -400,9 +423,11 @@ class _Replay:
         """Apply or compare one entry of the journal."""
         if not self.report.entries and self.header.part:
             self.next_sequence = record.sequence  # the parts before it are not here
+            self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
         if missing:
             self.gaps += missing
+            self.alarms.give_up()
             self.synced = self.outputs_synced = False
         elif record.sequence == 0 and not isinstance(record.entry, Snapshot):
             # from the scene's own initial state
@@ -414,9 +439,11 @@ class _Replay:
         match record.entry:
             case Loss(count):
                 self.noted["journal"] += count
+                self.alarms.give_up()
                 self.synced = self.outputs_synced = False
             case Dropped(topic, count):
                 self.noted[topic] += count
+                self.alarms.give_up()
                 self.outputs_synced = False
             case Snapshot() as snapshot:
                 self._snapshot(snapshot)
@@ -426,11 +453,15 @@ class _Replay:
                     self._compare("digest", stamp_ns, "digest", digest, self.session.twin.digest())
             case entry:
                 if self.synced:
-                    self._apply(entry)
+                    self._apply(entry, record.sequence)
         if self.sink is not None:
             self._write_entry(record)
 
-    def _apply(self, entry: Any) -> None:
+    def _apply(self, entry: Any, sequence: int) -> None:
+        if isinstance(entry, Pose):
+            self.alarms.pose(sequence, self.report.steps - 1, entry)
+        elif isinstance(entry, Parameter):
+            self.alarms.parameter(sequence, self.report.steps - 1, entry)
         self.report.samples += isinstance(entry, Sample)
         if isinstance(entry, Sample | Hold | Unload):
             self.report.steps += 1
@@ -473,9 +504,12 @@ class _Replay:
             self.report.not_compared[name] += 1
             return
         if self.messages is None:  # the first message of a publication
-            publication = (
-                self.publications[len(self.publications) - 1] if self.publications else self.session.outputs.take()
-            )
+            if self.publications:
+                publication: Publication | None = self.publications[len(self.publications) - 1]
+            else:
+                publication = self.session.outputs.take()
+                if publication is not None:
+                    self.alarms.publication(here, self.report.steps - 1, publication)
             self.publications = None
             frames = (self.header.frame_id, self.header.child_frame_id)
             self.messages = {} if publication is None else publication_messages(publication, *frames)
@@ -505,6 +539,11 @@ class _Replay:
         """Complete the report once the file has been read."""
         report = self.report
         report.status, report.damaged_chunks, report.wall_s = reader.status, reader.damaged_chunks, wall_s
+        if report.status is FileStatus.COMPLETE:
+            for difference in self.alarms.left_over(report.steps - 1):
+                self._note(Divergence(*difference))
+        report.compared += Counter({ALARMS: self.alarms.compared})
+        report.not_compared += Counter({ALARMS: self.alarms.not_compared})
         report.stop_reason, report.inputs = reader.stop_reason, self.inputs.facts()
         report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
         if self.gaps > self.noted["journal"]:

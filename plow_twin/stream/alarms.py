@@ -8,13 +8,16 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import Publication, Publications
 
 #: A level is left below this share of its threshold.
 HYSTERESIS: Final = 0.95
@@ -50,6 +53,11 @@ class Thresholds:
                 found = level
         return found
 
+    @property
+    def lowest(self) -> float:
+        """Value below which there is no level."""
+        return min((found for found in (self.warn, self.error) if found > 0.0), default=math.inf)
+
 
 @dataclass
 class Alarm:
@@ -73,6 +81,10 @@ class Alarm:
         if stamp_ns - self._since_ns >= duration_ns:
             self.level, self._since_ns = level, None
             self.latched = max(self.latched, level)
+
+    def stays(self, values: NDArray[np.float64]) -> bool:
+        """Tell whether none of these values can change a level."""
+        return not self.level and float(values.max(initial=-math.inf)) < self.thresholds.lowest
 
 
 class _Model:
@@ -150,6 +162,29 @@ class Alarms:
             if name in self.alarms:
                 self.alarms[name].take(value, publication.stamp_ns, self._duration_ns)
         return self.levels != before
+
+    @property
+    def follows_poses(self) -> bool:
+        """Whether measured poses matter."""
+        return self._model is not None
+
+    def take_many(self, publications: Publications) -> Iterator[int]:
+        """Take in publications, none of them held; yield the index of each that has changed a level, right after it."""
+        peaks = publications.peak.max(axis=1)
+        values = {"force": peaks, "wear_rate": publications.wear_rate.max(axis=1, initial=0.0)}
+        values["clearance"] = publications.clearance[:, :2].max(axis=1, initial=-math.inf)
+        quiet = all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms)
+        growth = self.alarms.get("clearance_rate")
+        if self._model is not None or not quiet or (growth is not None and growth.thresholds.lowest < math.inf):
+            yield from (index for index in range(len(publications)) if self.take(publications[index]))
+            return
+        stamps_ns = publications.stamp_ns[publications.slow_index].tolist()
+        for stamp_ns, clearance in zip(stamps_ns, values["clearance"].tolist(), strict=True):
+            if growth is not None:
+                growth.take(self._growth(stamp_ns, clearance), stamp_ns, self._duration_ns)
+        for name, found in values.items():
+            if name in self.alarms and len(found):
+                self.alarms[name].take(float(found[-1]), int(publications.stamp_ns[-1]), self._duration_ns)
 
     def take_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
         """Take in a measured pose (x, y [m], theta [rad]); True when a level has changed."""

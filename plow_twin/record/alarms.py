@@ -1,0 +1,157 @@
+"""The alarms of a run: from its parameters, as a message, and computed again from its journal and publications."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.record.cdr import decode, encode
+from plow_twin.record.header import RunHeader
+from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.reader import OutputRecord
+from plow_twin.stream.alarms import Alarms, Thresholds
+from plow_twin.stream.journal import Parameter, Pose
+from plow_twin.stream.outputs import Publication, Publications
+
+#: Base name of their topic.
+ALARMS: Final = "alarms"
+#: Name under which an acknowledgement stands in the journal as a parameter.
+ACKNOWLEDGED: Final = "alarms_acknowledged"
+_NAMES: Final = ("force", "clearance", "clearance_rate", "wear_rate")
+
+#: Step, stamp [ns], topic, field, recorded and computed value of a difference.
+Difference = tuple[int, int, str, str, str, str]
+
+
+def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
+    """Return the alarms that the node's parameters ask for, none of them raised."""
+    thresholds = {name: Thresholds(*parameters.get(f"alarm_{name}", ())) for name in _NAMES}
+    residual = parameters.get("alarm_residual", ())
+    if any(residual):
+        thresholds["residual"] = Thresholds(*residual)
+    return Alarms(thresholds, parameters.get("alarm_duration", 0.0))
+
+
+def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticStatus:
+    """Return the message that says how the alarms are."""
+    each = alarms.alarms.items()
+    there = [name for name, alarm in each if alarm.level or alarm.latched]
+    values = tuple(
+        (key, text)
+        for name, alarm in each
+        for key, text in (
+            (name, f"{alarm.value:.6g}"),
+            (f"{name}_level", alarm.level.name.lower()),
+            (f"{name}_latched", alarm.latched.name.lower()),
+        )
+    )
+    return DiagnosticStatus(int(alarms.worst), f"{node}: {ALARMS}", ", ".join(there) or "none", hardware_id, values)
+
+
+class AlarmCheck:
+    """Compute the alarms of a run again, and compare each message of them with the one recorded.
+
+    They follow from what was published since the run's beginning: where a publication is missing nothing more can be
+    said of them.
+    """
+
+    def __init__(self, header: RunHeader, possible: bool) -> None:
+        self._header = header
+        self._alarms = alarms_of(header.parameters)
+        self._computed: deque[tuple[int, int, DiagnosticStatus]] = deque()
+        self._recorded: deque[OutputRecord] = deque()
+        #: whether all that they follow from has been there
+        self.possible = possible
+        #: messages of the recording that were compared, and that could not be
+        self.compared = self.not_compared = 0
+
+    def give_up(self) -> None:
+        """Take note that something is missing."""
+        self.possible = False
+        self.not_compared += len(self._recorded)
+        self._recorded.clear()
+        self._computed.clear()
+
+    def publication(self, sequence: int, step: int, publication: Publication) -> None:
+        """Take in what was published after entry number `sequence`, which was advance number `step`."""
+        if self.possible and publication.finite and self._alarms.take(publication):
+            self._say(sequence, step)
+
+    def pose(self, sequence: int, step: int, pose: Pose) -> None:
+        """Take in a measured pose of the journal."""
+        if self.possible and self._alarms.take_pose(pose.stamp_ns, pose.pose):
+            self._say(sequence, step)
+
+    def parameter(self, sequence: int, step: int, parameter: Parameter) -> None:
+        """Take in an acknowledgement, if it is one."""
+        if self.possible and parameter.name == ACKNOWLEDGED:
+            self._alarms.acknowledge()
+            self._say(sequence, step)
+
+    def publications(
+        self,
+        sequence: NDArray[np.int64],
+        step: NDArray[np.int64],
+        publications: Publications,
+        poses: Sequence[tuple[int, int, Pose]],
+    ) -> None:
+        """Take in publications and, each with its number and step, the poses between them."""
+        if not self.possible:
+            return
+        if not self._alarms.follows_poses:
+            for index in self._alarms.take_many(publications):
+                self._say(int(sequence[index]), int(step[index]))
+            return
+        waiting = deque(poses)
+        for index, place in enumerate(sequence.tolist()):
+            while waiting and waiting[0][0] <= place:
+                self.pose(*waiting.popleft())
+            self.publication(place, int(step[index]), publications[index])
+        for pose in waiting:
+            self.pose(*pose)
+
+    def recorded(self, record: OutputRecord) -> None:
+        """Take in a message of the recording."""
+        if self.possible:
+            self._recorded.append(record)
+        else:
+            self.not_compared += 1
+
+    def differences(self) -> Iterator[Difference]:
+        """Yield how messages differ; one without its counterpart waits: what is missing may be said to be so later."""
+        while self._recorded and self._computed:
+            record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()
+            self.compared += 1
+            if record.sequence != sequence:
+                difference = "place in the journal", str(record.sequence), str(sequence)
+            elif record.data != encode(computed):
+                difference = _first_difference(record, computed)
+            else:
+                continue
+            yield step, record.publish_time_ns, ALARMS, *difference
+
+    def left_over(self, step: int) -> Iterator[Difference]:
+        """Yield what has no counterpart, at the end of a whole recording; `step` is the last one."""
+        for record in self._recorded:
+            self.compared += 1
+            yield step, record.publish_time_ns, ALARMS, "message", "a message", "none"
+        for _, at, _ in self._computed:
+            yield at, 0, ALARMS, "message", "none", "a message"
+
+    def _say(self, sequence: int, step: int) -> None:
+        hardware_id = str(self._header.parameters.get("hardware_id", ""))
+        self._computed.append((sequence, step, alarms_message(self._alarms, self._header.node, hardware_id)))
+
+
+def _first_difference(record: OutputRecord, computed: DiagnosticStatus) -> tuple[str, str, str]:
+    recorded = decode(record.data, record.message_type)
+    if not isinstance(recorded, DiagnosticStatus):
+        return "type", record.message_type, computed.TYPE
+    for (key, ours), (name, theirs) in zip(computed.values, recorded.values, strict=False):
+        if (key, ours) != (name, theirs):
+            return key, theirs if key == name else name, ours
+    return "message", repr(recorded), repr(computed)
