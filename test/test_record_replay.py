@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from record_support import BASE_NS, STEP_NS, Run, chunk_spans, paper_entries, paper_sample, record_run, rewrite
 
 from plow_twin.errors import RecordingError
@@ -100,6 +102,51 @@ def test_a_changed_output_is_found_and_does_not_spoil_the_rest(run: Run, tmp_pat
     found = report.first_divergence
     assert (found.step, found.topic, found.field) == (index, "contact_forces", "effort[3]")
     assert float(found.recorded) == float(found.computed) + 1.0
+
+
+def test_a_flipped_bit_anywhere_in_an_output_is_found(run: Run, tmp_path: Path) -> None:
+    places = {
+        ("/contact_forces", 300): 0,
+        ("/contact_peaks", 600): -1,
+        ("/head_state", 900): 200,
+        ("/clearance", 1000): 60,
+        ("/wear_rate", 1000): 311,
+    }
+
+    def change(topic: str, message: Any) -> bytes | None:
+        place = places.get((topic, (message.publish_time - BASE_NS) // STEP_NS))
+        if place is None:
+            return None
+        data = bytearray(message.data)
+        data[place] ^= 4
+        return bytes(data)
+
+    report = replay(rewrite(run.file, tmp_path / "changed.mcap", change))
+    assert (report.exit_code, report.divergences, report.compared["clearance"]) == (1, len(places), 25)
+    assert report.first_divergence is not None
+    assert (report.first_divergence.step, report.first_divergence.topic) == (300, "contact_forces")
+
+
+def test_outputs_in_another_order_are_compared_all_the_same(run: Run, tmp_path: Path) -> None:
+    file = tmp_path / "turned.mcap"
+    with run.file.open("rb") as stream, file.open("wb") as out:
+        reader, writer = make_reader(stream), Writer(out, chunk_size=64 * 1024)
+        writer.start(profile="ros2", library="test")
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, dict(record.metadata))
+        messages = list(reader.iter_messages(log_time_order=False))
+        journal = [found for found in messages if "/journal/" in found[1].topic]
+        outputs = [found for found in messages if "/journal/" not in found[1].topic]
+        numbers: dict[str, int] = {}
+        for schema, channel, message in [*journal, *reversed(outputs)]:
+            if channel.topic not in numbers:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
+            times = message.log_time, message.data, message.publish_time, message.sequence
+            writer.add_message(numbers[channel.topic], *times)
+        writer.finish()
+    report = replay(file)
+    assert (report.exit_code, report.messages_compared) == (0, replay(run.folder).messages_compared)
 
 
 def test_a_missing_sample_diverges(run: Run, tmp_path: Path) -> None:

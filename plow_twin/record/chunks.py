@@ -17,6 +17,7 @@ import numpy as np
 
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.template import Bytes, Indexes, compiled
+from plow_twin.record.words import word
 
 try:  # twenty times as fast as the standard library's
     from isal.isal_zlib import crc32 as crc32
@@ -28,6 +29,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 RECORD_LIMIT: Final = 256 * 1024 * 1024
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
 _HEAD: Final = struct.Struct("<BQ")
+_INDEX_HEAD: Final = struct.Struct("<BQH")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
 MESSAGE_HEAD: Final = 31
@@ -110,11 +112,11 @@ class ChunkReader:
         loose: list[bytes] = []
         opened: list[Bytes] = []
         with open_mcap(self.path) as stream:
-            size = os.fstat(stream.fileno()).st_size
-            stream.seek(len(MAGIC))
+            descriptor = stream.fileno()
+            size = os.fstat(descriptor).st_size
+            place = len(MAGIC)
             while True:
-                place = stream.tell()
-                head = stream.read(_HEAD.size)
+                head = os.pread(descriptor, _HEAD.size, place)
                 opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
                 begin = place + _HEAD.size
                 if length > RECORD_LIMIT:
@@ -127,12 +129,11 @@ class ChunkReader:
                     yield Messages.none()
                     if not self.more(stream, size):
                         break
-                    size = os.fstat(stream.fileno()).st_size
-                    stream.seek(place)
+                    size = os.fstat(descriptor).st_size
                     continue
-                self.position = begin + length
+                place = self.position = begin + length
                 if opcode == _MESSAGE:
-                    loose.append(head + stream.read(length))
+                    loose.append(head + os.pread(descriptor, length, begin))
                     if len(loose) >= 4096 or length > _SMALL:
                         opened.append(np.frombuffer(b"".join(loose), np.uint8))
                         loose = []
@@ -142,47 +143,32 @@ class ChunkReader:
                 if sum(map(len, opened)) > _SMALL:
                     yield from self._scan(opened, schemas)
                     opened = []
-                if opcode == _MESSAGE:
-                    continue
                 if opcode == _CHUNK:
-                    if self.wanted is None or self._is_wanted(stream, begin + length, size):
-                        stream.seek(begin)
-                        content = self._open(stream.read(length))
-                        if content is not None:
-                            if len(content) > _SMALL:
-                                yield from self._scan(opened, schemas)
-                                opened = []
-                            opened.append(content)
-                        else:
-                            yield from self._scan(opened, schemas)
-                            opened = []
-                            self._note_damage(schemas)
-                    stream.seek(begin + length)
+                    numbers, place = _indexed(descriptor, place, size)
+                    if not self._is_wanted(numbers):
+                        continue
+                    content = self._open(os.pread(descriptor, length, begin))
+                    if content is None or len(content) > _SMALL:
+                        yield from self._scan(opened, schemas)
+                        opened = []
+                    if content is not None:
+                        opened.append(content)
+                    else:
+                        self._note_damage(schemas)
                 elif opcode in (_SCHEMA, _CHANNEL):
-                    self._declare(opcode, stream.read(length), schemas)
+                    self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
-                    self._metadata(stream.read(length))
+                    self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
-                    self.finished = stream.read(length + len(MAGIC))[-len(MAGIC) :] == MAGIC
+                    self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
                     break
-                else:
-                    stream.seek(begin + length)
             if loose:
                 opened.append(np.frombuffer(b"".join(loose), np.uint8))
             yield from self._scan(opened, schemas)
 
-    def _is_wanted(self, stream: IO[bytes], place: int, size: int) -> bool:
-        """Ask by the index records behind a chunk; without one the chunk is wanted."""
-        numbers: set[int] = set()
-        while place + 11 <= size:
-            stream.seek(place)
-            opcode, length, number = struct.unpack("<BQH", stream.read(11))
-            if opcode != _MESSAGE_INDEX:
-                break
-            numbers.add(number)
-            place += _HEAD.size + length
-        known = numbers <= self.channels.keys()
-        return not numbers or not known or self.wanted is None or self.wanted(numbers)
+    def _is_wanted(self, numbers: set[int]) -> bool:
+        """Ask for a chunk by the channels in its index; without one the chunk is wanted."""
+        return self.wanted is None or not numbers or not numbers <= self.channels.keys() or self.wanted(numbers)
 
     def _open(self, record: bytes) -> Bytes | None:
         """Return what a chunk holds, or None when it is damaged."""
@@ -266,6 +252,18 @@ class ChunkReader:
             self.channels.setdefault(channel.id, Channel(channel.topic, name, channel.message_encoding, text))
 
 
+def _indexed(descriptor: int, place: int, size: int) -> tuple[set[int], int]:
+    """Return the channels in the index records from `place` on, and where these end."""
+    numbers: set[int] = set()
+    while place + _INDEX_HEAD.size <= size:
+        opcode, length, number = _INDEX_HEAD.unpack(os.pread(descriptor, _INDEX_HEAD.size, place))
+        if opcode != _MESSAGE_INDEX or place + _HEAD.size + length > size:
+            break
+        numbers.add(number)
+        place += _HEAD.size + length
+    return numbers, place
+
+
 def _bytes(record: bytes) -> Bytes:
     return np.frombuffer(record, np.uint8)
 
@@ -295,27 +293,17 @@ def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, boo
 
     Returns the number of each, and whether the records end where the chunk ends.
     """
-    place, count, other = np.int64(0), 0, 0
+    place, count, other = 0, 0, 0
     size = content.size
     while place + 9 <= size:
-        length = np.int64(0)
-        for i in range(8):
-            length |= np.int64(content[place + 1 + i]) << (8 * i)
-        start = place + 9
+        length, start = word(content, place + 1), place + 9
         if length < 0 or length > size - start:
             return count, other, False
         opcode = content[place]
         if opcode == 5 and length >= 22:
-            table[0, count] = np.int64(content[start]) | np.int64(content[start + 1]) << 8
-            number = np.int64(0)
-            for i in range(4):
-                number |= np.int64(content[start + 2 + i]) << (8 * i)
-            table[1, count] = number
-            log, publish = np.int64(0), np.int64(0)
-            for i in range(8):
-                log |= np.int64(content[start + 6 + i]) << (8 * i)
-                publish |= np.int64(content[start + 14 + i]) << (8 * i)
-            table[2, count], table[3, count] = log, publish
+            head = word(content, start)
+            table[0, count], table[1, count] = head & 0xFFFF, head >> 16 & 0xFFFFFFFF
+            table[2, count], table[3, count] = word(content, start + 6), word(content, start + 14)
             table[4, count], table[5, count] = start + 22, length - 22
             count += 1
         elif opcode == 3 or opcode == 4:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Final
@@ -62,6 +63,8 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "loss": Loss,
     "dropped": Dropped,
 }
+#: A digest as it is written: it is what most entries of a journal are.
+_DIGEST: Final = re.compile(r'\{"kind": "digest", "stamp_ns": (-?[0-9]{1,19}), "digest": "([0-9a-f]*)"\}')
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
 
@@ -100,13 +103,15 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
 
 
 def _from_json(text: str, source: str) -> Entry | Dropped:
+    digest = _DIGEST.fullmatch(text)
+    if digest is not None:
+        return Digest(int(digest[1]), digest[2])
     try:
         values = json.loads(text)
-        kind = _KINDS[values.pop("kind")]
-        arguments = {spec.name: _READERS[str(spec.type)](values[spec.name]) for spec in fields(kind)}
+        kind = values["kind"]
+        entry: Entry | Dropped = _KINDS[kind](*[read(values[name]) for name, read in _FIELDS[kind]])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise RecordingError(f"{source}: got {text[:120]!r}, expected an entry of the journal ({error!r})") from error
-    entry: Entry | Dropped = kind(**arguments)
     return entry
 
 
@@ -151,4 +156,8 @@ _READERS: Final[dict[str, Callable[[Any], Any]]] = {
     "tuple[int, ...]": _ints,
     "tuple[tuple[float, ...], ...]": _rows,
     "ParameterValue": _exactly(bool, int, float, str),
+}
+#: Name and reader of each field by kind.
+_FIELDS: Final = {
+    name: [(spec.name, _READERS[str(spec.type)]) for spec in fields(kind)] for name, kind in _KINDS.items()
 }

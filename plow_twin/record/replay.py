@@ -10,19 +10,20 @@ import hashlib
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.build import build_fingerprint
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS, AlarmCheck
 from plow_twin.record.cdr import decode, encode
-from plow_twin.record.chunks import scan
+from plow_twin.record.chunks import Messages, scan
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
@@ -43,7 +44,7 @@ from plow_twin.record.reader import (
     RunReader,
     sample_template,
 )
-from plow_twin.record.template import Bytes, Indexes, Template, differs, read_numbers
+from plow_twin.record.template import Indexes, Templates, differing, read_numbers
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
@@ -57,6 +58,9 @@ if TYPE_CHECKING:
 #: Topics that depend on the publication before: after a lost message they can be compared again from the next
 #: snapshot on.
 _CUMULATIVE: Final = frozenset({"contact_peaks", "clearance", "wear_rate"})
+#: By place in `PUBLICATION_TOPICS`, the last one for other topics.
+_IS_CUMULATIVE: Final = np.array([*(name in _CUMULATIVE for name in PUBLICATION_TOPICS), False])
+_IS_SLOW: Final = np.array([*(name in SLOW_TOPICS for name in PUBLICATION_TOPICS), False])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 #: Receives the share of the file that has been replayed, 0..1.
@@ -188,7 +192,8 @@ class _Replay:
         bound = header.parameters.get("max_evaluations") or None
         twin = Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=None if bound is None else int(bound))
         twin.warm_up()
-        self.templates = publication_templates(header.frame_id, header.child_frame_id)
+        templates = publication_templates(header.frame_id, header.child_frame_id)
+        self.templates = Templates.of(templates[name] for name in PUBLICATION_TOPICS)
         if excitation == "sampled":
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
@@ -219,7 +224,7 @@ class _Replay:
             self.alarms.give_up()
         entries = batch.entries
         self.inputs.add(entries)
-        sent = _Sent.of(batch.outputs, self.topics if self.sink is None else _other_topics(batch, self.topics))
+        sent = _Sent.of(batch.outputs, self.topics)
         count = len(entries)
         breaks = np.ones(count, bool)  # entries that no run goes on into
         breaks[1:] = np.diff(entries.sequence) != 1
@@ -259,15 +264,19 @@ class _Replay:
     def _compare_alarms(self, batch: Batch) -> None:
         """Compare the messages of the alarms of a batch."""
         topic = self.header.topic(ALARMS)
-        parts = [part for part in batch.outputs if any(name == topic for name, _ in part.topics.values())]
-        said = _Sent.of(parts, {topic: ALARMS})
-        for index in range(len(said)):
-            self.alarms.recorded(said.record(index))
+        said = []
+        for part in batch.outputs:
+            channels = [channel for channel, (name, _) in part.topics.items() if name == topic]
+            places = np.flatnonzero(np.isin(part.messages.channel, channels)).tolist() if channels else []
+            said += [(int(part.sequence[place]), part.record(place)) for place in places]
+        for _, record in sorted(said, key=lambda found: found[0]):
+            self.alarms.recorded(record)
         for difference in self.alarms.differences():
             self._note(Divergence(*difference))
 
     def _messages(self, sent: _Sent, begin: int, end: int) -> None:
-        for index in range(begin, end):
+        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # what is written is formed anew
+        for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
     def _run(self, entries: Entries, sent: _Sent, begin: int, end: int) -> bool:
@@ -355,10 +364,11 @@ class _Replay:
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
         """Form the publications that were sent and compare their messages; return the differences."""
-        after = done[sent.sequence[begin:end] - entries.sequence[0]] - 1  # row after which each was sent
-        changed = np.ones(len(after), bool)
-        changed[1:] = after[1:] != after[:-1]
-        taken, publication = after[changed], np.cumsum(changed) - 1
+        sequence, kind = sent.sequence[begin:end], sent.kind[begin:end]
+        after = done[sequence - entries.sequence[0]] - 1  # row after which each was sent
+        published = np.zeros(len(stamps), bool)
+        published[after[kind >= 0]] = True
+        taken, publication = np.flatnonzero(published), np.cumsum(published)[after] - 1
         publications = self.session.outputs.take_rows(stamps, rows, taken)
         if len(taken) and taken[-1] == len(stamps) - 1:
             self.publications = publications
@@ -367,49 +377,43 @@ class _Replay:
             for index, entry in sorted(entries.others.items())
             if isinstance(entry, Pose)
         ]
-        places = sent.sequence[begin:end][changed] & _SEQUENCE_MASK
-        self.alarms.publications(places, first_step + taken, publications, poses)
-        numbers = publication_numbers(publications)
-        different: list[tuple[int, int]] = []
-        for name, indexes, buffer, starts, lengths in sent.by_topic(begin, end):
-            if name in _CUMULATIVE and not self.outputs_synced:
-                self.report.not_compared[name] += len(indexes)
-                continue
-            self.report.compared[name] += len(indexes)
-            row = publication[indexes - begin]
-            if name in SLOW_TOPICS:
-                slow = np.searchsorted(publications.slow_index, row)
-                absent = (
-                    publications.slow_index[np.minimum(slow, len(publications.slow_index) - 1)] != row
-                    if len(publications.slow_index)
-                    else np.ones(len(row), bool)
-                )
-                row = np.where(absent, -1, slow)
-            wrong = np.zeros(len(indexes), bool)
-            template = self.templates[name]
-            stamp, values = numbers[name]
-            present = np.flatnonzero(row >= 0)
-            wrong[row < 0] = True
-            if len(present) == len(row):
-                differs(
-                    buffer, starts, lengths, template.data, template.fixed, template.runs, row, stamp, values, wrong
-                )
-            elif present.size:
-                some = np.zeros(len(present), bool)
-                differs(
-                    buffer, starts[present], lengths[present], template.data, template.fixed, template.runs,
-                    row[present], stamp, values, some,
-                )  # fmt: skip
-                wrong[present] = some
-            different += [(int(index), int(publication[index - begin])) for index in indexes[wrong].tolist()]
+        first_sent = sequence[kind >= 0][np.searchsorted(after[kind >= 0], taken)]
+        self.alarms.publications(first_sent & _SEQUENCE_MASK, first_step + taken, publications, poses)
+        slow = np.full(len(taken) + 1, -1)
+        slow[publications.slow_index] = np.arange(len(publications.slow_index))
+        row = np.where(_IS_SLOW[kind], slow[publication], publication)
+        counts = np.bincount(kind[kind >= 0], minlength=len(PUBLICATION_TOPICS)).tolist()
+        for name, count in zip(PUBLICATION_TOPICS, counts, strict=True):
+            skipped = name in _CUMULATIVE and not self.outputs_synced
+            (self.report.not_compared if skipped else self.report.compared)[name] += count
+        if not self.outputs_synced:
+            kind = np.where(_IS_CUMULATIVE[kind], -1, kind)
+        wrong = self._differing(sent, begin, kind, row, publications)
         found = []
-        for index, place in sorted(different):
-            record = sent.record(index)
+        for index in np.flatnonzero(wrong).tolist():
+            record, place = sent.record(begin + index), int(publication[index])
             where = self._difference(record, publications[place])
             if where is not None:
-                step = first_step + int(taken[place])
-                found.append((step, record.publish_time_ns, self.topics[record.topic], *where))
+                found.append(
+                    (first_step + int(taken[place]), record.publish_time_ns, self.topics[record.topic], *where)
+                )
         return found
+
+    def _differing(
+        self, sent: _Sent, begin: int, kind: Indexes, row: Indexes, publications: Publications
+    ) -> NDArray[np.bool_]:
+        """Tell which messages from `begin` on are not those of their kind and row."""
+        wrong = np.zeros(len(kind), bool)
+        numbers = publication_numbers(publications)
+        stamps, values = zip(*(numbers[name] for name in PUBLICATION_TOPICS), strict=True)
+        packed = self.templates
+        for messages, first, last in sent.pieces(begin, begin + len(kind)):
+            here = slice(first - begin, last - begin)
+            differing(
+                messages.buffer, messages.start, messages.length, kind[here], row[here], packed.data, packed.fixed,
+                packed.ends, packed.places, packed.place_ends, stamps, values, wrong[here],
+            )  # fmt: skip
+        return wrong
 
     def _difference(self, record: OutputRecord, publication: Publication) -> tuple[str, str, str] | None:
         """Return what differs between a recorded message and that of a publication, computed as the node does."""
@@ -491,14 +495,11 @@ class _Replay:
 
     def output(self, record: OutputRecord) -> None:
         """Compare one recorded message with the one that the model gives at that place."""
-        name = self.topics.get(record.topic)
-        if self.sink is not None:
-            if name is None:  # another topic goes over as it is
-                place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
-                self.sink.write_output(*place, record.message())
+        if self.sink is not None:  # another topic goes over as it is
+            place = (record.topic, record.sequence, record.log_time_ns, record.publish_time_ns)
+            self.sink.write_output(*place, record.message())
             return
-        if name is None:
-            return
+        name = self.topics[record.topic]
         here = (self.next_sequence - 1) & _SEQUENCE_MASK
         if not self.synced or record.sequence != here or (name in _CUMULATIVE and not self.outputs_synced):
             self.report.not_compared[name] += 1
@@ -555,34 +556,28 @@ class _Replay:
 
 @dataclass(frozen=True)
 class _Sent:
-    """Messages that follow from the motion, of many chunks, in order: places are indexes into all of them."""
+    """Messages that were sent, of many chunks, in order of sequence: indexes go over all of them.
+
+    `kind` is the place of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics; part k begins at `begins[k]`.
+    """
 
     parts: list[Outputs]
+    begins: Indexes
     sequence: Indexes
-    part: Indexes
-    place: Indexes
-    topic: Indexes
-    names: tuple[str, ...]
+    kind: Indexes
 
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
-        """Take the messages on `topics` (base names by topic); others are passed over."""
-        names = tuple(topics.values())
-        columns: list[tuple[Indexes, Indexes, Indexes, Indexes]] = []
-        for number, part in enumerate(outputs):
-            lookup = np.full(int(part.messages.channel.max(initial=0)) + 1, -1)
-            for channel, (topic, _) in part.topics.items():
-                if topic in topics and channel < len(lookup):
-                    lookup[channel] = names.index(topics[topic])
-            topic_numbers = lookup[part.messages.channel]
-            chosen = np.flatnonzero(topic_numbers >= 0)
-            columns.append((part.sequence[chosen], np.full(len(chosen), number), chosen, topic_numbers[chosen]))
-        empty = np.zeros(0, np.int64)
-        joined = [np.concatenate(column) for column in zip(*columns, strict=True)] if columns else [empty] * 4
-        if joined[0].size and (joined[0][1:] < joined[0][:-1]).any():
-            order = np.argsort(joined[0], kind="stable")
-            joined = [column[order] for column in joined]
-        return cls(outputs, joined[0], joined[1], joined[2], joined[3], names)
+        """Take messages; `topics` has the base names of those that follow from the motion."""
+        sequence, kind = _joined(part.sequence for part in outputs), _joined(_kinds(part, topics) for part in outputs)
+        begins = np.cumsum([0, *map(len, outputs)])
+        if (sequence[1:] < sequence[:-1]).any():  # not as our recorder writes: each message is a part
+            order = np.argsort(sequence, kind="stable")
+            owner = np.searchsorted(begins, order, side="right") - 1
+            places = zip(owner.tolist(), (order - begins[owner]).tolist(), strict=True)
+            outputs = [outputs[part][place : place + 1] for part, place in places]
+            begins, sequence, kind = np.arange(len(order) + 1), sequence[order], kind[order]
+        return cls(outputs, begins, sequence, kind)
 
     def __len__(self) -> int:
         return len(self.sequence)
@@ -593,49 +588,47 @@ class _Sent:
 
     def record(self, index: int) -> OutputRecord:
         """Return one message."""
-        return self.parts[int(self.part[index])].record(int(self.place[index]))
+        part = int(np.searchsorted(self.begins, index, side="right")) - 1
+        return self.parts[part].record(index - int(self.begins[part]))
 
-    def by_topic(self, begin: int, end: int) -> Iterator[tuple[str, Indexes, Bytes, Indexes, Indexes]]:
-        """Yield base name, indexes, and buffer, starts and lengths, for each topic of each chunk."""
-        for number in range(int(self.part[begin]), int(self.part[end - 1]) + 1) if end > begin else ():
-            first, last = np.searchsorted(self.part[begin:end], (number, number + 1)) + begin
-            messages, topic = self.parts[number].messages, self.topic[first:last]
-            for kind, name in enumerate(self.names):
-                indexes = first + np.flatnonzero(topic == kind)
-                if indexes.size:
-                    places = self.place[indexes]
-                    yield name, indexes, messages.buffer, messages.start[places], messages.length[places]
+    def pieces(self, begin: int, end: int) -> Iterator[tuple[Messages, int, int]]:
+        """Yield the messages from `begin` to before `end`, chunk by chunk, with the indexes of each chunk's."""
+        first = int(np.searchsorted(self.begins, begin, side="right")) - 1
+        while begin < end:
+            origin, stop = int(self.begins[first]), min(end, int(self.begins[first + 1]))
+            yield self.parts[first].messages[begin - origin : stop - origin], begin, stop
+            begin, first = stop, first + 1
 
 
-def _other_topics(batch: Batch, topics: Mapping[str, str]) -> dict[str, str]:
-    """Return the topics of a batch that do not follow from the motion, under themselves."""
-    present = (topic for part in batch.outputs for topic, _ in part.topics.values())
-    return {topic: topic for topic in present if topic not in topics}
+def _joined(arrays: Iterable[Indexes]) -> Indexes:
+    return np.concatenate([np.zeros(0, np.int64), *arrays])
 
 
-def _warm_up(scene: Scene, tol: float, templates: Mapping[str, Template], *, rows: bool) -> None:
+def _kinds(part: Outputs, topics: Mapping[str, str]) -> Indexes:
+    lookup = np.full(int(part.messages.channel.max(initial=0)) + 1, -1)
+    for channel, (topic, _) in part.topics.items():
+        if topic in topics and channel < len(lookup):
+            lookup[channel] = PUBLICATION_TOPICS.index(topics[topic])
+    kinds: Indexes = lookup[part.messages.channel]
+    return kinds
+
+
+def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> None:
     """Compile what a replay needs, so that its time is that of the work."""
-    twin = Twin(scene, tol=tol, excitation="sampled")
+    session = Session(Twin(scene, tol=tol, excitation="sampled"))
     stamps = np.arange(1, 3, dtype=np.int64) * 1000
-    session = Session(twin)
     done = session.advance_marked(stamps, np.zeros((2, 3)), np.array([1]), rows=rows)
-    table, others = np.empty((6, 2), np.int64), np.empty(2, np.int64)
-    template = sample_template("")
-    scan(np.frombuffer(bytes(8), np.uint8), table, others)
-    places = np.zeros(1, np.int64)
-    buffer = np.frombuffer(bytes(8), np.uint8)
-    numbers, flags = np.zeros((1, 6)), np.zeros(1, bool)
-    read_numbers(
-        buffer, places, places, template.data, template.fixed, template.runs, places.copy(), numbers, flags
-    )  # fmt: skip
+    scan(np.zeros(8, np.uint8), np.empty((6, 2), np.int64), np.empty(2, np.int64))
+    none, buffer, flags = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, bool)
+    sample = sample_template("")
+    read_numbers(buffer, none, none, sample.data, sample.fixed, sample.places, none, np.zeros((0, 6)), flags)
     if done.rows is not None:
-        for name, (stamp, values) in publication_numbers(
-            session.outputs.take_rows(stamps, done.rows, np.arange(2))
-        ).items():
-            template = templates[name]
-            differs(
-                buffer, places, places, template.data, template.fixed, template.runs, places, stamp, values, flags
-            )  # fmt: skip
+        numbers = publication_numbers(session.outputs.take_rows(stamps, done.rows, np.arange(2)))
+        stamps_of, values = zip(*(numbers[name] for name in PUBLICATION_TOPICS), strict=True)
+        differing(
+            buffer, none, none, none, none, templates.data, templates.fixed, templates.ends, templates.places,
+            templates.place_ends, stamps_of, values, flags,
+        )  # fmt: skip
 
 
 def _hash(data: bytes) -> str:
@@ -644,7 +637,10 @@ def _hash(data: bytes) -> str:
 
 def _first_difference(record: OutputRecord, computed: Message) -> tuple[str, str, str]:
     """Return field, recorded and computed value of the first difference between two messages."""
-    recorded = decode(record.data, record.message_type)
+    try:
+        recorded = decode(record.data, record.message_type)
+    except RecordingError:
+        return "encoding", "bytes that hold no message", "a message"
     if type(recorded) is not type(computed):
         return "type", record.message_type, computed.TYPE
     for name in type(computed).__dataclass_fields__:

@@ -70,7 +70,7 @@ def _rows(part: Outputs, chosen: Indexes, template: Template) -> Rows:
     messages, count = part.messages[chosen], len(chosen)
     stamps, numbers, good = np.zeros(count, np.int64), np.zeros((count, template.count)), np.zeros(count, bool)
     read_numbers(
-        messages.buffer, messages.start, messages.length, template.data, template.fixed, template.runs, stamps,
+        messages.buffer, messages.start, messages.length, template.data, template.fixed, template.places, stamps,
         numbers, good,
     )  # fmt: skip
     for index in np.flatnonzero(~good).tolist():

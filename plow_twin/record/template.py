@@ -6,7 +6,7 @@ keeps them at fixed places, which are found by encoding the message once with nu
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import encode
 from plow_twin.record.messages import Message
+from plow_twin.record.words import set_word, word
 
 Bytes = NDArray[np.uint8]
 Indexes = NDArray[np.int64]
@@ -32,17 +33,15 @@ compiled: Final[Callable[[Callable[..., Any]], Callable[..., Any]]] = numba.njit
 
 @dataclass(frozen=True)
 class Template:
-    """The bytes of a message (`data`), where its numbers stand, and which bytes never change (`fixed`).
+    """The bytes of a message (`data`), where its numbers stand (`places`, shape (count,)), and a mask of the others.
 
-    `runs` are the numbers that stand side by side, shape (m, 3): place in the message, place in a row of numbers,
-    length, in bytes.
+    `fixed` has all bits set in the bytes that never change.
     """
 
     message_type: str
     data: Bytes
-    runs: Indexes
+    places: Indexes
     fixed: Bytes
-    count: int
 
     @classmethod
     def of(cls, build: Callable[[NDArray[np.float64]], Message], count: int) -> Self:
@@ -61,96 +60,125 @@ class Template:
             raise RecordingError(f"{message.TYPE}: number {places.index(-1)} is not in its message")
         array = np.frombuffer(data, np.uint8).copy()
         fixed = np.full(len(array), 0xFF, np.uint8)
-        fixed[_STAMP_AT : _STAMP_AT + 8] = 0
-        for place in places:
+        for place in (_STAMP_AT, *places):
             fixed[place : place + 8] = 0
             array[place : place + 8] = 0
-        runs: list[list[int]] = []
-        for index, place in enumerate(places):
-            if runs and place == runs[-1][0] + runs[-1][2]:
-                runs[-1][2] += 8
-            else:
-                runs.append([place, 8 * index, 8])
-        return cls(message.TYPE, array, np.array(runs, np.int64), fixed, count)
+        return cls(message.TYPE, array, np.array(places, np.int64), fixed)
 
     def __len__(self) -> int:
         return len(self.data)
 
+    @property
+    def count(self) -> int:
+        """How many numbers a message has."""
+        return len(self.places)
+
 
 @compiled
-def fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> bool:
+def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> bool:
     """Tell whether the bytes from `start` on are a message of a template, whatever its numbers."""
     if length != data.size or start < 0 or start + length > buffer.size:
         return False
-    message = buffer[start : start + length]  # its own array: the index needs no check and the loop is wide
-    wrong = np.uint8(0)
-    for i in range(data.size):
-        wrong = np.uint8(wrong | np.uint8(np.uint8(message[i] ^ data[i]) & fixed[i]))  # bytes stay bytes: wide lanes
+    last = length - 8  # the last word may overlap the one before
+    wrong = (word(buffer, start + last) ^ word(data, last)) & word(fixed, last)
+    for k in range(length >> 3):
+        wrong |= (word(buffer, start + 8 * k) ^ word(data, 8 * k)) & word(fixed, 8 * k)
     return bool(wrong == 0)
 
 
 @compiled
-def _copy(target: Bytes, place: int, source: Bytes, begin: int, count: int) -> None:
-    """Copy `count` bytes."""
-    to, taken = target[place : place + count], source[begin : begin + count]
-    for i in range(count):
-        to[i] = taken[i]
+def _stamp(stamp_ns: int) -> int:
+    """Return seconds and nanoseconds side by side, as they stand in a message."""
+    seconds = stamp_ns // _SECOND_NS
+    return (seconds & 0xFFFFFFFF) | ((stamp_ns - seconds * _SECOND_NS) << 32)
 
 
 @compiled
-def _unequal(left: Bytes, place: int, right: Bytes, begin: int, count: int) -> bool:
-    """Compare `count` bytes."""
-    one, other = left[place : place + count], right[begin : begin + count]
-    wrong = np.uint8(0)
-    for i in range(count):
-        wrong = np.uint8(wrong | np.uint8(one[i] ^ other[i]))
-    return bool(wrong != 0)
-
-
-@compiled
-def read_numbers(buffer, starts, lengths, data, fixed, runs, stamps, values, good):  # type: ignore[no-untyped-def]
+def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, good):  # type: ignore[no-untyped-def]
     """Read stamp and numbers of each message that fits the template; the others are not `good`."""
-    stamp = np.empty(2, np.int32)
-    stamp8, row8 = stamp.view(np.uint8), values.view(np.uint8)
     for n in range(starts.size):
         start = starts[n]
-        good[n] = fits(buffer, start, lengths[n], data, fixed)
+        good[n] = _fits(buffer, start, lengths[n], data, fixed)
         if not good[n]:
             continue
-        _copy(stamp8, 0, buffer, start + _STAMP_AT, 8)
-        stamps[n] = np.int64(stamp[0]) * _SECOND_NS + np.int64(np.uint32(stamp[1]))
-        for k in range(len(runs)):
-            _copy(row8[n], runs[k, 1], buffer, start + runs[k, 0], runs[k, 2])
+        stamp = word(buffer, start + _STAMP_AT)
+        stamps[n] = np.int64(np.int32(stamp)) * _SECOND_NS + (stamp >> 32 & 0xFFFFFFFF)
+        for k in range(places.size):
+            set_word(values, 8 * (n * places.size + k), word(buffer, start + places[k]))
+
+
+@dataclass(frozen=True)
+class Templates:
+    """Several templates one behind the other, to compare messages of any of them in one pass.
+
+    `ends` (k + 1,) and `place_ends` (k + 1,) say where the bytes and the places of each begin and end.
+    """
+
+    data: Bytes
+    fixed: Bytes
+    ends: Indexes
+    places: Indexes
+    place_ends: Indexes
+
+    @classmethod
+    def of(cls, templates: Iterable[Template]) -> Self:
+        """Put templates together; a message's kind is its template's place."""
+        parts = list(templates)
+        return cls(
+            np.concatenate([part.data for part in parts]),
+            np.concatenate([part.fixed for part in parts]),
+            np.cumsum([0, *map(len, parts)]),
+            np.concatenate([part.places for part in parts]),
+            np.cumsum([0, *(part.count for part in parts)]),
+        )
 
 
 @compiled
-def differs(buffer, starts, lengths, data, fixed, runs, index, stamps, values, different):  # type: ignore[no-untyped-def]
-    """Compare each message with the template filled with stamp and numbers of row `index[n]`, byte for byte."""
-    stamp = np.empty(2, np.int32)
-    stamp8, rows8 = stamp.view(np.uint8), values.view(np.uint8)
+def differing(  # type: ignore[no-untyped-def]
+    buffer, starts, lengths, kinds, rows, data, fixed, ends, places, place_ends, stamps, values, different
+):
+    """Compare each message with its template filled with stamp and numbers of its row, byte for byte.
+
+    Parameters
+    ----------
+    kinds : ndarray of int64, shape (n,)
+        Which template a message has; below 0: it is not compared.
+    rows : ndarray of int64, shape (n,)
+        Row of its stamp and numbers; below 0: there should be no message, it differs.
+    stamps, values : tuple of ndarray, shapes (m,) and (m, count)
+        Of each kind.
+    different : ndarray of bool, shape (n,)
+        Receives what was found.
+    """
     for n in range(starts.size):
-        start, row = starts[n], index[n]
-        if not fits(buffer, start, lengths[n], data, fixed):
-            different[n] = True
+        k, row, start = kinds[n], rows[n], starts[n]
+        if k < 0:
             continue
-        stamp[0], stamp[1] = stamps[row] // _SECOND_NS, stamps[row] % _SECOND_NS
-        wrong = _unequal(stamp8, 0, buffer, start + _STAMP_AT, 8)
-        row8 = rows8[row]
-        for k in range(len(runs)):
-            wrong |= _unequal(row8, runs[k, 1], buffer, start + runs[k, 0], runs[k, 2])
-        different[n] = wrong
+        first, size = ends[k], ends[k + 1] - ends[k]
+        different[n] = True
+        if row < 0 or lengths[n] != size or start < 0 or start + size > buffer.size:
+            continue
+        last = size - 8
+        wrong = (word(buffer, start + last) ^ word(data, first + last)) & word(fixed, first + last)
+        for i in range(size >> 3):
+            wrong |= (word(buffer, start + 8 * i) ^ word(data, first + 8 * i)) & word(fixed, first + 8 * i)
+        wrong |= word(buffer, start + _STAMP_AT) ^ _stamp(stamps[k][row])
+        first, numbers = place_ends[k], values[k]
+        count = place_ends[k + 1] - first
+        for i in range(count):
+            wrong |= word(buffer, start + places[first + i]) ^ word(numbers, 8 * (row * count + i))
+        different[n] = wrong != 0
 
 
 @compiled
-def fill(buffer, starts, data, runs, stamps, values):  # type: ignore[no-untyped-def]
+def fill(buffer, starts, data, places, stamps, values):  # type: ignore[no-untyped-def]
     """Write the template with stamp and numbers of row n from `starts[n]` on."""
-    stamp = np.empty(2, np.int32)
-    stamp8, rows8 = stamp.view(np.uint8), values.view(np.uint8)
+    last = data.size - 8
     for n in range(starts.size):
         start = starts[n]
-        _copy(buffer, start, data, 0, data.size)
-        stamp[0], stamp[1] = stamps[n] // _SECOND_NS, stamps[n] % _SECOND_NS
-        _copy(buffer, start + _STAMP_AT, stamp8, 0, 8)
-        row8 = rows8[n]
-        for k in range(len(runs)):
-            _copy(buffer, start + runs[k, 0], row8, runs[k, 1], runs[k, 2])
+        for k in range(data.size >> 3):
+            set_word(buffer, start + 8 * k, word(data, 8 * k))
+        set_word(buffer, start + last, word(data, last))
+        set_word(buffer, start + _STAMP_AT, _stamp(stamps[n]))
+        for k in range(places.size):
+            set_word(buffer, start + places[k], word(values, 8 * (n * places.size + k)))

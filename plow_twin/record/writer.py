@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
 from plow_twin.record.chunks import MESSAGE_HEAD
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
@@ -19,11 +20,11 @@ from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.mcap_file import ByteFile, ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import Message, WrenchStamped
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
-from plow_twin.record.outputs import SLOW_TOPICS, head_numbers, publication_numbers, publication_templates
+from plow_twin.record.outputs import SLOW_TOPICS, publication_numbers, publication_templates
 from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
 from plow_twin.stream.journal import Entry, Sample
-from plow_twin.stream.outputs import Publications
+from plow_twin.stream.outputs import Publication, Publications
 
 #: Folder in a run's folder with what was recorded beside it; further ones are `beside_2`, ...
 BESIDE: Final = "beside"
@@ -301,4 +302,6 @@ def warm_up_writer(header: RunHeader) -> None:
         builder = ChunkBuilder("zstd")
         builder.reserve(MESSAGE_HEAD + len(template))
         builder.add_many(1, template, one, one, one, one, np.zeros((1, template.count)))
-    head_numbers(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 7)))
+    pairs, motion = np.zeros(PAIR_COUNT), np.zeros(3)
+    still = Publication(0, pairs, pairs, pairs, np.zeros(PAIR_COUNT, np.int64), pairs, pairs, motion, motion, None)
+    publication_numbers(Publications.of([still]))

@@ -1,0 +1,46 @@
+"""Eight bytes at any place of an array as one number inside compiled code: messages begin anywhere.
+
+Numbers are little-endian, as in MCAP and in the CDR that is written here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, cast
+
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+_WORD = ir.IntType(64)
+
+
+def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    view = context.make_array(signature.args[0])(context, builder, arguments[0])
+    place = context.cast(builder, arguments[1], signature.args[1], types.intp)
+    first = builder.gep(builder.bitcast(view.data, ir.IntType(8).as_pointer()), [place])
+    return builder.bitcast(first, _WORD.as_pointer())
+
+
+def _word(typingctx: Any, data: Any, place: Any) -> Any:
+    """Return the eight bytes from byte `place` of a contiguous array on as an int64; nothing is checked."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(_place(context, builder, signature, arguments), align=1)
+
+    return types.int64(data, place), codegen
+
+
+def _set_word(typingctx: Any, data: Any, place: Any, value: Any) -> Any:
+    """Write an int64 to the eight bytes from byte `place` of a contiguous array on; nothing is checked."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = context.cast(builder, arguments[2], signature.args[2], types.int64)
+        builder.store(number, _place(context, builder, signature, arguments), align=1)
+        return context.get_dummy_value()
+
+    return types.void(data, place, value), codegen
+
+
+word = cast("Callable[[Any, Any], Any]", intrinsic(_word))
+set_word = cast("Callable[[Any, Any, Any], None]", intrinsic(_set_word))
