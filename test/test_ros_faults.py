@@ -7,6 +7,7 @@ import json
 import math
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -33,7 +34,7 @@ from sensor_msgs.msg import JointState
 
 from plow_twin.model.scene import Wear
 from plow_twin.record.replay import replay
-from plow_twin.ros.messages import set_stamp
+from plow_twin.ros.messages import set_stamp, stamp_ns
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -212,6 +213,102 @@ def test_a_clock_that_is_paused_looped_and_fast_moves_the_twin_with_its_samples(
         figures = _until_accounted(running, 3500)
         assert (figures["samples_used"], figures["holds"]) == ("3500", "0")
         assert probe.figures("state")["resets"] == "1"
+
+
+def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_path: Path) -> None:
+    with bench(tmp_path, use_sim_time="true", excitation_source="scene") as running:
+        probe = running.probe
+        clock = probe.node.create_publisher(Clock, "/clock", 100)
+        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
+        forces = probe.listen(JointState, "contact_forces")
+        message = Clock()
+
+        def show(time_ns: int) -> None:
+            message.clock.sec, message.clock.nanosec = divmod(time_ns, 10**9)
+            clock.publish(message)
+
+        def reach(time_ns: int) -> None:
+            probe.until(lambda: show(time_ns) or (forces and stamp_ns(forces[-1].header) == time_ns), "that time")
+
+        reach(T0)
+        reach(T0 + 20 * MS)
+        count = len(forces)
+        for _ in range(3):  # paused: three reports, and nothing moves
+            probe.figures("output")
+        assert len(forces) == count and probe.figures("state")["resets"] == "0"
+        for second in range(1, 8):  # as fast as the answers come, seven seconds of the head in as many messages
+            reach(T0 + second * 1000 * MS)
+        assert probe.figures("state")["resets"] == "0"
+        reach(T0)  # from the beginning again
+        reach(T0 + 20 * MS)
+        figures = probe.figures("state")
+        assert (figures["resets"], figures["solver_failures"]) == ("1", "0")
+
+
+@pytest.fixture
+def stepped_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Give the processes started from now on a clock of their own, and return what puts it off by so many seconds.
+
+    The system's clock only: the steady one goes on as it is, as with a step of NTP.
+    """
+    compiler, library, offset = shutil.which("cc"), tmp_path / "stepped_clock.so", tmp_path / "offset"
+    if compiler is None:
+        pytest.skip("there is no C compiler")
+    source = Path(__file__).parent / "data" / "stepped_clock.c"
+    subprocess.run([compiler, "-shared", "-fPIC", "-O2", "-o", library, source, "-ldl", "-lpthread"], check=True)
+    offset.write_bytes(bytes(8))
+    monkeypatch.setenv("LD_PRELOAD", str(library))
+    monkeypatch.setenv("STEPPED_CLOCK", str(offset))
+
+    def step(seconds: float) -> None:
+        with offset.open("r+b", buffering=0) as file:
+            file.write(round(seconds * 1e9).to_bytes(8, "little", signed=True))
+
+    return step
+
+
+def test_steps_of_the_node_s_own_clock_stop_reset_and_lose_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stepped_clock: Callable[[float], None]
+) -> None:
+    settings = {"record_path": tmp_path / "run", "excitation_timeout": 60.0, **RELIABLE_INPUT}
+    with bench(tmp_path, **settings) as running:
+        monkeypatch.delenv("LD_PRELOAD")  # of the node alone
+        probe = running.probe
+        send = probe.excitation()
+        sent = 0
+        for off_s in (0.0, -10.0, 25.0, 0.0):
+            stepped_clock(off_s)
+            for _ in range(500):
+                send(T0 + sent * MS, (30e3 * math.sin(2e-3 * sent), 0.0, 0.0))
+                sent += 1
+                probe.pace(sent)
+            figures = _until_accounted(running, sent)
+            age_s = float(figures["newest_sample_age_s"]) - (time.time_ns() - T0 - sent * MS) * 1e-9
+            # the report tells the node's own time, so the step has come there; a busy machine may read it late
+            assert abs(age_s - off_s) < 5.0
+            assert (figures["samples_used"], figures["holds"]) == (str(sent), "0")
+        found = probe.figures("state")
+        assert (found["resets"], found["solver_failures"]) == ("0", "0")
+        assert running.twin.stop() == 0
+    report = replay(tmp_path / "run")
+    assert (report.exit_code, report.samples) == (0, sent)
+
+
+def test_the_scene_s_loads_begin_anew_where_the_node_s_own_clock_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stepped_clock: Callable[[float], None]
+) -> None:
+    with bench(tmp_path, excitation_source="scene", record_path=tmp_path / "run") as running:
+        monkeypatch.delenv("LD_PRELOAD")
+        probe = running.probe
+        forces = probe.listen(JointState, "contact_forces")
+        for resets, off_s in enumerate((0.0, -10.0, 25.0)):
+            stepped_clock(off_s)
+            probe.until_figure("state", "resets", str(resets))
+            count = len(forces)
+            probe.until(lambda: len(forces) > count + 50, "the motion to go on")  # noqa: B023
+            assert abs(stamp_ns(forces[-1].header) - time.time_ns() - off_s * 1e9) < 5e9
+        assert running.twin.stop() == 0
+    assert replay(tmp_path / "run").exit_code == 0
 
 
 SUBSCRIBER = """
