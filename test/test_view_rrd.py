@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,13 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Wear
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import FileStatus
+from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Travel
+from plow_twin.stream.journal import Entry, Pose, Travel
 from plow_twin.view import ViewSummary, to_rrd
 from plow_twin.view.columns import extremes
+from plow_twin.view.contact_sets import masks_of, set_color
 from plow_twin.view.section import ARROW_MM_PER_N, Section
 
 COUNT = 1500
@@ -115,6 +118,53 @@ def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary
         np.testing.assert_allclose(top, cavity[0] * np.array([np.cos(theta), -np.sin(theta)]), atol=1e-3)
     arrows = [len(row or []) for row in tables["/section/force"]["Arrows2D:vectors"].to_pylist()]
     assert max(arrows) >= 2 and len(arrows) == len(head)
+
+
+def test_what_lies_along_the_face_what_was_measured_and_what_if(tmp_path: Path) -> None:
+    entries: list[Entry] = []
+    scene = load_scene(scene_path("paper"))
+    twin, offset = Twin(scene, excitation="sampled"), np.array([1e-3, -5e-4, 2e-3])
+    for index in range(COUNT):
+        sample = paper_sample(index)
+        if index in (0, 1000):
+            entries.append(Travel(sample.stamp_ns, 2.0 if index == 0 else -2.0))
+        entries.append(sample)
+        pose = twin.advance(index * 1e-3, sample.wrench).q + offset
+        if index % 10 == 0:
+            entries.append(Pose(sample.stamp_ns, tuple(pose.tolist())))
+    wear = Wear(1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0, prior_m2_n=(1e-15, 1e-13))
+    run = record_run(tmp_path / "run", entries, wear=wear)
+    wide = replace(scene, clearance=replace(scene.clearance, horizontal_m=0.05))
+    to_rrd(run.file, tmp_path / "run.rrd", others={"the same": scene, "wide": wide})
+    tables = read(tmp_path / "run.rrd")
+    # there and back: the second pass ends half way
+    first, second = tables["/face/force"]["LineStrips2D:strips"].to_pylist()[-1][1:]
+    assert first[0][0] < 10.0 and first[-1][0] > 290.0 and 140.0 < second[0][0] < 160.0
+    assert "2 m" in tables["/face/ticks"]["Points2D:labels"].to_pylist()[-1]
+    for name, value in (("x", 1.0), ("y", -0.5), ("theta", 2.0)):
+        residual = scalars(tables[f"/residual/{name}"])
+        assert len(residual) >= COUNT // 10 - 1
+        np.testing.assert_allclose(residual, value, atol=0.01)  # the measured pads do not wear
+    largest, same, other = (scalars(tables[f"/what_if/{number}"]) for number in range(3))
+    np.testing.assert_allclose(same, largest, rtol=0.01, atol=1.0)
+    assert len(same) == COUNT and np.abs(other - largest).max() > 10.0
+    # the bars at the corners of the frame, and their depths in words
+    depths = tables["/exaggerated/pads/wear"]["Points2D:labels"].to_pylist()[-1]
+    assert len(depths) == 8 and all(depth.endswith(" um") for depth in depths)
+    for group in ("clearance", "growth"):
+        band, low, high = (scalars(tables[f"/{group}/vertical{part}"]) for part in ("/band", "/p05", "/p95"))
+        assert band.min() >= low.min() and high[-2] <= band.max() <= high.max()
+
+
+def test_each_change_of_the_corners_that_carry_force_is_drawn(
+    run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]
+) -> None:
+    forces = [m for topic, m in run.outputs if topic == "/contact_forces" and isinstance(m, JointState)]
+    masks = masks_of(np.array([message.effort for message in forces]))
+    states = [row[0] for row in view[1]["/contact_set"]["StateChange:state"].to_pylist()]
+    assert len(states) == 1 + np.count_nonzero(np.diff(masks)) and states[0] == "free"
+    assert {state.split()[0] for state in states} == {"free", "ccw", "cw"}
+    assert set_color(0b1) != set_color(0b10) != set_color(0)
 
 
 def test_an_arrow_pushes_the_wall_off_its_corner() -> None:

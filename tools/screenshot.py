@@ -19,6 +19,8 @@ from pathlib import Path
 from PIL import Image
 from rerun.experimental import ViewerClient
 
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.view import to_rrd
 
 SIZE = (1400, 900)
@@ -53,13 +55,14 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("out", type=Path, nargs="?", default=Path("docs/images/view.png"))
     parser.add_argument("--at", type=float, default=3.65, help="seconds after the first stamp (default: %(default)s)")
+    parser.add_argument("--with", dest="others", action="append", default=[], help="a further scene (view --with)")
     options = parser.parse_args()
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     with tempfile.TemporaryDirectory() as folder:
         rrd, shot = Path(folder) / "run.rrd", Path(folder) / "shot.png"
-        to_rrd(options.run, rrd)
+        to_rrd(options.run, rrd, others={Path(file).stem: load_scene(scene_path(file)) for file in options.others})
         viewer = start_viewer(port)
         try:
             client = connect(port)

@@ -14,6 +14,7 @@ import click
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, progress, quiet_option
 
 if TYPE_CHECKING:
+    from plow_twin.model.scene import Scene
     from plow_twin.view.live import Sink
     from plow_twin.view.rrd import ViewSummary
 
@@ -24,6 +25,13 @@ if TYPE_CHECKING:
     "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; by default beside the .mcap."
 )
 @click.option("--exaggerate", type=POSITIVE, help="How many times as wide the clearance is drawn beside the true one.")
+@click.option(
+    "--with",
+    "others",
+    multiple=True,
+    metavar="SCENE",
+    help="A further scene, whose forces under the run's load are drawn too; may be repeated.",
+)
 @click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="A picture instead; needs no viewer.")
 @click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
 @click.option("--web-port", type=click.IntRange(0, 65535), default=9090, show_default=True, help="Its port.")
@@ -36,6 +44,7 @@ def view(
     recording: Path,
     out: Path | None,
     exaggerate: float | None,
+    others: tuple[str, ...],
     png: Path | None,
     web: bool,
     web_port: int,
@@ -48,8 +57,10 @@ def view(
 
     if not follow and not recording.exists():
         raise click.BadParameter(f"{recording}: does not exist", param_hint="RECORDING")
+    if png is not None and others:
+        raise click.UsageError("--with cannot be combined with --png: a picture shows the run alone")
     if follow:
-        return _follow(recording, out, exaggerate, web_port if web else None, wait, quiet)
+        return _follow(recording, out, exaggerate, _scenes(others), web_port if web else None, wait, quiet)
     if png is not None:
         from plow_twin.view.picture import to_png
 
@@ -63,13 +74,23 @@ def view(
 
     out = out or mcap_path(recording).with_suffix(".rrd")
     with progress(f"writing {out.name}", quiet) as on_progress:
-        summary = to_rrd(recording, out, exaggerate=exaggerate, on_progress=on_progress)
+        summary = to_rrd(recording, out, exaggerate=exaggerate, others=_scenes(others), on_progress=on_progress)
     code = _show(recording, out, summary, quiet)
     if web:
         return _serve(out, web_port, quiet)
     if not quiet:
         click.echo(f"look at it with: rerun {out}")
     return code
+
+
+def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
+    """Return scenes by a short name."""
+    from plow_twin.scene_file import load_scene
+    from plow_twin.scene_file.presets import scene_path
+
+    stems = [Path(file).stem for file in files]
+    names = [stem if stems.count(stem) == 1 else file for stem, file in zip(stems, files, strict=True)]
+    return {name: load_scene(scene_path(file)) for name, file in zip(names, files, strict=True)}
 
 
 def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:
@@ -103,7 +124,13 @@ def _serve(file: Path, port: int, quiet: bool) -> int:
 
 
 def _follow(
-    recording: Path, out: Path | None, exaggerate: float | None, web_port: int | None, wait: float, quiet: bool
+    recording: Path,
+    out: Path | None,
+    exaggerate: float | None,
+    others: dict[str, Scene],
+    web_port: int | None,
+    wait: float,
+    quiet: bool,
 ) -> int:
     """Show a run while it is recorded; a viewer that was started ends with the command."""
     from plow_twin.cli.interruption import interruptible
@@ -127,7 +154,7 @@ def _follow(
             if viewer is not None
             else (lambda stream, blueprint: stream.save(str(out), default_blueprint=blueprint))
         )
-        summary = follow(run, sink, stopped, exaggerate=exaggerate)
+        summary = follow(run, sink, stopped, exaggerate=exaggerate, others=others)
         code = _show(run, out or run, summary, quiet)
         sys.stdout.flush()
         while viewer is not None and viewer.process.poll() is None and not stopped():  # the run has ended: look on

@@ -6,7 +6,7 @@ In a replay time is that of the stamps: nothing is held for want of samples, a l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mapping import Role
+from plow_twin.record.reader import Entries
 from plow_twin.record.sources import Arrived
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Digest, Entry, Reset, Snapshot, Travel
+from plow_twin.stream.journal import Digest, Entry, Loss, Reset, SetWear, Snapshot, Travel
 from plow_twin.stream.outputs import Publications
 from plow_twin.stream.session import DIGEST_INTERVAL, Session
 
@@ -67,7 +69,7 @@ class Walker:
         self._log_time_ns = 0
         #: advances that the solver could not make
         self.failures = 0
-        #: called after each reset
+        #: called after each reset of the motion
         self.on_reset: Callable[[], object] = lambda: None
         self.speed_m_s = 0.0
         self._opening: Snapshot | None = session.snapshot()
@@ -91,7 +93,7 @@ class Walker:
         self._log_time_ns = log_time_ns or self._log_time_ns
         self._entry(entry)
         self.session.apply(entry)
-        if isinstance(entry, Reset):
+        if isinstance(entry, Reset | SetWear):
             self.on_reset()
 
     def samples(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_time_ns: NDArray[np.int64]) -> None:
@@ -149,6 +151,66 @@ class Walker:
         """End the journal."""
         if self.session.stamp_ns is not None:
             self._entry(Digest(self.session.stamp_ns, self.session.twin.digest()))
+
+
+class JournalWalk:
+    """The journal of a run through walkers of the run's scene and of others; nothing is held.
+
+    `used` and `late` count samples; a late one stands where its stamp puts it, if the walkers have not passed that.
+
+    Parameters
+    ----------
+    own
+        Walkers that take over states from the journal: after a loss, and wear that was set.
+    others
+        Walkers that go on from states of their own.
+    whole
+        Whether the journal begins with the run: else its first snapshot is taken over.
+    """
+
+    def __init__(self, own: Sequence[Walker], others: Sequence[Walker], *, whole: bool = True) -> None:
+        self._own, self._all = own, (*own, *others)
+        self._lost = not whole
+        self._reached_ns = -1
+        self.used = self.late = 0
+
+    def add(self, entries: Entries) -> None:
+        """Take in entries."""
+        begin = 0
+        for place in (*sorted(entries.others), len(entries)):
+            if place > begin:
+                self._samples(entries.stamp_ns[begin:place], entries.wrench[begin:place])
+            if place < len(entries):
+                self._entry(entries.others[place])
+            begin = place + 1
+
+    def _samples(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
+        order = np.argsort(stamps, kind="stable")
+        order = order[stamps[order] > self._reached_ns]
+        self.used, self.late = self.used + len(order), self.late + len(stamps) - len(order)
+        if len(order):
+            self._reached_ns = int(stamps[order[-1]])
+            for walker in self._all:
+                walker.samples(stamps[order], wrench[order], stamps[order])
+
+    def _entry(self, entry: Entry | Dropped) -> None:
+        match entry:
+            case Travel(_, speed):
+                for walker in self._all:
+                    walker.speed_m_s = speed
+                    walker.apply(Travel(max(0, self._reached_ns), speed))  # at once
+            case Reset() | Loss():
+                self._reached_ns = -1
+                for walker in self._all:
+                    walker.apply(Reset(0, "loss") if isinstance(entry, Loss) else entry)
+            case Snapshot() if self._lost:
+                for walker in self._own:
+                    walker.apply(entry)
+                    self._reached_ns = walker.session.stamp_ns or -1
+            case SetWear():
+                for walker in self._all:
+                    walker.apply(entry) if walker in self._own else walker.on_reset()
+        self._lost = isinstance(entry, Loss) or (self._lost and not isinstance(entry, Snapshot))
 
 
 @dataclass

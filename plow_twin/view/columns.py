@@ -53,6 +53,11 @@ class Curves:
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
         self._waiting = self.rows = self.sent = 0
 
+    @property
+    def thinned(self) -> bool:
+        """Whether rows are left out."""
+        return self._span_ns > 0
+
     def add(self, stamps: Indexes, steps: Indexes, values: Array) -> None:
         """Add rows, shapes (n,), (n,) and (n, number of entities)."""
         if len(stamps):

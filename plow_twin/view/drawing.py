@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -12,17 +13,22 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
+from plow_twin.record.alarms import ALARMS
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import Batch, Entries, FileStatus
 from plow_twin.record.rows import Rows, rows_by_topic
-from plow_twin.stream.journal import Hold, Unload
-from plow_twin.stream.outputs import CLEARANCE_NAMES
+from plow_twin.stream.journal import Hold, Pose, Reset, Travel, Unload
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 from plow_twin.view import layout
 from plow_twin.view.columns import Array, Batches, Curves, Indexes, TimeAxis, buffers
+from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
 from plow_twin.view.events import Events
+from plow_twin.view.face import FaceChart
+from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
+from plow_twin.view.what_if import WhatIf
 
 #: Stamps further than that from the recorder's clock [ns] are on another clock: no age is drawn.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
@@ -30,6 +36,14 @@ _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
 _TOUCHING: Final = (240, 140, 40)
 _PADS: Final = np.array([name.startswith("pad_") for name in CLEARANCE_NAMES])
+_BEST_PADS: Final = np.array([name in PAD_NAMES for name in CLEARANCE_NAMES])
+_BOUNDS: Final = [
+    CLEARANCE_NAMES.index(f"{way}/{point}") for way in ("horizontal", "vertical") for point in ("p05", "p95")
+]
+#: Rows of a band for each message of a clearance, where curves are not thinned.
+_BAND_ROWS: Final = 10
+#: The chart of forces along the face is drawn that often [ns].
+_FACE_NS: Final = 1_000_000_000
 
 
 class Drawing:
@@ -47,6 +61,8 @@ class Drawing:
         How many times as wide the clearance is drawn in the second cross-section.
     span_ns
         Span of stamps in which a curve keeps its least and largest value [ns]; 0: it keeps every row.
+    others
+        Further scenes, by name, whose forces under the run's load are drawn beside those of the run.
     """
 
     def __init__(
@@ -59,6 +75,7 @@ class Drawing:
         section_hz: float,
         exaggerate: float,
         span_ns: int,
+        others: Mapping[str, Scene] | None = None,
     ) -> None:
         self.stream, self.header, self.section = stream, header, Section.of(scene)
         self._exaggerate, self.section_hz = exaggerate, section_hz
@@ -72,12 +89,22 @@ class Drawing:
         self.total = Curves(stream, axis, layout.TOTAL, span_ns)
         self.growth = Curves(stream, axis, layout.GROWTH, span_ns)
         self.wear = Curves(stream, axis, layout.WEAR, span_ns)
-        self.head = Batches(stream, axis, "section/head", rr.LineStrips2D, ("strips",))
+        self.band = Curves(stream, axis, layout.BAND, span_ns)
+        self.residual = Curves(stream, axis, layout.RESIDUAL, span_ns)
+        self.what_if = WhatIf(stream, axis, header, others or {}, span_ns)
+        self.contact_sets = ContactSets(stream, axis, self.section.labels, span_ns)
+        self.face = FaceChart(stream, axis)
+        self._residuals = Residuals()
+        self._drawn_face_ns = -_FACE_NS
+        self._band_end: tuple[Indexes, Indexes, Array] | None = None
+        self.head = Batches(stream, axis, "section/head", rr.LineStrips2D, ("strips", "colors"))
         self.corners = Batches(stream, axis, "section/corners", rr.Points2D, ("positions", "radii"))
         self.arrows = Batches(stream, axis, "section/force", rr.Arrows2D, ("origins", "vectors", "colors", "labels"))
         self.names = Batches(stream, axis, "section/head/name", rr.Points2D, ("positions",))
         self.load_arrow = Batches(stream, axis, "section/load", rr.Arrows2D, ("origins", "vectors", "labels"))
         self.walls = Batches(stream, axis, "exaggerated/head", rr.LineStrips2D, ("strips", "colors"))
+        self.pads = Batches(stream, axis, "exaggerated/pads", rr.Boxes2D, ("centers", "half_sizes"))
+        self.pad_names = Batches(stream, axis, "exaggerated/pads/wear", rr.Points2D, ("positions", "labels"))
         self.events = Events(stream, axis)
         self.section_rows = 0
         #: number of the last advance, and its stamp [ns]
@@ -89,6 +116,7 @@ class Drawing:
         self._new_m = np.array(
             [getattr(scene.clearance, f"{name.partition('/')[0]}_m") for name in np.array(CLEARANCE_NAMES)[~_PADS]]
         )
+        self._bounds_new_m = np.repeat([scene.clearance.horizontal_m, scene.clearance.vertical_m], 2)
         self._templates = publication_templates(header.frame_id, header.child_frame_id)
         self._topics = {header.topic(name): name for name in self._templates}
         self._draw_still(scene, source)
@@ -105,11 +133,15 @@ class Drawing:
         self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
         self.stream.log("exaggerated/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
         self.stream.log("exaggerated/head", rr.LineStrips2D.from_fields(radii=[1.5]), static=True)
+        pads = rr.Boxes2D.from_fields(colors=list(PAIR_COLORS), radii=[1.0])
+        self.stream.log("exaggerated/pads", pads, static=True)
+        depths = rr.Points2D.from_fields(colors=list(PAIR_COLORS), radii=[0.1], show_labels=True)
+        self.stream.log("exaggerated/pads/wear", depths, static=True)
         places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.43 * self.section.frame[1]]]))
         names = (*self.section.labels, "frame (fixed)")
         labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
         self.stream.log("section/frame/names", labels, static=True)
-        self.stream.log("section/head", rr.LineStrips2D.from_fields(colors=[_WHITE], radii=[0.9]), static=True)
+        self.stream.log("section/head", rr.LineStrips2D.from_fields(radii=[0.9]), static=True)
         self.stream.log("section/corners", rr.Points2D.from_fields(colors=[_WHITE]), static=True)
         self.stream.log("section/force", rr.Arrows2D.from_fields(radii=[2.2], show_labels=True), static=True)
         name = rr.Points2D.from_fields(labels=["head (moves)"], radii=[0.1], colors=[_WHITE], show_labels=True)
@@ -142,12 +174,18 @@ class Drawing:
         steps_before = np.concatenate(([before[0]], steps))
         for name, rows in found.items():
             self._rows(name, rows, np.maximum(steps_before[places(rows)], 0))
+        if "contact_peaks" in found:
+            self._along_face(entries, found["contact_peaks"], places(found["contact_peaks"]))
+        self.what_if.add(entries, stamps, steps)
         contact, head = found.get("contact_forces"), found.get("head_state")
         if contact is not None and head is not None:
             samples = np.flatnonzero(entries.sample)
             loads = np.concatenate((before[1][None], entries.wrench[samples]))
             at = places(head)
             self._section(contact, head, steps_before[at], loads[np.searchsorted(samples, at)])
+        if head is not None:
+            poses = [(index, entry) for index, entry in sorted(entries.others.items()) if isinstance(entry, Pose)]
+            self.residual.add(*self._residuals.take(poses, steps, head))
         self._statuses(batch)
 
     def _entries(self, entries: Entries, stamps: Indexes, steps: Indexes, advance: NDArray[np.bool_]) -> None:
@@ -187,15 +225,63 @@ class Drawing:
             case "contact_forces":
                 self.penetration.add(stamps, steps, numbers[:, :PAIR_COUNT] * 1e3)
                 self.force_at_stamp.add(stamps, steps, numbers[:, 2 * PAIR_COUNT :] / 1e3)
+                self.contact_sets.add(stamps, steps, numbers[:, 2 * PAIR_COUNT :])
             case "contact_peaks":
                 peak = numbers[:, 2 * PAIR_COUNT :]
                 self.force.add(stamps, steps, peak / 1e3)
+                self.what_if.run(stamps, steps, peak)
                 self.events.peaks(stamps, steps, numbers[:, :PAIR_COUNT], peak)
             case "clearance":
                 total_m = numbers[:, ~_PADS]
                 self.total.add(stamps, steps, 1e3 * total_m)
                 self.growth.add(stamps, steps, 1e6 * (total_m - self._new_m))
                 self.wear.add(stamps, steps, 1e3 * numbers[:, _PADS])
+                self._bands(stamps, steps, numbers)
+                self._pads(stamps, steps, numbers)
+
+    def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
+        """Draw the areas between the bounds: curves that change between them, row by row."""
+        total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * (numbers[:, _BOUNDS] - self._bounds_new_m)), axis=1)
+        if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
+            ends = zip(self._band_end, (stamps, steps, total), strict=True)
+            stamps, steps, total = (np.concatenate(pair) for pair in ends)
+        self._band_end = stamps[-1:], steps[-1:], total[-1:]
+        if len(stamps) > 1 and not self.band.thinned:
+            rows = np.arange(0.0, len(stamps) - 1, 1.0 / _BAND_ROWS)
+            known = np.arange(len(stamps))
+            total = np.stack([np.interp(rows, known, column) for column in total.T], axis=1)
+            stamps = stamps[0] + np.interp(rows, known, stamps - stamps[0]).astype(np.int64)
+            steps = steps[rows.astype(np.int64)]
+        bound = np.arange(len(stamps)) % 2
+        sides = total.reshape(len(stamps), len(layout.BAND), 2)
+        self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
+
+    def _pads(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
+        """Draw the wear of the pads in the second cross-section."""
+        depth_mm = 1e3 * numbers[:, _BEST_PADS]
+        for row in np.flatnonzero(np.diff(stamps // round(1e9 / min(self.section_hz, 1.0)), prepend=-1)).tolist():
+            if depth_mm[row].any():
+                middles, halves, places = self.section.pads(depth_mm[row])
+                self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
+                labels = [f"{1e3 * depth:.3g} um" for depth in depth_mm[row]]
+                self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
+
+    def _along_face(self, entries: Entries, rows: Rows, places: Indexes) -> None:
+        """Assign the forces of some messages to places along the face, each under the speed at its time."""
+        largest, begin = rows.numbers[:, 2 * PAIR_COUNT :].max(axis=1), 0
+        for index, entry in sorted(entries.others.items()):
+            if isinstance(entry, Travel | Reset):
+                end = int(np.searchsorted(places, index, side="right"))
+                self.face.forces(rows.stamp_ns[begin:end], largest[begin:end])
+                begin = end
+                if isinstance(entry, Travel):
+                    self.face.travel(entry.speed_m_s)
+                else:
+                    self.face.restart()
+        self.face.forces(rows.stamp_ns[begin:], largest[begin:])
+        if self.face.known and self.stamp_ns - self._drawn_face_ns >= _FACE_NS:
+            self.face.draw(self.stamp_ns, max(self.step, 0))
+            self._drawn_face_ns = self.stamp_ns
 
     def _section(self, contact: Rows, head: Rows, steps: Indexes, loads: Array) -> None:
         """Draw the first moment in each span, where forces and pose of one publication are there."""
@@ -212,7 +298,8 @@ class Drawing:
         self.section_rows += 1
         force = contact[2 * PAIR_COUNT :]
         pose = (float(head[0]), float(head[1]), 2.0 * math.atan2(head[2], head[3]))
-        self.head.add(stamp_ns, step, strips=list(self.section.head_strips(pose)))
+        color = set_color(int(masks_of(force[None])[0]))
+        self.head.add(stamp_ns, step, strips=list(self.section.head_strips(pose)), colors=[color, color])
         self._load(stamp_ns, step, pose, load)
         self.corners.add(stamp_ns, step, positions=self.section.corners(), radii=self.section.corner_radii(force))
         origins, vectors, pairs = self.section.arrows(pose[2], force)
@@ -234,10 +321,10 @@ class Drawing:
             self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
 
     def _statuses(self, batch: Batch) -> None:
-        """Draw changes of the status; those from before the first sample at its stamp, so that playing starts there."""
-        topic = self.header.topic("status")
+        """Write changes of status and alarms; those from before the first sample at its stamp: playing starts there."""
+        topics = (self.header.topic("status"), self.header.topic(ALARMS))
         for part in batch.outputs:
-            for channel in [number for number, (name, _) in part.topics.items() if name == topic]:
+            for channel in [number for number, (name, _) in part.topics.items() if name in topics]:
                 for index in np.flatnonzero(part.messages.channel == channel).tolist():
                     record = part.record(index)
                     message = record.message()
@@ -257,11 +344,13 @@ class Drawing:
         """Send what is still collected."""
         for buffer in buffers(self):
             buffer.flush()
-        self.events.flush()
+        for part in (self.events, self.contact_sets, self.face, self.what_if):
+            part.flush()
 
     def finish(self, status: FileStatus) -> None:
         """Draw how the recording ended, and send what is still collected."""
         self._write_statuses()
+        self.face.draw(self.stamp_ns, max(self.step, 0))
         if status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
             self.events.add(self.stamp_ns, max(self.step, 0), f"recording {status.value}", "ERROR")
         self.flush()

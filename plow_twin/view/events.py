@@ -7,6 +7,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.alarms import ALARMS
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.stream.journal import Entry, Hold, Loss, Mark, Parameter, Reset, SetWear, Travel, Unload, Unused
@@ -22,7 +23,7 @@ class Events:
         self.count = 0
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._touches: NDArray[np.float64] | None = None
-        self._status: tuple[int, str] | None = None
+        self._status: dict[str, tuple[int, str]] = {}
         #: whether the load is held for want of samples
         self.silent = False
         self._speed_m_s: float | None = None
@@ -79,11 +80,12 @@ class Events:
             self.add(int(stamps[row]), int(steps[row]), text)
 
     def status(self, stamp_ns: int, step: int, message: DiagnosticStatus) -> None:
-        """Write a status when it differs from the one before."""
+        """Write a status, or what alarms there are, when it differs from the one before of that name."""
         now = (message.level, message.message)
-        if now != self._status:
-            self.add(stamp_ns, step, f"status: {message.message}", _LEVELS[min(message.level, 3)])
-        self._status = now
+        if now != self._status.get(message.name):
+            what = "alarms" if message.name.endswith(f": {ALARMS}") else "status"
+            self.add(stamp_ns, step, f"{what}: {message.message}", _LEVELS[min(message.level, 3)])
+        self._status[message.name] = now
 
     def flush(self) -> None:
         """Send what has been collected."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +16,9 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.view.columns import ROS_TIME, RUN_TIME, STEP
-from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
+from plow_twin.view.contact_sets import ENTITY
+from plow_twin.view.face import HEIGHT, WIDTH
+from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAD_MM_PER_MM, PAIR_COLORS, Section
 
 FORCE: Final = tuple(f"force/{name}" for name in PAIR_NAMES)
 FORCE_AT_STAMP: Final = tuple(f"force_at_stamp/{name}" for name in PAIR_NAMES)
@@ -25,15 +28,30 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
+#: The area between the bounds of a clearance: a curve that changes between them.
+BAND: Final = tuple(f"{group}/{way}/band" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
+RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
 _LOAD_COLORS: Final = (LOAD_COLOR, (86, 180, 233), (200, 200, 200))
+_RESIDUAL_NAMES: Final = ("x [mm]", "y [mm]", "theta [mrad]")
+_WHAT_IF_COLORS: Final = (
+    (235, 235, 235),
+    (86, 180, 233),
+    (240, 160, 60),
+    (0, 158, 115),
+    (204, 121, 167),
+    (240, 228, 66),
+)
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
 
 
-def blueprint(section: Section, exaggerate: float) -> rrb.Blueprint:
-    """Return the arrangement: the cross-sections beside the curves, the events and data quality below."""
+def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb.Blueprint:
+    """Return the arrangement: the cross-sections beside the curves, the events and data quality below.
+
+    With `what_if` the predictions of other scenes are in front.
+    """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
         origin="section",
@@ -49,23 +67,33 @@ def blueprint(section: Section, exaggerate: float) -> rrb.Blueprint:
     )
     times = [TimelineColumn(visible=name == RUN_TIME, timeline=name) for name in (RUN_TIME, ROS_TIME, STEP)]
     columns = rrb.TextLogColumns(timeline_columns=times, text_log_columns=["LogLevel", "Body"])
+    face = rrb.Spatial2DView(
+        origin="face",
+        name="Force along the face",
+        visual_bounds=rrb.VisualBounds2D(x_range=(-30.0, WIDTH + 15.0), y_range=(-HEIGHT - 12.0, 15.0)),
+        background=(24, 26, 30),
+    )
     below = rrb.Tabs(
         rrb.TextLogView(origin="events", name="Events", columns=columns),
+        face,
         rrb.TextDocumentView(origin="about", name="About this run"),
         rrb.TimeSeriesView(origin="quality", name="Data quality [ms]"),
         active_tab=0,
     )
     curves = rrb.Vertical(
         _plot("force", "Contact force, largest between two messages [kN]"),
+        rrb.StateTimelineView(origin=ENTITY, name="Corners that carry force"),
         _plot("load", "Load on the head"),
         rrb.Tabs(
-            _plot("growth", "Clearance: growth by wear, 5..95 % [um]", rrb.Corner2D.LeftTop),
-            _plot("clearance", "Clearance with 5..95 % interval [mm]"),
-            _plot("penetration", "Penetration, negative is a gap [mm]"),
-            _plot("wear", "Wear depth of the pads with 5..95 % interval [mm]"),
+            *([_plot("what_if", "What if: largest force [kN]")] if what_if else []),
+            _plot("growth", "Growth by wear [um]", rrb.Corner2D.LeftTop),
+            _plot("clearance", "Clearance [mm]"),
+            _plot("residual", "Residual"),
+            _plot("penetration", "Penetration [mm]"),
+            _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop),
             active_tab=0,
         ),
-        row_shares=[5, 2, 4],
+        row_shares=[5, 1.4, 2.4, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -90,12 +118,26 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in (*AGE, *INTERVAL):
         _style(stream, entity, entity.rpartition("/")[2], (200, 200, 200), AggregationPolicy.MinMax)
+    for entity, name, color in zip(RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
+        _style(stream, entity, name, color, AggregationPolicy.MinMax)
+    for entity in BAND:
+        way = entity.split("/")[1]
+        _style(stream, entity, f"{way} 5..95 %", (*_CLEARANCE_COLORS[way], 60), AggregationPolicy.MinMax)
     for entity in (*TOTAL, *GROWTH, *WEAR):  # the bounds of an interval thinner than the value that they belong to
         base, _, bound = entity.partition("/")[2].partition("/")
         pair = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(pair)]
         shade = tuple(round(0.6 * part) for part in color) if bound else color
         _style(stream, entity, f"{base} {bound}".strip(), shade, AggregationPolicy.MinMax, 1.0 if bound else 2.5)
+
+
+def what_if_curves(stream: rr.RecordingStream, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the entities of the run's curve and of those of other scenes, which are named and coloured."""
+    entities = tuple(f"what_if/{number}" for number in range(len(names) + 1))
+    for number, (entity, name) in enumerate(zip(entities, ("the run", *names), strict=True)):
+        color = _WHAT_IF_COLORS[number % len(_WHAT_IF_COLORS)]
+        _style(stream, entity, name, color, AggregationPolicy.MinMax, 2.0 if number == 0 else 1.2)
+    return entities
 
 
 def _style(
@@ -130,9 +172,12 @@ Where a corner of the frame meets a wall of the cavity, an arrow shows the force
 - grey: frame, with its corners; white: the cavity and, schematically, the body of the head; violet: the load on it
 - force curves: the largest force between two messages, no peak is left out (`force_at_stamp`: the force at the stamp)
 - the cross-section is thinned in time; curves keep every row
-- growth of the clearance: over the clearance without wear, in micrometres; the thin lines bound its 5..95 % interval
+- growth of the clearance: over the clearance without wear, in micrometres, with the band of its 5..95 % interval
+- head's outline and corners that carry force: blue stops a counter-clockwise swing, orange a clockwise one, violet both
+- force along the face: the largest in each piece, the newest pass bright; residual: measured pose less the model's
 - timelines: `{ROS_TIME}` is the stamp, `{RUN_TIME}` the time since the first one, `{STEP}` counts the advances
-- beside it the same with the clearance drawn several times as wide, worn pads included; walls that touch are orange
+- beside it the same with the clearance drawn several times as wide; walls that touch are orange; bars inside the frame
+  are the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each um
 
 | | |
 |---|---|

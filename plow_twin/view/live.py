@@ -6,13 +6,14 @@ is thinned to a fixed rate, the least and the largest value of each span being k
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 import rerun as rr
 import rerun.blueprint as rrb
 
+from plow_twin.model.scene import Scene
 from plow_twin.record.follow import Tail
 from plow_twin.record.reader import RunReader
 from plow_twin.view import layout
@@ -31,9 +32,14 @@ Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
 
 
 def follow(
-    path: Path, sink: Sink, stop: Callable[[], bool] = lambda: False, *, exaggerate: float | None = None
+    path: Path,
+    sink: Sink,
+    stop: Callable[[], bool] = lambda: False,
+    *,
+    exaggerate: float | None = None,
+    others: Mapping[str, Scene] | None = None,
 ) -> ViewSummary:
-    """Show a recording until its recorder closes it or ends, or `stop` is true.
+    """Show a recording until its recorder closes it or ends, or `stop` is true; `exaggerate`, `others` as in `to_rrd`.
 
     Raises
     ------
@@ -44,7 +50,7 @@ def follow(
     scene = reader.header.scene(reader.path)
     wide = exaggerate or Section.of(scene).exaggeration()
     stream = rr.RecordingStream("plow_twin")
-    sink(stream, layout.blueprint(Section.of(scene), wide))
+    sink(stream, layout.blueprint(Section.of(scene), wide, bool(others)))
     drawing = Drawing(
         stream,
         reader.header,
@@ -53,6 +59,7 @@ def follow(
         section_hz=_SECTION_HZ_BEFORE,
         exaggerate=wide,
         span_ns=round(1e9 / CURVE_HZ),
+        others=others,
     )
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:

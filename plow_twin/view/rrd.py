@@ -10,6 +10,7 @@ from typing import Final
 import rerun as rr
 
 from plow_twin.errors import RecordingError
+from plow_twin.model.scene import Scene
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.view import layout
 from plow_twin.view.drawing import Drawing
@@ -63,6 +64,7 @@ def to_rrd(
     section_hz: float = SECTION_HZ,
     exaggerate: float | None = None,
     most_rows: int = MOST_ROWS,
+    others: Mapping[str, Scene] | None = None,
     on_progress: Callable[[float], object] | None = None,
 ) -> ViewSummary:
     """Write the .rrd of a recording, complete or cut off, with at most some chunks of it in memory.
@@ -80,6 +82,8 @@ def to_rrd(
     most_rows
         Rows of a curve, and a twentieth of them of the cross-section, beyond which a long run is thinned: a curve keeps
         the least and the largest value of each span, so that no peak is lost.
+    others
+        Further scenes, by name: their forces under the load of the run are drawn beside those of the run.
     on_progress
         Receives the share done, 0..1.
 
@@ -94,7 +98,7 @@ def to_rrd(
     stream = rr.RecordingStream("plow_twin")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        stream.save(out, default_blueprint=layout.blueprint(Section.of(scene), wide))
+        stream.save(out, default_blueprint=layout.blueprint(Section.of(scene), wide, bool(others)))
     except Exception as error:  # the SDK raises RuntimeError and OSError alike
         raise RecordingError(f"{out}: cannot be written: {error}") from error
     duration_s = reader.duration_s()
@@ -106,6 +110,7 @@ def to_rrd(
         section_hz=min(section_hz, max(1.0, 0.05 * most_rows / max(duration_s, 1e-9))),
         exaggerate=wide,
         span_ns=_span_ns(reader, duration_s, most_rows),
+        others=others,
     )
     for batch in reader.batches():
         drawing.add(batch)

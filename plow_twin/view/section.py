@@ -23,6 +23,12 @@ FAINT_N: Final = 500.0
 #: The head's body is drawn that much larger than its cavity [mm]; its true outline is not part of a scene.
 BODY_MARGIN_MM: Final = 60.0
 
+#: Depth of a pad as it is drawn [mm] per wear depth [mm], and the pad's length [mm].
+PAD_MM_PER_MM: Final = 200.0
+_PAD_MM: Final = 60.0
+#: A label stands so far below its place [mm].
+_LABEL_MM: Final = 16.0
+
 #: One hue per corner; the pair with the vertical wall in the lighter shade (Okabe and Ito's palette).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
 _LIGHTER: Final = ((86, 180, 233), (240, 228, 66), (255, 158, 105), (110, 220, 185))
@@ -90,6 +96,20 @@ class Section:
         places = (corners - outwards * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
         return places[walls], (penetration[walls] > 0.0).any(axis=1)
+
+    def pads(self, wear_depth_mm: Array) -> tuple[Array, Array, Array]:
+        """Return middles, half sizes and places of labels of bars inside the frame that show the wear of its pads.
+
+        A bar lies along the wall that its pair touches, from the corner on. Each has shape (8, 2).
+        """
+        corners = 0.5 * self.frame * np.stack((CORNER_X, CORNER_Y), axis=1)
+        outwards = np.abs(np.stack((NORMAL_X, NORMAL_Y), axis=1)) * np.sign(corners)
+        along = (np.abs(outwards) < 0.5) * np.sign(corners)
+        depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
+        middles = (corners - 0.5 * depth * outwards - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
+        labels = (corners - 22.0 * outwards * (1.0 + np.abs(outwards[:, :1])) - 75.0 * along) * _FLIP
+        labels[:, 1] -= _LABEL_MM
+        return middles, 0.5 * (depth * np.abs(outwards) + _PAD_MM * np.abs(along)), labels
 
     def head_points(self, pose: Iterable[float]) -> Array:
         """Centre of the cavity and the place of the head's name, shape (2, 2)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +17,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.follow import Tail
-from plow_twin.record.importing import Feed, Walked, Walker
+from plow_twin.record.importing import Feed, JournalWalk, Walked, Walker
 from plow_twin.record.mapping import Role, read_map, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import Source, open_source
@@ -25,7 +25,6 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Loss, Reset, SetWear, Snapshot, Travel
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis.loads import LoadTotals
 from plow_twin.study.analysis.signals import Comparison, compare
@@ -250,46 +249,25 @@ def _walk_own(
         Walker(_session(prediction.scene, header.tol, header.origin_ns), prediction.walked)
         for prediction in predictions
     ]
-    used, late, reached_ns = 0, 0, -1
+    for walker, prediction in zip(walkers, predictions, strict=True):
+        walker.on_reset = prediction.restart
+    walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part)
 
     def so_far() -> Analysis:
         losses = {topic: count for topic, count in reader.lost.items() if count}
-        if late:
-            losses["samples_too_late"] = late
+        if walk.late:
+            losses["samples_too_late"] = walk.late
         if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
             losses[reader.status.value] = 1
         measured, unknown = _measured_beside(path, mapping, header.node)
-        return Analysis(reader.path, "run", predictions, measured, {"samples_used": used}, losses, unknown)
+        return Analysis(reader.path, "run", predictions, measured, {"samples_used": walk.used}, losses, unknown)
 
-    for stamps, wrench, other in _journal(reader):
-        if other is None and not len(stamps):
+    for batch in reader.batches(outputs=False):
+        walk.add(batch.entries)
+        if not len(batch.entries) and reader.tail is not None:
             on_caught_up(so_far())
         if on_progress is not None:
             on_progress(reader.position)
-        if len(stamps):
-            order = np.argsort(stamps, kind="stable")  # a late sample stands where its stamp puts it
-            order = order[stamps[order] > reached_ns]
-            used, late = used + len(order), late + len(stamps) - len(order)
-            if len(order):
-                reached_ns = int(stamps[order[-1]])
-                for walker in walkers:
-                    walker.samples(stamps[order], wrench[order], stamps[order])
-        if isinstance(other, Travel):
-            for walker in walkers:
-                walker.speed_m_s = other.speed_m_s
-                walker.apply(Travel(max(0, reached_ns), other.speed_m_s))  # at once
-        elif isinstance(other, Reset | Loss):
-            reached_ns = -1
-            for walker, prediction in zip(walkers, predictions, strict=True):
-                walker.apply(Reset(0, "loss") if isinstance(other, Loss) else other)
-                prediction.restart()
-        elif isinstance(other, Snapshot):
-            walkers[0].apply(other)  # the state after a loss; other scenes go on from their own
-            reached_ns = walkers[0].session.stamp_ns or -1
-        elif isinstance(other, SetWear):
-            walkers[0].apply(other)
-            for prediction in predictions:
-                prediction.restart()
     return so_far()
 
 
@@ -302,26 +280,6 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
         _collect(source, {name: roles[name] for name in roles.keys() - {"excitation", "travel"}}, measured)
         unknown |= source.losses.unknown_types
     return measured, unknown
-
-
-def _journal(reader: RunReader) -> Iterator[tuple[NDArray[np.int64], Array, Any]]:
-    """Yield runs of samples, and the entry that ends each; nothing is held, as in every replay of another recording."""
-    empty = (np.zeros(0, np.int64), np.zeros((0, 3)))
-    lost = bool(reader.header.part)  # what was before the first part that is there
-    for batch in reader.batches(outputs=False):
-        entries, begin = batch.entries, 0
-        if not len(entries) and reader.tail is not None:
-            yield (*empty, None)
-        for place in (*sorted(entries.others), len(entries)):
-            chosen = slice(begin, place)
-            if place > begin:
-                yield entries.stamp_ns[chosen], entries.wrench[chosen], None
-            if place < len(entries):
-                entry = entries.others[place]
-                if isinstance(entry, Travel | Reset | SetWear | Loss) or (isinstance(entry, Snapshot) and lost):
-                    yield (*empty, entry)
-                lost = isinstance(entry, Loss)
-            begin = place + 1
 
 
 def _collect(source: Source, roles: Mapping[str, Role], measured: Measured) -> None:

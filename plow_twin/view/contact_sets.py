@@ -1,0 +1,79 @@
+"""Which corners carry force together, and how that is coloured: by the sense of the swing that they stop."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Final
+
+import numpy as np
+import rerun as rr
+
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKWISE
+from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
+
+ENTITY: Final = "contact_set"
+FREE: Final = "free"
+Color = tuple[int, int, int]
+#: No contact, a counter-clockwise swing stopped, a clockwise one, both senses at once.
+_COLORS: Final[tuple[Color, ...]] = ((235, 235, 235), (86, 180, 233), (240, 160, 60), (204, 121, 167))
+_CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PAIR_COUNT)).sum())
+
+
+def set_color(mask: int) -> Color:
+    """Return the colour of a set of pairs, a bit each."""
+    return _COLORS[(1 if mask & _CCW_BITS else 0) + (2 if mask & ~_CCW_BITS else 0)]
+
+
+def masks_of(force: Array) -> Indexes:
+    """Return a bit for each pair that carries force, (n,) from (n, 8)."""
+    masks: Indexes = ((force > 0.0) << np.arange(PAIR_COUNT)).sum(axis=1)
+    return masks
+
+
+class ContactSets:
+    """Write each change of the set, at most one in each span of stamps [ns] of a thinned run."""
+
+    def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
+        self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
+        self._states = Batches(stream, axis, ENTITY, rr.StateChange, ("state",))
+        self._span_ns = span_ns
+        self._before: str | None = None
+        self._at: int | None = None
+        names: dict[str, Color] = {}
+        for ccw, cw in product(range(16), range(16)):
+            mask = self._pairs(ccw, True) | self._pairs(cw, False)
+            names[self.name(mask)] = set_color(mask)
+        style = rr.StateConfiguration(values=list(names), labels=list(names), colors=list(names.values()))
+        stream.log(ENTITY, style, static=True)
+
+    @staticmethod
+    def _pairs(corners: int, ccw: bool) -> int:
+        """Return the pairs of these corners that stop a swing of one sense."""
+        return sum(
+            1 << pair
+            for pair in range(PAIR_COUNT)
+            if bool(STOPS_COUNTER_CLOCKWISE[pair]) == ccw and corners >> pair // 2 & 1
+        )
+
+    def name(self, mask: int) -> str:
+        """Return the name of a set of pairs: its corners by sense."""
+        parts = []
+        for word, bits in (("ccw", mask & _CCW_BITS), ("cw", mask & ~_CCW_BITS)):
+            corners = sorted(self._names[corner] for corner in range(4) if bits >> 2 * corner & 3)
+            parts += [f"{word} {'+'.join(corners)}"] if corners else []
+        return ", ".join(parts) or FREE
+
+    def add(self, stamps: Indexes, steps: Indexes, force: Array) -> None:
+        """Take in forces, shape (n, 8)."""
+        masks = masks_of(force)
+        changed = np.flatnonzero(np.diff(masks, prepend=-1))
+        for row in changed.tolist():
+            name = self.name(int(masks[row]))
+            span = int(stamps[row]) // self._span_ns if self._span_ns else None
+            if name != self._before and (span is None or span != self._at):
+                self._states.add(int(stamps[row]), int(steps[row]), state=[name])
+                self._before, self._at = name, span
+
+    def flush(self) -> None:
+        """Send what has been collected."""
+        self._states.flush()

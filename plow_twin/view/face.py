@@ -1,0 +1,118 @@
+"""Largest contact force over the place along the face, pass by pass: a chart drawn anew while the run goes on."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
+
+#: Size of the chart in the units of its view.
+WIDTH: Final = 300.0
+HEIGHT: Final = 90.0
+#: Length of a piece of the face to begin with [m]; it doubles when there are more than `_MOST_PIECES`.
+_PIECE_M: Final = 0.1
+_MOST_PIECES: Final = 600
+#: Passes that are drawn; the newest is bright.
+_MOST_PASSES: Final = 8
+_AXIS: Final = (110, 115, 125)
+_NEWEST: Final = (240, 160, 60)
+_EARLIER: Final = (90, 110, 130)
+
+
+class FaceChart:
+    """Collect forces by place, and draw them.
+
+    `known` says whether the run has a speed along the face at all.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
+        self._lines = Batches(stream, axis, "face/force", rr.LineStrips2D, ("strips", "colors"))
+        self._ticks = Batches(stream, axis, "face/ticks", rr.Points2D, ("positions", "labels"))
+        style: Any = rr.LineStrips2D.from_fields(radii=[0.5])
+        stream.log("face/force", style, static=True)
+        style = rr.Points2D.from_fields(colors=[_AXIS], radii=[0.1], show_labels=True)
+        stream.log("face/ticks", style, static=True)
+        self._passes: list[dict[int, float]] = [{}]
+        self._piece_m = _PIECE_M
+        self._speed = self._place_m = 0.0
+        self._direction = 0.0
+        self._reached_ns: int | None = None
+        self.known = False
+
+    def travel(self, speed_m_s: float) -> None:
+        """Go on with another speed; a change of direction begins a pass."""
+        direction = math.copysign(1.0, speed_m_s) if speed_m_s else 0.0
+        if direction and self._direction and direction != self._direction:
+            self._passes.append({})
+            del self._passes[:-_MOST_PASSES]
+        self._speed, self._direction = speed_m_s, direction or self._direction
+        self.known = self.known or bool(speed_m_s)
+
+    def forces(self, stamps: Indexes, force: Array) -> None:
+        """Take in forces [N], shape (n,), under the present speed."""
+        if not len(stamps):
+            return
+        last = int(stamps[0]) if self._reached_ns is None else self._reached_ns
+        steps = np.maximum(np.diff(stamps, prepend=last), 0) * 1e-9
+        place = self._place_m + self._speed * np.cumsum(steps)
+        self._place_m, self._reached_ns = float(place[-1]), int(stamps[-1])
+        if not self._speed:
+            return
+        here = self._passes[-1]
+        pieces: NDArray[np.int64] = np.floor(place / self._piece_m).astype(np.int64)
+        for piece in np.unique(pieces).tolist():
+            here[piece] = max(here.get(piece, 0.0), float(force[pieces == piece].max()))
+        while len(here) > _MOST_PIECES:
+            self._piece_m *= 2.0
+            self._passes = [_halved(one) for one in self._passes]
+            here = self._passes[-1]
+
+    def restart(self) -> None:
+        """Go on after a reset: the stamps may go back."""
+        self._reached_ns = None
+
+    def draw(self, stamp_ns: int, step: int) -> None:
+        """Draw what there is."""
+        filled = [one for one in self._passes if one]
+        if not filled:
+            return
+        places = [piece * self._piece_m for one in filled for piece in (min(one), max(one) + 1)]
+        first, last = min(places), max(places)
+        top = _round_up(max(1.0, max(max(one.values()) for one in filled) / 1e3))
+        across, up = WIDTH / max(last - first, self._piece_m), HEIGHT / top
+        strips = [np.array([[0.0, -HEIGHT], [0.0, 0.0], [WIDTH, 0.0]])]
+        colors = [_AXIS]
+        for number, one in enumerate(filled):
+            pieces = np.array(sorted(one))
+            force = np.array([one[piece] for piece in pieces.tolist()]) / 1e3
+            middle = (pieces + 0.5) * self._piece_m
+            strips.append(np.column_stack((across * (middle - first), -up * force)))
+            colors.append(_NEWEST if number == len(filled) - 1 else _EARLIER)
+        ticks = [(across * (x - first), 6.0, f"{x:g} m") for x in (first, 0.5 * (first + last), last)]
+        ticks += [(-12.0, -up * force, f"{force:g} kN") for force in (0.5 * top, top)]
+        self._lines.add(stamp_ns, step, strips=strips, colors=colors)
+        self._ticks.add(stamp_ns, step, positions=[(x, y) for x, y, _ in ticks], labels=[text for *_, text in ticks])
+
+    def flush(self) -> None:
+        """Send what has been collected."""
+        self._lines.flush()
+        self._ticks.flush()
+
+
+def _halved(one: dict[int, float]) -> dict[int, float]:
+    """Return the forces by pieces twice as long."""
+    found: dict[int, float] = {}
+    for piece, force in one.items():
+        found[piece // 2] = max(found.get(piece // 2, 0.0), force)
+    return found
+
+
+def _round_up(value: float) -> float:
+    """Return the next of 1, 2, 5, 10, ... times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(value))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value)

@@ -1,0 +1,49 @@
+"""Measured poses of the journal less those of the model at the same stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from plow_twin.record.rows import Rows
+from plow_twin.stream.journal import Pose
+from plow_twin.view.columns import Array, Indexes
+
+#: Millimetres and milliradians.
+_SCALE = 1e3
+
+
+class Residuals:
+    """Poses wait until the model has passed their stamps; then they are compared on the straight line between two."""
+
+    def __init__(self) -> None:
+        self._waiting: list[tuple[int, int, tuple[float, ...]]] = []
+        self._last: tuple[int, Array] | None = None
+
+    def take(self, poses: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows) -> tuple[Indexes, Indexes, Array]:
+        """Return stamps, steps and residuals x, y [mm], theta [mrad], (n, 3), of what can be compared now.
+
+        Parameters
+        ----------
+        poses
+            Poses and their places among the entries, which `steps` belong to.
+        head
+            Rows of `head_state`.
+        """
+        self._waiting += [(pose.stamp_ns, max(int(steps[place]), 0), pose.pose) for place, pose in poses]
+        predicted = np.column_stack((head.numbers[:, :2], 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])))
+        stamps = head.stamp_ns
+        if self._last is not None and len(stamps) and self._last[0] < stamps[0]:
+            stamps = np.concatenate(([self._last[0]], stamps))
+            predicted = np.concatenate((self._last[1][None], predicted))
+        if not len(stamps):
+            return stamps, stamps, np.zeros((0, 3))
+        self._last = int(stamps[-1]), predicted[-1]
+        ready = [one for one in self._waiting if stamps[0] <= one[0] <= stamps[-1]]
+        self._waiting = [one for one in self._waiting if one[0] > stamps[-1]]
+        at = np.array([one[0] for one in ready], np.int64)
+        rising = np.maximum.accumulate(stamps) - stamps[0]
+        model = np.stack([np.interp(at - stamps[0], rising, column) for column in predicted.T], axis=1)
+        measured = np.array([one[2] for one in ready]).reshape(-1, 3)
+        return at, np.array([one[1] for one in ready], np.int64), _SCALE * (measured - model)

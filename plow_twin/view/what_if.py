@@ -1,0 +1,64 @@
+"""What other scenes would have borne under the load of a run: their largest contact forces beside those of the run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import rerun as rr
+
+from plow_twin.model.scene import Scene
+from plow_twin.record.header import RunHeader
+from plow_twin.record.importing import JournalWalk, Walked, Walker
+from plow_twin.record.reader import Entries
+from plow_twin.run.twin import Twin
+from plow_twin.stream.session import Session
+from plow_twin.view import layout
+from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
+
+
+class WhatIf:
+    """Walk other scenes, by name, through the journal of a run, and draw their forces; without any nothing is done."""
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        axis: TimeAxis,
+        header: RunHeader,
+        others: Mapping[str, Scene],
+        span_ns: int,
+    ) -> None:
+        entities = layout.what_if_curves(stream, tuple(others)) if others else ()
+        self._curves = [Curves(stream, axis, [entity], span_ns) for entity in entities]
+        self._walk = JournalWalk((), [self._walker(header, scene, n + 1) for n, scene in enumerate(others.values())])
+        self._stamps = self._steps = np.zeros(0, np.int64)
+
+    def _walker(self, header: RunHeader, scene: Scene, number: int) -> Walker:
+        def draw(walked: Walked) -> None:
+            place = np.searchsorted(self._stamps, walked.stamp_ns)
+            self._curves[number].add(walked.stamp_ns, self._steps[place], _largest_kn(walked.rows.peak))
+
+        twin = Twin(scene, tol=header.tol, excitation="sampled")
+        return Walker(Session(twin, header.origin_ns), draw)
+
+    def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:
+        """Go on by entries of the journal."""
+        if self._curves:
+            order = np.argsort(stamps[entries.sample], kind="stable")
+            self._stamps, self._steps = stamps[entries.sample][order], steps[entries.sample][order]
+            self._walk.add(entries)
+
+    def run(self, stamps: Indexes, steps: Indexes, peak: Array) -> None:
+        """Draw what the run itself bore: largest forces [N], shape (n, 8)."""
+        if self._curves:
+            self._curves[0].add(stamps, steps, _largest_kn(peak))
+
+    def flush(self) -> None:
+        """Send what has been collected."""
+        for curve in self._curves:
+            curve.flush()
+
+
+def _largest_kn(peak: Array) -> Array:
+    largest: Array = peak.max(axis=1, keepdims=True) / 1e3
+    return largest
