@@ -41,6 +41,7 @@ def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any
     simple, _ = range_of_motion(truth.nominal, truth.poses)
     row: dict[str, Any] = {
         "group": name, "seed": seed, "stiffness": truth.scene.contact.stiffness, "model": result.model,
+        "stiffness_p05": result.stiffness.p05, "stiffness_p95": result.stiffness.p95,
         "sensor": result.sensor, "cpu_s": cpu_s, "work": result.figures.get("work", 0.0),
     }  # fmt: skip
     for index, (axis, value, state) in enumerate(

@@ -67,6 +67,8 @@ GROUPS = {
     "middle": Group("K 3e7 .. 3e8", stiffness=(3e7, 3e8)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
     "kelvin_voigt": Group("truth: Kelvin-Voigt", law="kelvin_voigt", model="suspect"),
+    "hard_kelvin_voigt": Group("hard, truth: Kelvin-Voigt", stiffness=(1e9, 1e11), law="kelvin_voigt", model="suspect"),
+    "hard_shape": Group("hard, truth: third harmonic", stiffness=(1e9, 1e11), third_harmonic=0.15, model="suspect"),
     "exponent": Group("truth: exponent 1.5", exponent=1.5, stiffness=(5e7, 3e8), model="suspect"),
     "shape": Group("truth: third harmonic of 15 %", third_harmonic=0.15, model="suspect"),
     "scale": Group("truth: 1.4 times the load", stiffness=(1e7, 3e7), load_scale=1.4, model="suspect"),
@@ -146,7 +148,8 @@ def _contact(group: Group, rng: np.random.Generator) -> Contact:
     stiffness = float(np.exp(rng.uniform(low, high)))
     damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
     if group.law == "kelvin_voigt":
-        damping = 10.0 ** rng.uniform(4.5, 5.3)
+        # the same share of the critical one for hard contacts
+        damping = 10.0 ** rng.uniform(4.5, 5.3) * max(1.0, np.sqrt(stiffness / 3e7))
     return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
 
 

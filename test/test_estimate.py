@@ -14,16 +14,17 @@ from rosbags.rosbag2 import StoragePlugin
 from scenes import ROOT, preset
 from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
-from plow_twin import Scene, Table, simulate
+from plow_twin import Scene, Table, Twin, simulate
 from plow_twin.estimate.bouncing import _regress
 from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.measurements import EstimateError, Load, Poses
-from plow_twin.estimate.result import Interval, State
+from plow_twin.estimate.result import Estimate, Interval, State
 
 __all__ = ["motion"]  # a fixture
 
 sys.path.insert(0, str(ROOT / "benchmark"))
-from estimate_truths import GROUPS, draw
+from estimate_truths import GROUPS, Truth, draw
 
 
 def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
@@ -33,7 +34,7 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     with (tmp_path / "pose.csv").open("a") as file:
         file.write("99,what,0,0\n")
     command = [sys.executable, "-m", "plow_twin", "estimate", str(tmp_path), "--json", "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=110)
+    done = subprocess.run([*command, "--forces", "20"], capture_output=True, text=True, timeout=110)
     assert done.returncode == 3, done.stderr
     facts = json.loads(done.stdout)
     assert facts == json.loads((tmp_path / "out" / "estimate.json").read_text())
@@ -45,19 +46,65 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     assert facts["delay"]["mean"] == pytest.approx(truth.delay, abs=2e-3)
     assert (facts["model"], facts["sensor"], facts["lost"]) == ("ok", "ok", 1)
     assert facts["t_end"] > 18.0 and facts["wall_s"] > 0.0
+    header = (tmp_path / "out" / "forces.csv").read_text().splitlines()[0].split(",")
+    assert header[:2] == ["t", "force_top_left_top/p05"] and len(header) == 25
+    assert facts["forces"]["members"] == 20 and facts["forces"]["pairs"]["top_left_top"]["peak_n"]["p50"] > 0.0
 
 
-def test_intervals_hold_and_the_same_data_give_the_same_bits() -> None:
+@pytest.fixture(scope="module")
+def known() -> list[tuple[Truth, Estimate]]:
     truths = [draw(replace(GROUPS["plain"], periods=5.0), seed) for seed in (2, 3)]
-    results = [estimate(truth.nominal, truth.load, truth.poses) for truth in truths]
+    return [(truth, estimate(truth.nominal, truth.load, truth.poses)) for truth in truths]
+
+
+def test_intervals_hold_and_the_same_data_give_the_same_bits(known: list[tuple[Truth, Estimate]]) -> None:
     inside = [
         value.p05 <= true <= value.p95
-        for truth, result in zip(truths, results, strict=True)
+        for truth, result in known
         for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True)
     ]
     assert sum(inside) >= 3
-    assert all((result.model, result.sensor) == ("ok", "ok") for result in results)
-    assert estimate(truths[0].nominal, truths[0].load, truths[0].poses) == results[0]
+    assert all((result.model, result.sensor) == ("ok", "ok") for _, result in known)
+    truth, result = known[0]
+    assert estimate(truth.nominal, truth.load, truth.poses) == result
+
+
+def test_forces_have_intervals_that_hold_peaks_and_impulses(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, result = known[0]
+    assert result.correlation is not None and np.linalg.eigvalsh(np.array(result.correlation)).min() > 0.0
+    period = truth.load.period()
+    forces = forces_of(truth.nominal, result, truth.load, 60, period)
+    cutting = truth.scene.loads[0]
+    assert isinstance(cutting, Table)
+    run = Twin(replace(truth.scene, loads=()), excitation="sampled").advance_samples(cutting.t, cutting.wrench)
+    late = (cutting.t > forces.t[0]) & (cutting.t <= forces.t[-1])
+    true = {"peak": run.peak[late].max(axis=0), "impulse": run.impulse[late].sum(axis=0)}
+    held = [
+        low <= value <= high
+        for name, values in true.items()
+        for value, low, high in zip(values, getattr(forces, name)[0], getattr(forces, name)[2], strict=True)
+    ]
+    assert sum(held) >= 11, "of 16, whose errors go together"
+    assert forces.peak[2].max() < 1.4 * forces.peak[0].max()
+    withdrawn = replace(result, horizontal_state=State.WITHDRAWN)
+    with pytest.raises(ForcesError, match="withdrawn"):
+        ForceEnsemble(truth.nominal, withdrawn)
+    with pytest.raises(ForcesError, match="members: got 3"):
+        ForceEnsemble(truth.nominal, result, 3)
+
+
+def test_members_are_drawn_with_the_estimate_s_correlation(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, result = known[0]
+    matrix = np.eye(7)
+    matrix[0, 2] = matrix[2, 0] = -0.8
+    drawn = replace(result, correlation=tuple(map(tuple, matrix.tolist())))
+    scenes, gains = draw_scenes(truth.nominal, drawn, 2000, np.random.default_rng(1))
+    clearance = np.array([scene.clearance.horizontal_m for scene in scenes])
+    stiffness = np.log([scene.contact.stiffness for scene in scenes])
+    # a softer contact goes with a smaller clearance
+    assert np.corrcoef(clearance, stiffness)[0, 1] == pytest.approx(0.8, abs=0.04)
+    assert np.quantile(clearance, [0.05, 0.95]) == pytest.approx([drawn.horizontal.p05, drawn.horizontal.p95], abs=5e-6)
+    assert gains.shape == (2000, 3)
 
 
 @pytest.mark.parametrize(
@@ -153,6 +200,19 @@ def test_a_load_is_thinned_within_its_share() -> None:
     for column, whole in zip(thin.wrench.T, load.wrench.T, strict=True):
         assert np.abs(np.interp(t, thin.t, column) - whole).max() <= 1.001e-3 * 2e5
     assert load.period() == pytest.approx(np.pi, rel=0.1)
+
+
+def test_an_averaged_load_keeps_its_mean_and_bridges_gaps() -> None:
+    rng = np.random.default_rng(2)
+    t = np.delete(np.arange(0.0, 10.0, 2e-3), slice(2000, 2400))
+    load, _ = Load.of(t, rng.standard_normal((len(t), 3)) + 5.0)
+    few = load.averaged(1000)
+    fine = np.linspace(0.0, t[-1], 200_001)
+    for column, whole in zip(few.wrench.T, load.wrench.T, strict=True):
+        left_over = np.interp(fine, few.t, column) - np.interp(fine, t, whole)
+        # impulse since the beginning: it does not drift
+        assert np.abs(np.cumsum(left_over) * (fine[1] - fine[0])).max() < 0.02
+        assert np.abs(np.interp(4.4, few.t, column) - np.interp(4.4, t, whole)) < 0.1
 
 
 def test_an_interval_is_cut_off_where_the_head_has_been() -> None:

@@ -14,6 +14,8 @@ import click
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, busy, json_option, output_console, quiet_option, table
 
 if TYPE_CHECKING:
+    from plow_twin.estimate.forces import Forces
+    from plow_twin.estimate.measurements import Load
     from plow_twin.estimate.result import Estimate, Interval
     from plow_twin.model.scene import Scene
 
@@ -31,10 +33,23 @@ if TYPE_CHECKING:
     help="YAML that says which topic of a recording is the excitation and which the head_pose.",
 )
 @json_option
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for estimate.json.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for estimate.json, forces.csv.")
+@click.option(
+    "--forces",
+    "members",
+    metavar="N",
+    type=click.IntRange(20, 4096),
+    help="Forces of each pair with 90 % intervals, from N twins drawn from the estimate (256 is plenty).",
+)
 @quiet_option
 def estimate(
-    source: Path, scene: Path | None, mapping: Path | None, as_json: bool, out: Path | None, quiet: bool
+    source: Path,
+    scene: Path | None,
+    mapping: Path | None,
+    as_json: bool,
+    out: Path | None,
+    members: int | None,
+    quiet: bool,
 ) -> int:
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
 
@@ -43,6 +58,8 @@ def estimate(
     rosbag2's sqlite3). Where the node of a run estimated, its newest estimate is made again from the journal and
     compared, bit for bit; else the measured pose is one recorded beside the run.
     """
+    import numpy as np
+
     from plow_twin.estimate.estimate import warm_up
     from plow_twin.record.measured import LOAD_FILE
     from plow_twin.record.reader import own_run
@@ -57,14 +74,24 @@ def estimate(
     with busy("estimating", quiet or as_json):
         result, more = task.run()
     facts = {**result.as_dict(), **more, "wall_s": time.perf_counter() - begin, "compile_s": compile_s}
+    forces = None
+    if members is not None:
+        with busy("forces", quiet or as_json):
+            forces = _forces(task, result, members)
+        facts["forces"] = None if forces is None else forces.as_dict()
     text = json.dumps(facts, indent=2, allow_nan=False)
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
+        if forces is not None:
+            names, rows = forces.table()
+            np.savetxt(out / "forces.csv", rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
         (out / "estimate.json").write_text(text + "\n", encoding="utf-8")
     if as_json:
         click.echo(text)
     elif not quiet:
         _show(result)
+        if forces is not None:
+            _show_forces(forces)
     if more.get("live", {}).get("repeated") is False:
         click.echo("the journal gives another estimate than the node published", err=True)
         return FAILED
@@ -76,6 +103,7 @@ class _Task:
     """What is to be estimated: `run` returns the estimate and what else is to be said."""
 
     scene: Scene
+    load: Load
     run: Callable[[], tuple[Estimate, dict[str, Any]]]
 
 
@@ -89,7 +117,7 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:])
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:])
     lost = measured.unreadable + lost_load + lost_poses
-    return _Task(measured.scene, lambda: (run(measured.scene, load, poses, lost), {}))
+    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost), {}))
 
 
 def _repeated(source: Path) -> _Task | None:
@@ -114,7 +142,28 @@ def _repeated(source: Path) -> _Task | None:
         live = {"estimates": len(found), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
         return result, {"live": live}
 
-    return _Task(scene, run)
+    newest = whole[-1].window
+    assert newest is not None
+    return _Task(scene, newest.load, run)
+
+
+def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
+    """Return the forces under the load believed; None where nothing holds that they could be drawn from."""
+    from plow_twin.estimate.forces import forces_of
+    from plow_twin.estimate.result import State
+
+    if State.WITHDRAWN in (result.horizontal_state, result.vertical_state):
+        return None
+    return forces_of(task.scene, result, task.load, members, task.load.period())
+
+
+def _show_forces(forces: Forces) -> None:
+    from plow_twin.model.pairs import PAIR_NAMES
+
+    view = table(f"Largest forces from {forces.t[0]:.2f} s on [kN]", "", "5 %", "50 %", "95 %")
+    for name, peaks in zip(PAIR_NAMES, forces.peak.T, strict=True):
+        view.add_row(name, *(f"{1e-3 * peak:.1f}" for peak in peaks))
+    output_console().print(view)
 
 
 def _show(result: Estimate) -> None:

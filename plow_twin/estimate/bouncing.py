@@ -35,23 +35,24 @@ NARROW, NARROW_M = 1.58, 8e-4
 _WINDOWS: Final = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
 #: Parts of a period in which the scatter is told.
 _PHASES = 20
-#: Draws of each round, and the share of the last ones that are regressed.
+#: Draws of each round.
 _DRAWS: Final = (40, 40, 40)
-_KEPT, _NEAR = 1.6, 0.7
+#: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
+_NEAR, _RIDGE = 0.7, 0.3
 #: Steps of the solver after which no further draw is made.
 _MOST_WORK = 3_500_000
 #: Drawn: logarithm of the penetration under the reference force [m] and its bounds; deviations of the damping's
 #: logarithm, of the gains, of the clearance [m].
-_LN_PENETRATION, _BOUNDS = (math.log(3e-5), 1.2), (5e-6, 6e-4)
+_LN_PENETRATION, _BOUNDS = (math.log(1.2e-5), 1.6), (2e-6, 6e-4)
 _DAMPING, _GAIN, _CLEARANCE = 0.7, 0.06, (1.2e-3, 3e-4, 3e-4)
 #: Correction of the last round in m from which on nothing has been found.
 _ASTRAY = 1.5e-4
 #: What the range of motion overrates a clearance by: noise, and bounces against it [m].
 _OVERRATED: Final = np.array([0.8e-3, 1.0e-3])
-#: Scatter of the logarithm of the noise as it is told by neighbours.
-_NOISE_SCATTER = 0.03
-#: Widening of the intervals, set on seeds below 1000 of the benchmark.
-_WIDENED = 1.5
+#: Corrections of a draw's noise.
+_NOISE_ROUNDS = 3
+#: Widening of the softness: what a regression says of the logarithm has long tails (set as `BOUNCED_MOST` was).
+_WIDENED_SOFTNESS = 1.6
 #: Fewest draws that are regressed.
 _FEWEST = 30
 
@@ -100,17 +101,16 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
     """Compare the measured motion with drawn ones; None where too few can be run."""
     eye = _Eye(unknowns, poses, period)
     measured = eye.features(eye.q)
-    rng = np.random.default_rng(seed)
+    rng, most_work = np.random.default_rng(seed), forward.work + _MOST_WORK
     centre = range_of_motion(unknowns.scene, poses)[0] - _OVERRATED
     mean = np.array([_LN_PENETRATION[0], unknowns.nominal()[DAMPING], 1.0, 1.0, 1.0])
     spread = np.array([_LN_PENETRATION[1], _DAMPING if unknowns.damped else 0.0, _GAIN, _GAIN, _GAIN])
-    first_mean, first_spread = mean, spread
     features: list[Array] = []
     targets: list[Array] = []
     found: _Regressed | None = None
     for count, about in zip(_DRAWS, _CLEARANCE, strict=True):
         for _ in range(count):
-            if forward.work > _MOST_WORK:
+            if forward.work > most_work:
                 break
             numbers = mean + spread * rng.standard_normal(5)
             numbers[0] = np.clip(numbers[0], *np.log(_BOUNDS))
@@ -119,25 +119,22 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
             if seen is not None:
                 features.append(seen)
                 targets.append(np.concatenate([clearance - seen[:2], -seen[2:4], numbers]))
-        kept = -int(_KEPT * count)
         if len(features) < _FEWEST:
             return None
-        found = _regress(np.array(features[kept:])[:, 4:], np.array(targets[kept:]), measured[4:])
+        found = _regress(np.array(features)[:, 4:], np.array(targets), measured[4:])
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
-        mean = np.clip(found.value[4:], first_mean - 2.0 * first_spread, first_mean + 2.0 * first_spread)
-        spread = np.clip(1.3 * found.deviation[4:], 0.3 * first_spread, first_spread)
     assert found is not None
     # what still moves has not been found
-    deviation = np.hypot(_WIDENED * found.deviation[:2], 2.0 * moved)
+    deviation = np.hypot(found.deviation[:2], moved)
     deviation[np.abs(moved) > _ASTRAY] = np.inf
     return Bounced(
         centre,
         deviation,
         measured[2:4] + found.value[2:4],
-        _WIDENED * found.deviation[2:4],
-        (float(found.value[4]), _WIDENED * float(found.deviation[4])),
-        (float(found.value[5]), _WIDENED * float(found.deviation[5])),
+        found.deviation[2:4],
+        (float(found.value[4]), _WIDENED_SOFTNESS * float(found.deviation[4])),
+        (float(found.value[5]), float(found.deviation[5])),
         eye.noise,
         found.distance,
     )
@@ -151,18 +148,22 @@ class _Regressed:
 
 
 def _regress(features: Array, targets: Array, measured: Array) -> _Regressed:
-    """Regress targets (n, k) on features (n, m), the nearest to what was measured most; errors by leaving one out."""
+    """Regress targets (n, k) on features (n, m), the nearest to what was measured most.
+
+    The deviations are those of a prediction at `measured`, which may lie at the edge of what was drawn.
+    """
     scale = features.std(axis=0) + 1e-12
     z = (features - measured) / scale
     distance = (z * z).mean(axis=1)
     weight = np.maximum(1.0 - distance / np.sort(distance)[int(_NEAR * len(distance))], 0.0)
     basis = np.concatenate([np.ones((len(z), 1)), z], axis=1)
-    ridge = np.diag([0.0] + [1.0] * z.shape[1])
+    ridge = np.diag([0.0] + [_RIDGE] * z.shape[1])
     inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
     beta = inverse @ (basis.T @ (weight[:, None] * targets))
     leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
-    error = (targets - basis @ beta) / (1.0 - np.minimum(leverage, 0.9))[:, None]
-    deviation = np.sqrt((weight[:, None] * error**2).sum(axis=0) / weight.sum())
+    error = targets - basis @ beta
+    variance = (weight[:, None] * error**2).sum(axis=0) / (weight * (1.0 - np.minimum(leverage, 0.9))).sum()
+    deviation = np.sqrt(variance * (1.0 + inverse[0, 0]))
     between = ((features[:, None] - features[None]) ** 2 / scale**2).mean(axis=2)
     nearest = np.sort(between, axis=1)[:, 1:6].mean(axis=1)
     return _Regressed(beta[0], deviation, float(np.sort(distance)[:5].mean() / np.quantile(nearest, 0.95)))
@@ -189,11 +190,20 @@ class _Eye:
         contact = replace(scene.contact, stiffness=unknowns.force / math.exp(numbers[0]) ** scene.contact.exponent)
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
-        noise = self.noise * math.exp(_NOISE_SCATTER * rng.standard_normal())
-        seen = noise * rng.standard_normal(self.q.shape)
+        white = rng.standard_normal(self.q.shape)
         edges = np.array([0, len(self._t)])
         run = forward.run(replace(scene, contact=contact), vector[GAIN], self._t[:1] - 0.1, start[None], edges, self._t)
-        return None if run is None else self.features(run.q + seen)
+        return None if run is None else self.features(self._seen(run.q, white))
+
+    def _seen(self, q: Array, white: Array) -> Array:
+        """Return a motion with as much noise as makes its quick changes as large as those measured.
+
+        Bounces change the pose quickly too, so those changes overrate the noise, and the reach with it.
+        """
+        noise = self.noise
+        for _ in range(_NOISE_ROUNDS):
+            noise = noise * self.noise / np.maximum(noise_level(q + noise * white), 1e-12)
+        return q + noise * white
 
     def features(self, q: Array) -> Array:
         """Return reach of the clearances, half the difference of the reaches, then what the motion is like."""

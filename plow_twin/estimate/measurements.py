@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import solveh_banded
 
 from plow_twin.errors import PlowTwinError
 
 Array = NDArray[np.float64]
 
+#: Least number of points between two knots at which a load is averaged.
+_FINER = 8
 #: Fewest measured poses from which anything is estimated.
 FEWEST_POSES = 20
 
@@ -134,19 +138,27 @@ class Load:
         return Load(self.t[keep], self.wrench[keep])
 
     def averaged(self, count: int) -> Load:
-        """Return `count` knots at equal distances, each the mean of the samples about it, weighted by nearness."""
-        step = float(self.t[-1] - self.t[0]) / (count - 1)
-        place = (self.t - self.t[0]) / step
+        """Return `count` knots at equal distances whose lines are nearest to this load (least squares).
+
+        What is left over has no mean over any few of them, so it moves the head nowhere for long.
+        """
+        knots = np.linspace(self.t[0], self.t[-1], count)
+        within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
+        place = np.arange((count - 1) * within + 1) / within
+        times = self.t[0] + (self.t[-1] - self.t[0]) * place / (count - 1)
         left = np.minimum(place.astype(np.int64), count - 2)
         share = place - left
-        weight = np.bincount(left, 1.0 - share, count) + np.bincount(left + 1, share, count)
-        there = weight > 1e-9
-        columns = [
-            (np.bincount(left, (1.0 - share) * column, count) + np.bincount(left + 1, share * column, count))[there]
-            / weight[there]
-            for column in self.wrench.T
-        ]
-        return Load(self.t[0] + step * np.flatnonzero(there), np.stack(columns, axis=1))
+        # the normal equations have three diagonals
+        bands = np.zeros((2, count))
+        bands[1] = np.bincount(left, (1.0 - share) ** 2, count) + np.bincount(left + 1, share**2, count)
+        bands[0, 1:] = np.bincount(left, share * (1.0 - share), count)[:-1]
+        columns = []
+        for column in self.wrench.T:
+            value = np.interp(times, self.t, column)
+            columns.append(
+                np.bincount(left, (1.0 - share) * value, count) + np.bincount(left + 1, share * value, count)
+            )
+        return Load(knots, solveh_banded(bands, np.stack(columns, axis=1)))
 
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:

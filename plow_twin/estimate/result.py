@@ -15,6 +15,10 @@ Array = NDArray[np.float64]
 NORMAL_P95: Final = 1.6448536269514722
 
 
+#: Unknowns whose correlation is told; softness is the penetration under a force, the other side of stiffness.
+CORRELATED: Final = ("horizontal", "vertical", "softness", "damping", "gain_fx", "gain_fy", "gain_m")
+
+
 class State(Enum):
     """How far a value can be relied on."""
 
@@ -73,6 +77,8 @@ class Estimate:
         `ok` or `suspect`; `reasons` says why.
     lost : int
         Rows that could not be used.
+    correlation : tuple of tuple of float
+        Correlation of `CORRELATED`; stiffness and clearance stand for each other in part.
     """
 
     t_start: float
@@ -95,6 +101,7 @@ class Estimate:
     sensor: str = "ok"
     reasons: tuple[str, ...] = ()
     lost: int = 0
+    correlation: tuple[tuple[float, ...], ...] | None = None
     figures: dict[str, float] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
@@ -116,5 +123,8 @@ class Estimate:
             "sensor": self.sensor,
             "reasons": list(self.reasons),
             "lost": self.lost,
+            "correlation": None
+            if self.correlation is None
+            else {"names": list(CORRELATED), "matrix": [list(row) for row in self.correlation]},
             "figures": self.figures,
         }

@@ -38,8 +38,9 @@ class Stage:
 _FEWEST_ROWS = (8, 12)
 
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Shortest swing and horizon, as shares of the period, of hard and of soft contacts.
-_SHORT, _LONG = (0.04, 0.11), (0.35, np.inf)
+#: Shortest swing and horizon, as shares of the period, of hard and of soft contacts, and under a broad-band load: what
+#: its samples do not tell between them adds up along a swing.
+_SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.12, np.inf)
 
 
 def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> Fit | None:
@@ -61,12 +62,12 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def refine(
-    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, broad: bool
 ) -> tuple[Problem, Fit] | None:
-    """Fit all poses from a good start: the beginning of each swing first."""
+    """Fit all poses from a good start: the beginning of each swing first; `broad`: the load is broad-band."""
     hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
     rows = float(np.median(np.diff(poses.t))) * np.array(_FEWEST_ROWS)
-    shortest, horizon = _SHORT if hard else _LONG
+    shortest, horizon = _SHORT if hard else _BROAD if broad else _LONG
     shortest, horizon = max(shortest * period, rows[1]), max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon))

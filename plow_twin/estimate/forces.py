@@ -1,0 +1,179 @@
+"""Contact forces with intervals: full twins drawn from an estimate, advanced together under the load believed.
+
+Each member has clearances, contact numbers and load gains of its own, drawn from the estimate with their correlation,
+and each follows every sample of the load; the quantiles over the members are the interval. After some load periods the
+members have forgotten where they began, so what they differ by is what is not known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.estimate.measurements import Load
+from plow_twin.estimate.result import NORMAL_P95, Estimate, Interval, State
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.scene import Clearance, Scene
+from plow_twin.run.batch import TwinBatch
+
+Array = NDArray[np.float64]
+
+#: Members by default.
+MEMBERS: Final = 256
+#: Tolerance of the pose relative to the clearance.
+TOLERANCE: Final = 1e-4
+#: Quantiles that are told.
+POINTS: Final = (0.05, 0.5, 0.95)
+_LEAST_CLEARANCE = 5e-4
+#: Samples that are advanced in one call: what it returns is kept for all members until the quantiles are taken.
+_CALL = 100
+
+
+class ForcesError(PlowTwinError):
+    """The estimate tells no forces."""
+
+
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """Quantiles over the members, in the order of `POINTS`.
+
+    t : (n,) in s
+    force : (3, n, 8) of each pair at these times in N
+    peak, impulse : (3, 8) largest force in N and impulse in N s from the first to the last of them
+    """
+
+    t: Array
+    force: Array
+    peak: Array
+    impulse: Array
+    members: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return peaks and impulses for JSON."""
+        pairs = {
+            name: {
+                key: dict(zip(("p05", "p50", "p95"), map(float, values[:, index]), strict=True))
+                for key, values in (("peak_n", self.peak), ("impulse_n_s", self.impulse))
+            }
+            for index, name in enumerate(PAIR_NAMES)
+        }
+        return {"members": self.members, "t_start": float(self.t[0]), "t_end": float(self.t[-1]), "pairs": pairs}
+
+    def table(self) -> tuple[list[str], Array]:
+        """Return the names of the columns and the rows of the forces over time."""
+        names = [f"force_{name}/{point}" for name in PAIR_NAMES for point in ("p05", "p50", "p95")]
+        return ["t", *names], np.column_stack([self.t, self.force.transpose(1, 2, 0).reshape(len(self.t), -1)])
+
+
+class ForceEnsemble:
+    """Twins drawn from an estimate, advanced sample by sample.
+
+    Parameters
+    ----------
+    scene : Scene
+        The nominal scene: geometry, masses and gravity hold.
+    found : Estimate
+        Its intervals are drawn from; not one that is withdrawn.
+    members : int
+        At least 20: fewer have no 5 % point.
+    start : float
+        Time in s at which all members are in the scene's initial state.
+
+    Raises
+    ------
+    ForcesError
+        For a withdrawn estimate, or too few members.
+    """
+
+    def __init__(
+        self, scene: Scene, found: Estimate, members: int = MEMBERS, *, seed: int = 0, start: float = 0.0
+    ) -> None:
+        if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
+            raise ForcesError(f"estimate: got a withdrawn one ({'; '.join(found.reasons)}), expected one that holds")
+        if members < 20:
+            raise ForcesError(f"members: got {members}, expected at least 20")
+        scenes, self._gain = draw_scenes(scene, found, members, np.random.default_rng(seed))
+        self._twins = TwinBatch(scenes, tol=TOLERANCE, start=start)
+
+    def __len__(self) -> int:
+        return len(self._twins)
+
+    def advance(self, t: Array, wrench: Array) -> Forces:
+        """Advance all members through samples of the load believed; `t` (n,) in s, `wrench` (n, 3)."""
+        force = np.zeros((len(POINTS), len(t), PAIR_COUNT))
+        peak, impulse = np.zeros((len(self), PAIR_COUNT)), np.zeros((len(self), PAIR_COUNT))
+        for first in range(0, len(t), _CALL):
+            part = slice(first, first + _CALL)
+            batch = self._twins.advance_samples(t[part], wrench[part] * self._gain[:, None, :])
+            if (batch.status != 0).any():
+                raise ForcesError(f"t = {t[first]:.3f} s: got a member that left the model's range, expected none")
+            force[:, part] = quantiles(batch.force)
+            np.maximum(peak, batch.peak.max(axis=1), out=peak)
+            impulse += batch.impulse.sum(axis=1)
+        return Forces(t, force, quantiles(peak), quantiles(impulse), len(self))
+
+
+def quantiles(values: Array) -> Array:
+    """Return the nearest-rank quantiles over the first axis, in the order of `POINTS`; no value is below zero."""
+    places = [min(int(share * len(values)), len(values) - 1) for share in POINTS]
+    out = np.zeros((len(POINTS), *values.shape[1:]))
+    # most pairs are apart in all members: nothing to put in order
+    there = values.any(axis=0)
+    out[:, there] = np.partition(np.ascontiguousarray(values[:, there].T), places, axis=1)[:, places].T
+    return out
+
+
+def forces_of(scene: Scene, found: Estimate, load: Load, members: int, settle_s: float) -> Forces:
+    """Return the forces under a load from `settle_s` after its first sample on: until then the members settle."""
+    ensemble = ForceEnsemble(scene, found, members, start=float(load.t[0]))
+    first = int(np.searchsorted(load.t, load.t[0] + settle_s))
+    if first >= len(load.t):
+        raise ForcesError(f"load: got {load.t[-1] - load.t[0]:g} s, expected more than the {settle_s:g} s to settle in")
+    if first:
+        ensemble.advance(load.t[:first], load.wrench[:first])
+    return ensemble.advance(load.t[first:], load.wrench[first:])
+
+
+def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Generator) -> tuple[list[Scene], Array]:
+    """Return scenes drawn from an estimate, and the gains of their loads, shape (m, 3)."""
+    white = rng.standard_normal((members, 7))
+    if found.correlation is not None:
+        white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(7)).T
+    horizontal, vertical = (
+        np.maximum(_normal(value, white[:, index]), _LEAST_CLEARANCE)
+        for index, value in enumerate((found.horizontal, found.vertical))
+    )
+    stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, 2]))
+    restitution = scene.contact.restitution is not None
+    damping = np.zeros(members)
+    if found.damping is not None:
+        value = found.damping if restitution else _logarithm(found.damping)
+        damping = _normal(value, white[:, 3])
+        damping = np.clip(damping, 1e-3, 0.999) if restitution else np.exp(damping)
+    gains = [
+        np.ones(members) if value is None else _normal(value, white[:, 4 + index])
+        for index, value in enumerate((found.gain_fx, found.gain_fy, found.gain_m))
+    ]
+    scenes = []
+    for index in range(members):
+        contact = replace(scene.contact, stiffness=float(stiffness[index]))
+        if found.damping is not None:
+            number = float(damping[index])
+            contact = replace(contact, restitution=number) if restitution else replace(contact, damping=number)
+        clearance = Clearance(float(horizontal[index]), float(vertical[index]))
+        scenes.append(replace(scene, clearance=clearance, contact=contact, loads=(), wear=None))
+    return scenes, np.stack(gains, axis=1)
+
+
+def _normal(value: Interval, white: Array) -> Array:
+    """Return normal numbers whose 5 % and 95 % points are the interval's, each side with a deviation of its own."""
+    below, above = (value.mean - value.p05) / NORMAL_P95, (value.p95 - value.mean) / NORMAL_P95
+    return value.mean + np.where(white < 0.0, below, above) * white
+
+
+def _logarithm(value: Interval) -> Interval:
+    return Interval(*(float(np.log(max(number, 1e-12))) for number in (value.mean, value.p05, value.p95)))
