@@ -1,6 +1,8 @@
 """The live node under load: loss, share of a core, age at a subscriber, beside a bare rclpy echo of three messages.
 
-`python benchmark/live_load.py [--seconds N] [--repeats N]` prints a line of JSON for each case, medians of the repeats.
+`python benchmark/live_load.py [--seconds N] [--repeats N]` prints a line of JSON for each case, medians of the repeats,
+in each of which every case runs once, and then the targets with what was reached. `--minutes N` runs the node with its
+recorder at 1 kHz for so long instead, prints a line each ten seconds, and what has grown.
 The machine is shared by publisher, node and subscriber: what is compared is the node and the echo in the same run.
 """
 
@@ -12,24 +14,34 @@ import os
 import struct
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 NS_PER_S = 1_000_000_000
-#: publish mode, rate of the samples [Hz], recorded
-CASES = (
-    ("on_sample", 1000, False),
-    ("on_sample", 1000, True),
-    ("fixed_rate", 1000, False),
-    ("fixed_rate", 10000, False),
-)
+PERIOD_S = 10.0
 
 
-def echo(rate_hz: float) -> None:
+class Case(NamedTuple):
+    """Publish mode of the node, or `echo`; rate of the samples [Hz]; whether it records."""
+
+    mode: str
+    rate_hz: float
+    recorded: bool = False
+
+
+ECHO = Case("echo", 1000)
+ON_SAMPLE, RECORDED = Case("on_sample", 1000), Case("on_sample", 1000, True)
+FIXED, FIXED_RECORDED = Case("fixed_rate", 1000), Case("fixed_rate", 1000, True)
+CASES = (ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed_rate", 10000))
+
+
+def echo() -> None:
     """Answer each sample with three messages of the sizes that the node sends, and nothing else."""
     import rclpy
     from geometry_msgs.msg import WrenchStamped
@@ -80,51 +92,82 @@ def send(rate_hz: float, seconds: float) -> None:
     time.sleep(1.0)
 
 
-def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
-    """Run one answerer under one rate; return what was sent, used and lost, its CPU, and the age at a subscriber."""
-    import rclpy
-    from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.context import Context
-    from rclpy.experimental.events_executor import EventsExecutor
-    from sensor_msgs.msg import JointState
+class Probe:
+    """A node that hears the forces and the diagnostics."""
 
-    context = Context()
-    context.init(args=[])
-    node = rclpy.create_node("probe", context=context)
-    executor = EventsExecutor(context=context)
-    executor.add_node(node)
-    ages: list[float] = []
-    figures: dict[str, str] = {}
+    def __init__(self) -> None:
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from rclpy.context import Context
+        from rclpy.experimental.events_executor import EventsExecutor
+        from sensor_msgs.msg import JointState
 
-    def heard(data: bytes) -> None:
+        self.context = Context()
+        self.context.init(args=[])
+        self.node = rclpy.create_node("probe", context=self.context)
+        self._executor = EventsExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        #: age of each message [ms], and figures of the newest report
+        self.ages: list[float] = []
+        self.figures: dict[str, str] = {}
+        self.node.create_subscription(JointState, "/live_load/contact_forces", self._heard, 5000, raw=True)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 10)
+
+    def _heard(self, data: bytes) -> None:
         sec, nanosec = struct.unpack_from("<iI", data, 4)
-        ages.append((time.time_ns() - sec * NS_PER_S - nanosec) * 1e-6)
+        self.ages.append((time.time_ns() - sec * NS_PER_S - nanosec) * 1e-6)
 
-    def report(message: DiagnosticArray) -> None:
+    def _report(self, message: Any) -> None:
         for status in message.status:
-            figures.update({item.key: item.value for item in status.values})
+            self.figures.update({item.key: item.value for item in status.values})
 
-    node.create_subscription(JointState, "/live_load/contact_forces", heard, 5000, raw=True)
-    node.create_subscription(DiagnosticArray, "/diagnostics", report, 10)
+    def spin(self, reached: Callable[[], bool], timeout_s: float) -> None:
+        """Listen until something is so, or time is up."""
+        give_up = time.monotonic() + timeout_s
+        while not reached() and time.monotonic() < give_up:
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def close(self) -> None:
+        """Take the node down."""
+        self._executor.remove_node(self.node)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+
+@contextmanager
+def running(answerer: list[str]) -> Iterator[tuple[Probe, int]]:
+    """Start an answerer and wait until it answers; yields a probe and the answerer's process id."""
+    probe = Probe()
     process = subprocess.Popen(answerer, env=environment(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        _spin(executor, lambda: node.count_subscribers("/live_load/excitation") > 0 and
-              (not figures or figures["lifecycle"] == "active"), 120.0)  # fmt: skip
-        _spin(executor, lambda: False, 2.0)
-        source = subprocess.Popen([sys.executable, __file__, "--role", "send", str(rate_hz), str(seconds)])
-        _spin(executor, lambda: bool(ages) or figures.get("samples_used", "0") != "0", 30.0)
-        busy, begin = _cpu_s(process.pid), time.monotonic()
-        _spin(executor, lambda: source.poll() is not None, seconds + 30.0)
-        share = (_cpu_s(process.pid) - busy) / (time.monotonic() - begin)
-        figures.pop("samples_used", None)
-        if "published" in figures:
-            _spin(executor, lambda: "samples_used" in figures, 5.0)
+        probe.spin(lambda: probe.node.count_subscribers("/live_load/excitation") > 0 and
+                   (not probe.figures or probe.figures["lifecycle"] == "active"), 120.0)  # fmt: skip
+        probe.spin(lambda: False, 2.0)
+        yield probe, process.pid
     finally:
         process.terminate()
         process.wait(20.0)
-        executor.remove_node(node)
-        node.destroy_node()
-        context.try_shutdown()
+        probe.close()
+
+
+def source(rate_hz: float, seconds: float) -> subprocess.Popen[bytes]:
+    """Start the publisher."""
+    return subprocess.Popen([sys.executable, __file__, "--role", "send", str(rate_hz), str(seconds)], env=environment())
+
+
+def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, float]:
+    """Run one answerer under one rate; return what was sent, used and lost, its CPU, and the age at a subscriber."""
+    with running(answerer) as (probe, process_id):
+        sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
+        probe.spin(lambda: bool(ages) or figures.get("samples_used", "0") != "0", 30.0)
+        busy, begin = _cpu_s(process_id), time.monotonic()
+        probe.spin(lambda: False, 1.0)
+        first_s = max(ages, default=0.0)
+        probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
+        share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
+        figures.pop("samples_used", None)
+        if "published" in figures:
+            probe.spin(lambda: "samples_used" in figures, 5.0)
     ages.sort()
     return {
         "sent": round(rate_hz * seconds),
@@ -134,6 +177,7 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
         "core": round(share, 3),
         "age_p50_ms": round(ages[len(ages) // 2], 3),
         "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+        "age_max_of_first_second_ms": round(first_s, 3),
     }
 
 
@@ -147,25 +191,84 @@ def _cpu_s(process_id: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _spin(executor: Any, reached: Callable[[], bool], timeout_s: float) -> None:
-    give_up = time.monotonic() + timeout_s
-    while not reached() and time.monotonic() < give_up:
-        executor.spin_once(timeout_sec=0.02)
-
-
 def _twin(mode: str, folder: str) -> list[str]:
     given = {"publish_mode": mode, "excitation_timeout": 60.0, "record_path": folder}
     settings = [word for name, value in given.items() if value != "" for word in ("-p", f"{name}:={value}")]
     return [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-r", "__ns:=/live_load", *settings]
 
 
-def main() -> None:
-    """Print the table."""
-    import tempfile
+def compare(seconds: float, repeats: int) -> None:
+    """Print the medians of all cases, and the targets with what was reached."""
+    runs: dict[Case, list[dict[str, float]]] = {case: [] for case in CASES}
+    with tempfile.TemporaryDirectory() as folder:
+        for repeat in range(repeats):
+            for number, case in enumerate(CASES):
+                path = f"{folder}/{number}_{repeat}" if case.recorded else ""
+                answerer = [sys.executable, __file__, "--role", "echo"]
+                command = answerer if case is ECHO else _twin(case.mode, path)
+                runs[case].append(measure(command, case.rate_hz, seconds))
+    rows = {case: {key: median(run[key] for run in found) for key in found[0]} for case, found in runs.items()}
+    for case, row in rows.items():
+        print(json.dumps(case._asdict() | row), flush=True)
+    for text, reached, most in _targets(rows):
+        print(f"{'reached' if reached <= most else 'MISSED '} {reached:8.3f} of {most:g}: {text}", flush=True)
 
+
+def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, float]]:
+    """Yield the targets in words, what was reached, and the most that is allowed."""
+    bare = rows[ECHO]
+    for case, how in ((ON_SAMPLE, ""), (RECORDED, ", recording")):
+        row = rows[case]
+        yield f"CPU against the echo, 1 kHz out{how}", row["core"] / bare["core"], 1.3
+        yield f"median age against the echo, 1 kHz out{how}", row["age_p50_ms"] / bare["age_p50_ms"], 1.3
+        yield f"p99 of the age above the echo [ms], 1 kHz out{how}", row["age_p99_ms"] - bare["age_p99_ms"], 1.0
+    for case, how in ((FIXED, ""), (FIXED_RECORDED, ", recording")):
+        yield f"share of a core, 100 Hz out{how}", rows[case]["core"], 1.0 / 3.0
+
+
+def soak(minutes: float) -> None:
+    """Run the node at 1 kHz with its recorder; print its size and figures, and what has grown in the last half."""
+    rows: list[dict[str, float]] = []
+    with tempfile.TemporaryDirectory() as folder, running(_twin("on_sample", f"{folder}/soak")) as (probe, process_id):
+        sender, begin = source(1000, 60.0 * minutes), time.monotonic()
+        while sender.poll() is None:
+            count, busy = len(probe.ages), _cpu_s(process_id)
+            probe.spin(lambda: sender.poll() is not None, PERIOD_S)
+            ages, figures = sorted(probe.ages[count:]), probe.figures
+            if not ages:
+                continue
+            rows.append({
+                "minute": round((time.monotonic() - begin) / 60.0, 2),
+                "rss_mib": round(_status(process_id, "VmRSS") / 1024.0, 2),
+                "threads": _status(process_id, "Threads"),
+                "files": len(os.listdir(f"/proc/{process_id}/fd")),
+                "core": round((_cpu_s(process_id) - busy) / PERIOD_S, 3),
+                "age_p50_ms": round(ages[len(ages) // 2], 3),
+                "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+                "queued": int(figures.get("queued") or 0),
+                "used": int(figures.get("samples_used", 0)),
+                "lost": int(figures.get("samples_lost", 0)),
+            })  # fmt: skip
+            print(json.dumps(rows[-1]), flush=True)
+            del probe.ages[:count]
+    later = rows[len(rows) // 2 :]
+    hours = (later[-1]["minute"] - later[0]["minute"]) / 60.0
+    for key in ("rss_mib", "threads", "files", "age_p50_ms", "queued"):
+        grown = later[-1][key] - later[0][key]
+        print(f"{key}: {later[0][key]:g} -> {later[-1][key]:g}, {grown / hours if hours else 0.0:.3g} an hour")
+
+
+def _status(process_id: int, key: str) -> int:
+    lines = Path(f"/proc/{process_id}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:"))
+
+
+def main() -> None:
+    """Print the table, or the soak."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--minutes", type=float, default=0.0)
     parser.add_argument("--role", nargs="+", default=[])
     options = parser.parse_args()
     if options.role:
@@ -174,16 +277,10 @@ def main() -> None:
         return
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", "91")
-    with tempfile.TemporaryDirectory() as folder:
-        cases = [("echo", 1000, False), *CASES]
-        for case, (mode, rate, recorded) in enumerate(cases):
-            runs = []
-            for repeat in range(options.repeats):
-                path = f"{folder}/{case}_{repeat}" if recorded else ""
-                answerer = [sys.executable, __file__, "--role", "echo", str(rate)]
-                runs.append(measure(answerer if mode == "echo" else _twin(mode, path), rate, options.seconds))
-            row = {key: median(run[key] for run in runs) for key in runs[0]}
-            print(json.dumps({"mode": mode, "rate_hz": rate, "recorded": recorded, **row}), flush=True)
+    if options.minutes:
+        soak(options.minutes)
+    else:
+        compare(options.seconds, options.repeats)
 
 
 if __name__ == "__main__":

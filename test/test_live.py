@@ -121,6 +121,15 @@ def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> N
     assert (report.samples, report.exit_code) == (100, 0)
 
 
+def test_bounded_work_is_said_with_its_error_and_given_again_by_the_journal(tmp_path: Path) -> None:
+    given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
+    values = _run(_csv(tmp_path / "load.csv", 1500), **given)["state"][2]
+    assert int(values["coarse_advances"]) > 0 and 0.0 < float(values["error_estimate_m"]) < 1e-3
+    report = replay(tmp_path / "run")
+    assert (report.samples, report.exit_code, report.first_divergence) == (1500, 0, None)
+    assert report.compared["contact_forces"] == 1500
+
+
 def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> None:
     rows = [",".join(map(repr, _row(index))) + ",,," for index in range(1200)]
     for index in range(50, 1200, 50):

@@ -445,9 +445,8 @@ class Runtime:
 
     def _pose(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
         self.driver.session.apply(Pose(stamp_ns, pose))
-        latched = self.alarms.latched
         if self.alarms.take_pose(stamp_ns, pose):
-            self._alarms_changed(stamp_ns, latched)
+            self._alarms_changed(stamp_ns)
 
     def _gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
         self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))
@@ -511,7 +510,6 @@ class Runtime:
             messages[QUALITY] = quality(publication, self._settings.frame_id)
         self._front.publish(messages, self._forces_sent)
         self.published += 1
-        latched = self.alarms.latched
         changed = self.alarms.take(publication)
         if self._received_ns and not self._front.follows_samples:
             self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
@@ -520,13 +518,12 @@ class Runtime:
             if publication.marked:
                 self.recording.message(QUALITY, publication.stamp_ns, messages[QUALITY])
         if changed:
-            self._alarms_changed(publication.stamp_ns, latched)
+            self._alarms_changed(publication.stamp_ns)
 
-    def _alarms_changed(self, stamp_ns: int, latched: Mapping[str, int]) -> None:
+    def _alarms_changed(self, stamp_ns: int) -> None:
         self._publish_alarms(stamp_ns)
-        risen = [name for name, level in self.alarms.latched.items() if level > latched[name]]
-        if risen:
-            self.mark(f"alarm: {', '.join(risen)}")
+        if self.alarms.raised:
+            self.mark(f"alarm: {', '.join(self.alarms.raised)}")
 
     def _publish_alarms(self, stamp_ns: int) -> None:
         status = alarms_message(self.alarms, self._front.name, self._settings.hardware_id)

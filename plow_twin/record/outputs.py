@@ -68,6 +68,11 @@ def publication_templates(frame_id: str, child_frame_id: str) -> dict[str, Templ
     }
 
 
+def quality_template(frame_id: str) -> Template:
+    """Return the template of `quality`."""
+    return Template.of(lambda values: JointState(0, frame_id, QUALITY_NAMES, position=values), len(QUALITY_NAMES))
+
+
 def publication_numbers(publications: Publications) -> dict[str, tuple[NDArray[np.int64], Array]]:
     """Return, by base name of the topic, stamps (n,) and numbers (n, k) of the messages of many publications."""
     stamps, slow = publications.stamp_ns, publications.stamp_ns[publications.slow_index]
@@ -125,8 +130,8 @@ def contact_peaks(publication: Publication, frame_id: str) -> JointState:
 
 def head_state(publication: Publication, frame_id: str, child_frame_id: str) -> Odometry:
     """Return the head's pose in the slide's frame and its twist in the head's own axes, as Odometry asks."""
-    x, y, theta = (float(value) for value in publication.q)
-    vx, vy, omega = (float(value) for value in publication.v)
+    x, y, theta = publication.q.tolist()
+    vx, vy, omega = publication.v.tolist()
     cos, sin = math.cos(theta), math.sin(theta)
     return Odometry(
         publication.stamp_ns,

@@ -194,7 +194,7 @@ class _Replay:
         twin.warm_up()
         templates = publication_templates(header.frame_id, header.child_frame_id)
         self.templates = Templates.of(templates[name] for name in PUBLICATION_TOPICS)
-        if excitation == "sampled":
+        if excitation == "sampled" and bound is None:  # a bounded one goes sample by sample
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
         self.publications: Publications | None = (

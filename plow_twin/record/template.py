@@ -23,7 +23,7 @@ Bytes = NDArray[np.uint8]
 Indexes = NDArray[np.int64]
 
 #: Place of the stamp, seconds and nanoseconds, behind the four bytes that name the encoding.
-_STAMP_AT: Final = 4
+STAMP_AT: Final = 4
 _SECOND_NS: Final = 1_000_000_000
 
 compiled: Final[Callable[[Callable[..., Any]], Callable[..., Any]]] = numba.njit(
@@ -60,7 +60,7 @@ class Template:
             raise RecordingError(f"{message.TYPE}: number {places.index(-1)} is not in its message")
         array = np.frombuffer(data, np.uint8).copy()
         fixed = np.full(len(array), 0xFF, np.uint8)
-        for place in (_STAMP_AT, *places):
+        for place in (STAMP_AT, *places):
             fixed[place : place + 8] = 0
             array[place : place + 8] = 0
         return cls(message.TYPE, array, np.array(places, np.int64), fixed)
@@ -101,7 +101,7 @@ def read_numbers(buffer, starts, lengths, data, fixed, places, stamps, values, g
         good[n] = _fits(buffer, start, lengths[n], data, fixed)
         if not good[n]:
             continue
-        stamp = word(buffer, start + _STAMP_AT)
+        stamp = word(buffer, start + STAMP_AT)
         stamps[n] = np.int64(np.int32(stamp)) * _SECOND_NS + (stamp >> 32 & 0xFFFFFFFF)
         for k in range(places.size):
             set_word(values, 8 * (n * places.size + k), word(buffer, start + places[k]))
@@ -162,7 +162,7 @@ def differing(  # type: ignore[no-untyped-def]
         wrong = (word(buffer, start + last) ^ word(data, first + last)) & word(fixed, first + last)
         for i in range(size >> 3):
             wrong |= (word(buffer, start + 8 * i) ^ word(data, first + 8 * i)) & word(fixed, first + 8 * i)
-        wrong |= word(buffer, start + _STAMP_AT) ^ _stamp(stamps[k][row])
+        wrong |= word(buffer, start + STAMP_AT) ^ _stamp(stamps[k][row])
         first, numbers = place_ends[k], values[k]
         count = place_ends[k + 1] - first
         for i in range(count):
@@ -179,6 +179,6 @@ def fill(buffer, starts, data, places, stamps, values):  # type: ignore[no-untyp
         for k in range(data.size >> 3):
             set_word(buffer, start + 8 * k, word(data, 8 * k))
         set_word(buffer, start + last, word(data, last))
-        set_word(buffer, start + _STAMP_AT, _stamp(stamps[n]))
+        set_word(buffer, start + STAMP_AT, _stamp(stamps[n]))
         for k in range(places.size):
             set_word(buffer, start + places[k], word(values, 8 * (n * places.size + k)))

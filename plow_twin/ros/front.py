@@ -18,7 +18,7 @@ from plow_twin.live.parameters import Settings
 from plow_twin.live.runtime import ESTIMATE, Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.record.messages import DiagnosticStatus, JointState, Message
-from plow_twin.ros.messages import JointStateWriter, ros_status
+from plow_twin.ros.messages import ros_joint_state, ros_status
 from plow_twin.ros.publishers import TOPICS, OutputPublishers
 from plow_twin.ros.qos import LATCHED
 from plow_twin.ros.subscriptions import Subscriptions
@@ -75,7 +75,7 @@ class RosFront:
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))
-        self._publishers = OutputPublishers(node)
+        self._publishers = OutputPublishers(node, settings.frame_id, settings.child_frame_id)
         made.callback(self._publishers.close)
         self._alarms = node.create_publisher(RosDiagnosticStatus, "alarms", LATCHED)
         made.callback(node.destroy_publisher, self._alarms)
@@ -111,7 +111,7 @@ class RosFront:
 
     def publish_estimate(self, message: JointState) -> None:
         """Publish an estimate."""
-        self._estimates.publish(JointStateWriter(message).write(message))
+        self._estimates.publish(ros_joint_state(message))
 
     def say_error(self, text: str) -> None:
         """Log an error."""

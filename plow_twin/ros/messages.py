@@ -1,24 +1,27 @@
-"""Between ROS messages and plain numbers. Messages to send are made once and written over."""
+"""Between ROS messages and plain numbers. Those sent at each sample are bytes, written over."""
 
 from __future__ import annotations
 
 import struct
 from array import array
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from plow_twin.record import messages as plain
+from plow_twin.record.template import STAMP_AT, Template
 from plow_twin.stream.intake import NS_PER_S
 
 Wrench = tuple[float, float, float]
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
+_STAMP: Final = struct.Struct("<iI")
 #: Stamp and length of the publication's name, then force and torque; big endian and little endian.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
@@ -61,41 +64,38 @@ def ros_status(status: plain.DiagnosticStatus) -> DiagnosticStatus:
     )
 
 
-class JointStateWriter:
-    """One `JointState` of named numbers that is written over for each message."""
-
-    def __init__(self, first: plain.JointState) -> None:
-        self.message = JointState(name=list(first.name))
-        self.message.header.frame_id = first.frame_id
-        self._views: list[tuple[str, NDArray[np.float64]]] = []
-        for quantity in _QUANTITIES:
-            if len(getattr(first, quantity)):
-                setattr(self.message, quantity, array("d", bytes(8 * len(first.name))))
-                # the message's own array, which need not be the one that was set
-                self._views.append((quantity, np.frombuffer(getattr(self.message, quantity))))
-
-    def write(self, message: plain.JointState) -> JointState:
-        """Return the ROS message of the same numbers."""
-        set_stamp(self.message.header, message.stamp_ns)
-        for quantity, view in self._views:
-            view[:] = getattr(message, quantity)
-        return self.message
+def ros_joint_state(message: plain.JointState) -> JointState:
+    """Return the ROS message of named numbers."""
+    found = JointState(name=list(message.name))
+    found.header.frame_id = message.frame_id
+    set_stamp(found.header, message.stamp_ns)
+    for quantity in _QUANTITIES:
+        setattr(found, quantity, array("d", getattr(message, quantity).tobytes()))
+    return found
 
 
-class OdometryWriter:
-    """One `Odometry` that is written over; the covariances stay zero: unknown."""
+class Serializer:
+    """The CDR bytes of messages of one template: rclpy sends them as they are, in a third of the time of an object."""
 
-    def __init__(self, first: plain.Odometry) -> None:
-        self.message = Odometry(child_frame_id=first.child_frame_id)
-        self.message.header.frame_id = first.frame_id
+    def __init__(self, template: Template) -> None:
+        self._bytes = bytearray(template.data.tobytes())
+        # numbers that stand side by side are written at once
+        begins = [0, *(1 + np.flatnonzero(np.diff(template.places) != 8)), template.count]
+        self._views = [
+            np.frombuffer(self._bytes, np.float64, end - begin, int(template.places[begin]))
+            for begin, end in pairwise(begins)
+        ]
 
-    def write(self, message: plain.Odometry) -> Odometry:
-        """Return the ROS message of the same numbers."""
-        set_stamp(self.message.header, message.stamp_ns)
-        pose, twist = self.message.pose.pose, self.message.twist.twist
-        pose.position.x, pose.position.y, pose.position.z = message.position
-        turn = pose.orientation
-        turn.x, turn.y, turn.z, turn.w = message.orientation
-        twist.linear.x, twist.linear.y, twist.linear.z = message.linear
-        twist.angular.x, twist.angular.y, twist.angular.z = message.angular
-        return self.message
+    def write(self, message: plain.JointState | plain.Odometry) -> bytes:
+        """Return the bytes of a message that has the template's names."""
+        _STAMP.pack_into(self._bytes, STAMP_AT, *divmod(message.stamp_ns, NS_PER_S))
+        for view, numbers in zip(self._views, _numbers(message), strict=True):
+            view[:] = numbers
+        return bytes(self._bytes)
+
+
+def _numbers(message: plain.JointState | plain.Odometry) -> list[Sequence[float] | NDArray[np.float64]]:
+    """Return the numbers of a message in the order of its template, those side by side together."""
+    if isinstance(message, plain.JointState):
+        return [part for part in (message.position, message.velocity, message.effort) if len(part)]
+    return [message.position[:2], message.orientation[2:], message.linear[:2], message.angular[2:]]

@@ -1,46 +1,44 @@
-"""The outputs of a publication on ROS topics: the same plain messages that a recording holds, copied field by field."""
+"""The outputs of a publication on ROS topics: the same bytes that a recording holds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Final
 
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry as RosOdometry
 from rclpy.node import Node
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState as RosJointState
 
 from plow_twin.live.runtime import QUALITY
-from plow_twin.record import messages as plain
-from plow_twin.record.outputs import PUBLICATION_TOPICS
-from plow_twin.ros.messages import JointStateWriter, OdometryWriter
+from plow_twin.record.messages import JointState, Message, Odometry
+from plow_twin.record.outputs import PUBLICATION_TOPICS, publication_templates, quality_template
+from plow_twin.ros.messages import Serializer
 from plow_twin.ros.qos import KEPT_OUTPUT, OUTPUT
 
 #: Output topics that follow from the motion, with their types.
 TOPICS: Final[dict[str, type]] = {
-    topic: Odometry if topic == "head_state" else JointState for topic in (*PUBLICATION_TOPICS, QUALITY)
+    topic: RosOdometry if topic == "head_state" else RosJointState for topic in (*PUBLICATION_TOPICS, QUALITY)
 }
 
 
 class OutputPublishers:
-    """Publishers of all outputs of a publication; their messages are written over."""
+    """Publishers of all outputs of a publication."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, frame_id: str, child_frame_id: str) -> None:
         self._node = node
         self._publishers = {
             # sent on change only: a late reader gets those of before
             topic: node.create_publisher(kind, topic, KEPT_OUTPUT if topic == QUALITY else OUTPUT)
             for topic, kind in TOPICS.items()
         }
-        self._writers: dict[str, JointStateWriter | OdometryWriter] = {}
+        templates = publication_templates(frame_id, child_frame_id) | {QUALITY: quality_template(frame_id)}
+        self._serializers = {topic: Serializer(template) for topic, template in templates.items()}
 
-    def publish(self, messages: Mapping[str, plain.Message], forces_sent: Callable[[], None]) -> None:
+    def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:
         """Publish the messages of a publication in their order; `forces_sent` is called right after the forces."""
         for topic, message in messages.items():
-            writer: Any = self._writers.get(topic)
-            if writer is None:
-                kind = OdometryWriter if isinstance(message, plain.Odometry) else JointStateWriter
-                writer = self._writers[topic] = kind(message)  # type: ignore[arg-type]
-            self._publishers[topic].publish(writer.write(message))
+            assert isinstance(message, JointState | Odometry)
+            self._publishers[topic].publish(self._serializers[topic].write(message))
             if topic == "contact_forces":
                 forces_sent()
 

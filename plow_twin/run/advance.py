@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,7 +81,17 @@ class _Rows:
         rows : ndarray of `ROW`, shape (n,), of a batch (m, n)
             What the kernels filled.
         """
-        return cls(times, *(rows[name] for name in _NAMES))
+        made = cls.__new__(cls)
+        made.__dict__.update(t=times, _rows=rows)
+        return made
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        # fields of `of` are taken out of the rows when they are asked for: all of them take longer than one advance
+        if name not in _ROW_NAMES:
+            raise AttributeError(name)
+        found: NDArray[Any] = self.__dict__["_rows"][_ROW_NAMES[name]]
+        self.__dict__[name] = found
+        return found
 
 
 @dataclass(frozen=True)
@@ -91,14 +102,13 @@ class AdvanceSeries(_Rows):
         return len(self.t)
 
     def __getitem__(self, index: int) -> Advance:
-        arrays = {name: getattr(self, name)[index] for name in _ARRAYS}
-        return Advance(
-            t=float(self.t[index]),
-            steps=int(self.steps[index]),
-            status=Status(int(self.status[index])),
-            error_estimate_m=float(self.error_estimate_m[index]),
-            **arrays,
-        )
+        rows = self.__dict__.get("_rows")
+        row = tuple(getattr(self, name)[index] for name in _ROW_NAMES) if rows is None else rows[index].item()
+        made = Advance.__new__(Advance)  # all at once: a frozen class sets its fields one by one
+        made.__dict__.update(zip(_ROW_NAMES, row, strict=True), t=float(self.t[index]))
+        made.__dict__.update(steps=int(made.steps), status=_STATUS[made.status])
+        made.__dict__["error_estimate_m"] = float(made.error_estimate_m)
+        return made
 
 
 @dataclass(frozen=True)
@@ -112,13 +122,15 @@ class AdvanceBatch(_Rows):
         return AdvanceSeries(self.t, *(getattr(self, field.name)[member] for field in fields(_Rows)[1:]))
 
 
-_NAMES: Final = ROW.names or ()
-#: Fields of a row that are arrays.
-_ARRAYS: Final = _NAMES[: _NAMES.index("steps")]
+#: Names in the rows of the kernels, by field.
+_ROW_NAMES: Final = dict(zip((field.name for field in fields(_Rows)[1:]), ROW.names or (), strict=True))
+_STATUS: Final = {int(status): status for status in Status}
 
 
 def check_times(now: float, times: NDArray[np.float64]) -> None:
     """Raise `ValueError` for times that are not finite or go back."""
+    if times.shape == (1,) and now <= times[0] < math.inf:
+        return  # one after the other, as a live twin asks
     if times.ndim != 1 or not np.isfinite(times).all():
         raise ArgumentError(f"t: got {times!r}, expected finite times in s, shape (n,)")
     if len(times) and (times[0] < now or (times[1:] < times[:-1]).any()):

@@ -15,7 +15,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Initial, Scene
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.solve import loop
-from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, per_mass, wear_rate
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
 from plow_twin.solve.state import (
@@ -92,6 +92,9 @@ class Twin:
         self._works[0] = new_work()
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
+        self._inertias = inertias(scene)
+        #: model time, as a view of the state
+        self._time = self._states["time"]
         self._wrench = np.zeros(3)
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
@@ -118,7 +121,7 @@ class Twin:
     @property
     def time(self) -> float:
         """Model time in s."""
-        return float(self._state.time)
+        return float(self._time[0])
 
     def warm_up(self) -> float:
         """Compile every kernel that this scene uses, or load it from the cache on disk; return the seconds it took."""
@@ -188,7 +191,7 @@ class Twin:
         ends = np.concatenate([self._wrench[None], samples])
         loop.advance_batch(
             self._params, self._parts, self._states, self._works, self._all_totals, 0, 1, times,
-            per_mass(self.scene, ends)[None], self._budget, rows[None], self._bound,
+            (ends / self._inertias)[None], self._budget, rows[None], self._bound,
         )  # fmt: skip
         self._wrench = samples[-1].copy() if len(samples) else self._wrench
         return AdvanceSeries.of(times, rows)
@@ -227,7 +230,7 @@ class Twin:
         out = np.zeros(len(t), ROW) if rows else None
         status = np.zeros(len(t), np.int64)
         snapshots = np.zeros(len(marks), STATE)
-        per = per_mass(self.scene, np.concatenate([self._wrench[None], wrench]))
+        per = np.concatenate([self._wrench[None], wrench]) / self._inertias
         loop.advance_marked(
             self._params, self._parts, self._states, self._works, self._all_totals, t, per, self._budget, marks,
             snapshots, status, out,

@@ -9,7 +9,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final
 
@@ -53,11 +53,6 @@ class Thresholds:
                 found = level
         return found
 
-    @property
-    def lowest(self) -> float:
-        """Value below which there is no level."""
-        return min((found for found in (self.warn, self.error) if found > 0.0), default=math.inf)
-
 
 @dataclass
 class Alarm:
@@ -68,23 +63,38 @@ class Alarm:
     level: Level = Level.NONE
     latched: Level = Level.NONE
     _since_ns: int | None = None
+    #: value below which there is no level
+    lowest: float = field(init=False)
 
-    def take(self, value: float, stamp_ns: int, duration_ns: int) -> None:
-        """Take in a value; a level higher than the present one must last for `duration_ns` first."""
+    def __post_init__(self) -> None:
+        thresholds = (self.thresholds.warn, self.thresholds.error)
+        self.lowest = min((found for found in thresholds if found > 0.0), default=math.inf)
+
+    def take(self, value: float, stamp_ns: int, duration_ns: int) -> bool:
+        """Take in a value; a level higher than the present one must last for `duration_ns` first.
+
+        True when the level has changed.
+        """
         self.value = value
-        level = self.thresholds.level(value, self.level)
-        if level <= self.level:
+        before = self.level
+        if not before and value < self.lowest:
+            self._since_ns = None
+            return False
+        level = self.thresholds.level(value, before)
+        if level <= before:
             self.level, self._since_ns = level, None
-            return
+            return level != before
         if self._since_ns is None or stamp_ns < self._since_ns:
             self._since_ns = stamp_ns
-        if stamp_ns - self._since_ns >= duration_ns:
-            self.level, self._since_ns = level, None
-            self.latched = max(self.latched, level)
+        if stamp_ns - self._since_ns < duration_ns:
+            return False
+        self.level, self._since_ns = level, None
+        self.latched = max(self.latched, level)
+        return True
 
     def stays(self, values: NDArray[np.float64]) -> bool:
         """Tell whether none of these values can change a level."""
-        return not self.level and float(values.max(initial=-math.inf)) < self.thresholds.lowest
+        return not self.level and float(values.max(initial=-math.inf)) < self.lowest
 
 
 class _Model:
@@ -144,24 +154,24 @@ class Alarms:
         self._duration_ns = round(duration_s * NS_PER_S)
         self._model = _Model() if "residual" in self.alarms else None
         self._clearances: deque[tuple[int, float]] = deque()
+        #: names of those that the latest take has latched at a higher level
+        self.raised: list[str] = []
 
     def take(self, publication: Publication) -> bool:
         """Take in a publication; True when a level has changed. One without samples says nothing of the machine."""
         if publication.held:
             return False
-        before = self.levels
+        self.raised, stamp_ns, changed = [], publication.stamp_ns, False
         if self._model is not None:
-            for stamp_ns, residual in self._model.add(publication.stamp_ns, *publication.q[:2].tolist()):
-                self.alarms["residual"].take(residual, stamp_ns, self._duration_ns)
-        values = {"force": float(publication.peak.max())}
+            for at_ns, residual in self._model.add(stamp_ns, *publication.q[:2].tolist()):
+                changed |= self._take("residual", residual, at_ns)
+        changed |= self._take("force", float(publication.peak.max()), stamp_ns)
         if publication.slow is not None:
-            values["clearance"] = float(publication.slow.clearance[:2].max())
-            values["wear_rate"] = float(publication.slow.wear_rate.max())
-            values["clearance_rate"] = self._growth(publication.stamp_ns, values["clearance"])
-        for name, value in values.items():
-            if name in self.alarms:
-                self.alarms[name].take(value, publication.stamp_ns, self._duration_ns)
-        return self.levels != before
+            clearance = float(publication.slow.clearance[:2].max())
+            changed |= self._take("clearance", clearance, stamp_ns)
+            changed |= self._take("wear_rate", float(publication.slow.wear_rate.max()), stamp_ns)
+            changed |= self._take("clearance_rate", self._growth(stamp_ns, clearance), stamp_ns)
+        return changed
 
     @property
     def follows_poses(self) -> bool:
@@ -175,7 +185,7 @@ class Alarms:
         values["clearance"] = publications.clearance[:, :2].max(axis=1, initial=-math.inf)
         quiet = all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms)
         growth = self.alarms.get("clearance_rate")
-        if self._model is not None or not quiet or (growth is not None and growth.thresholds.lowest < math.inf):
+        if self._model is not None or not quiet or (growth is not None and growth.lowest < math.inf):
             yield from (index for index in range(len(publications)) if self.take(publications[index]))
             return
         stamps_ns = publications.stamp_ns[publications.slow_index].tolist()
@@ -191,9 +201,18 @@ class Alarms:
         found = None if self._model is None else self._model.residual(stamp_ns, pose[0], pose[1])
         if found is None:
             return False
-        before = self.levels
-        self.alarms["residual"].take(found[1], found[0], self._duration_ns)
-        return self.levels != before
+        self.raised = []
+        return self._take("residual", found[1], found[0])
+
+    def _take(self, name: str, value: float, stamp_ns: int) -> bool:
+        alarm = self.alarms.get(name)
+        if alarm is None:
+            return False
+        latched = alarm.latched
+        changed = alarm.take(value, stamp_ns, self._duration_ns)
+        if alarm.latched > latched:
+            self.raised.append(name)
+        return changed
 
     def _growth(self, stamp_ns: int, clearance: float) -> float:
         """Return by how much the clearance has grown a second [m/s] over the span, or 0 while it has not lasted."""
@@ -210,11 +229,6 @@ class Alarms:
     def levels(self) -> dict[str, tuple[Level, Level]]:
         """Present and latched level of each alarm."""
         return {name: (alarm.level, alarm.latched) for name, alarm in self.alarms.items()}
-
-    @property
-    def latched(self) -> dict[str, Level]:
-        """Highest level of each alarm since it was acknowledged."""
-        return {name: alarm.latched for name, alarm in self.alarms.items()}
 
     @property
     def worst(self) -> Level:

@@ -87,7 +87,7 @@ class History:
 
     def until_snapshot(self, samples: list[Sample]) -> int:
         """Return how many samples can be applied before a snapshot is due."""
-        if not self._span_ns:
+        if not self._span_ns or len(samples) == 1:
             return len(samples)
         if not self._snapshots:
             return 1

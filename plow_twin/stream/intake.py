@@ -55,19 +55,14 @@ class Verdict(Enum):
     #: came before the clock that time is to follow
     NO_CLOCK = "without_clock"
 
-    @property
-    def used(self) -> bool:
-        """Whether the sample is used."""
-        return self in _USED
+    # each is asked some times for each sample: an enumeration's own hash is slow
+    __hash__ = object.__hash__
 
-    @property
-    def resets(self) -> bool:
-        """Whether the model is reset before the sample is used."""
-        return self in _RESETS
-
-
-_USED = frozenset({Verdict.ACCEPTED, Verdict.JUMP_BACK, Verdict.JUMP_FORWARD, Verdict.WORKED_IN})
-_RESETS = frozenset({Verdict.JUMP_BACK, Verdict.JUMP_FORWARD})
+    def __init__(self, name: str) -> None:
+        #: whether the model is reset before the sample is used
+        self.resets = name in ("jump_back", "jump_forward")
+        #: whether the sample is used
+        self.used = self.resets or name in ("accepted", "worked_in")
 
 
 class Intake:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import gt, sub
 from typing import Final
 
 import numpy as np
@@ -27,14 +28,12 @@ class Limits:
 
     def exceeded(self, values: Sequence[float]) -> bool:
         """Tell whether a value is larger than it can be."""
-        return any(abs(value) > largest for value, largest in zip(values, self.largest, strict=True))
+        return any(map(gt, map(abs, values), self.largest))
 
     def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
         """Tell whether a value has changed faster than it can."""
-        return any(
-            abs(value - earlier) > fastest * duration_s
-            for value, earlier, fastest in zip(values, before, self.fastest, strict=True)
-        )
+        most = [fastest * duration_s for fastest in self.fastest]
+        return any(map(gt, map(abs, map(sub, values, before)), most))
 
 
 def excitation_limits(

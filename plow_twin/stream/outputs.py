@@ -69,11 +69,10 @@ class Publication:
     @property
     def finite(self) -> bool:
         """Whether every number is finite."""
-        total = self.q.sum() + self.v.sum() + self.penetration.sum() + self.rate.sum() + self.force.sum()
-        total += self.impulse.sum() + self.peak.sum()
+        parts = [self.q, self.v, self.penetration, self.rate, self.force, self.impulse, self.peak]
         if self.slow is not None:
-            total += self.slow.clearance.sum() + self.slow.wear_rate.sum()
-        return math.isfinite(total)
+            parts += [self.slow.clearance, self.slow.wear_rate]
+        return math.isfinite(np.add.reduce(np.concatenate(parts)))
 
 
 @dataclass(frozen=True)
