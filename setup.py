@@ -22,7 +22,15 @@ EXTRAS = {
     "dask": ["distributed>=2024.1"],
     "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9"],
     "docs": ["mkdocs>=1.6,<2", "mkdocstrings[python]>=0.26"],
-    "test": ["pytest>=8", "pytest-cov", "pytest-timeout", "pytest-xdist", "hypothesis", "amqtt>=0.11"],
+    "test": [
+        "pytest>=8",
+        "pytest-cov",
+        "pytest-timeout",
+        "pytest-xdist",
+        "hypothesis",
+        "amqtt>=0.11",
+        "websockets>=13",
+    ],
 }
 EXTRAS["dev"] = [
     *EXTRAS["docs"],

@@ -1,8 +1,8 @@
 """Start the twin: `ros2 launch plow_twin twin.launch.py scene:=paper record_path:=runs/monday`.
 
 With `autostart:=false` the node waits for lifecycle requests (`ros2 lifecycle set /plow_twin configure`).
-With `view:=plow-twin` a process of its own shows the recording on http://127.0.0.1:9090 while it is made. The program
-may stand in another Python environment (`view:=/opt/viewer/bin/plow-twin`): rerun needs numpy 2, ROS 2 Jazzy has 1.26.
+With `view:=true` a process of its own shows the recording in a browser while it is made; it says where. The program may
+stand in another Python environment (`view:=/opt/viewer/bin/plow-twin`): rerun needs numpy 2, ROS 2 Jazzy has 1.26.
 """
 
 from launch.actions import DeclareLaunchArgument, ExecuteProcess
@@ -21,7 +21,7 @@ ARGUMENTS = {
     "record_path": ("", "folder to make for the recording; empty: none"),
     "use_sim_time": ("false", "take the time from /clock"),
     "autostart": ("true", "configure and activate at start"),
-    "view": ("", "program plow-twin of the environment that has rerun; empty: the run is not shown"),
+    "view": ("", "true, or the program plow-twin of the environment that has rerun; empty: not shown"),
 }
 
 
@@ -50,9 +50,10 @@ def generate_launch_description() -> LaunchDescription:
         "env",
         *(f"--unset={name}" for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")),
     ]
+    program = PythonExpression(["'plow-twin' if '", given["view"], "' == 'true' else '", given["view"], "'"])
     viewer = ExecuteProcess(
-        cmd=[*apart, given["view"], "view", given["record_path"], "--follow", "--wait", "600", "--web"],
-        condition=IfCondition(PythonExpression(["'", given["view"], "' != ''"])),
+        cmd=[*apart, program, "view", given["record_path"], "--follow", "--wait", "600", "--web"],
+        condition=IfCondition(PythonExpression(["'", given["view"], "' not in ('', 'false')"])),
         output="screen",
     )
     arguments = [

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
+import socket
 import struct
 import subprocess
 import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import browser
+import numpy as np
 import pytest
+from PIL import Image
 from record_support import Run, paper_sample, record_run, rewrite
 
 SAMPLES = 600
@@ -115,31 +124,60 @@ def test_view_writes_where_it_is_told(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "picture.rrd").read_bytes()[:4] == b"RRF2"
 
 
-def test_view_serves_a_page_on_the_loopback_address_alone(run: Run, tmp_path: Path) -> None:
-    import socket
-    import time
-    import urllib.request
+def ports_of(address: str) -> list[int]:
+    """The ports of a page and of its data."""
+    return [int(port) for port in re.findall(r"127\.0\.0\.1(?::|%3A)(\d+)", address)]
 
+
+def answers(port: int) -> bool:
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "plow_twin", "view", str(run.folder), "--out", str(tmp_path / "run.rrd"), "--web"]
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.fixture(scope="module")
+def served(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address that `view --web` names, while it serves."""
+    out = tmp_path_factory.mktemp("served") / "run.rrd"
+    command = [sys.executable, "-m", "plow_twin", "view", str(run.folder), "--out", str(out), "--web", "--quiet"]
     process = subprocess.Popen(
-        [*command, "--web-port", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        [*command, "--web-port", "0"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
     try:
+        assert process.stdout is not None
+        address = re.search(r"http://127\.0\.0\.1:\S+", process.stdout.readline())
+        assert address is not None
         deadline = time.monotonic() + 90
-        page = b""
-        while not page and process.poll() is None and time.monotonic() < deadline:
-            try:
-                page = urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5).read()
-            except OSError:
-                time.sleep(0.2)
-        assert b"Rerun" in page
-        listening = {line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]}
-        assert f"0100007F:{port:04X}" in listening and f"00000000:{port:04X}" not in listening
+        for port in ports_of(address[0]):
+            while not answers(port):
+                assert process.poll() is None and time.monotonic() < deadline, "no server"
+                time.sleep(0.1)
+        yield address[0]
     finally:
         process.terminate()
-        process.wait(20)
-    with socket.socket() as probe:
-        assert probe.connect_ex(("127.0.0.1", port)) != 0, "the server has outlived the command"
+        process.communicate(timeout=20)
+    assert not any(map(answers, ports_of(address[0]))), "the server has outlived the command"
+
+
+def test_view_serves_a_page_on_the_loopback_address_alone(served: str) -> None:
+    assert b"Rerun" in urllib.request.urlopen(served, timeout=60).read()
+    listening = {line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]}
+    for port in ports_of(served):
+        assert f"0100007F:{port:04X}" in listening and f"00000000:{port:04X}" not in listening
+
+
+@pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
+def test_a_browser_shows_the_run_at_the_address_that_view_names(served: str, tmp_path: Path) -> None:
+    with browser.page(tmp_path, served) as page:
+        deadline = time.monotonic() + 90
+        # dark is the ground of the cross-sections, which no page of the viewer's own has
+        while _dark(page.picture()) < 0.15:
+            assert time.monotonic() < deadline, f"no picture: {page.errors}, {page.requests}"
+            time.sleep(0.5)
+        assert not page.errors
+        assert any("ReadMessages" in request for request in page.requests)
+
+
+def _dark(png: bytes) -> float:
+    """The share of a picture's dots that have the ground of the cross-sections."""
+    dots = np.asarray(Image.open(BytesIO(png)).convert("RGB")).astype(int)
+    return float((np.abs(dots - (24, 26, 30)).max(axis=2) <= 3).mean())

@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 )
 @click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="A picture instead; needs no viewer.")
 @click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
-@click.option("--web-port", type=click.IntRange(0, 65535), default=9090, show_default=True, help="Its port.")
+@click.option(
+    "--web-port", type=click.IntRange(0, 65535), default=9090, show_default=True, help="Its port; 0: a free one."
+)
 @click.option("--follow", is_flag=True, help="Show a run while it is recorded: in a window, with --web, or into --out.")
 @click.option(
     "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long --follow waits for one [s]."
@@ -77,7 +79,7 @@ def view(
         summary = to_rrd(recording, out, exaggerate=exaggerate, others=_scenes(others), on_progress=on_progress)
     code = _show(recording, out, summary, quiet)
     if web:
-        return _serve(out, web_port, quiet)
+        return _serve(out, web_port)
     if not quiet:
         click.echo(f"look at it with: rerun {out}")
     return code
@@ -110,14 +112,14 @@ def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> in
     return DONE if summary.status in whole and not summary.lost else DONE_WITH_LOSS
 
 
-def _serve(file: Path, port: int, quiet: bool) -> int:
+def _serve(file: Path, port: int) -> int:
     """Serve a .rrd with the viewer's own program on the loopback address until it is interrupted."""
-    from plow_twin.view.viewer import LOOPBACK, viewer_program
+    from plow_twin.view.viewer import LOOPBACK, free_port, page_address, viewer_program
 
-    program = viewer_program()
-    command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", "auto"]
-    if not quiet:
-        click.echo(f"serving on http://{LOOPBACK}:{port} until interrupted")
+    program, data_port = viewer_program(), free_port()
+    port = port or free_port()
+    command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
+    click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
     # in the place of this process: whoever stops it stops the server
     os.execv(program, [*command, "--web-viewer-port", str(port)])

@@ -93,7 +93,7 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop),
             active_tab=0,
         ),
-        row_shares=[5, 1.4, 2.4, 4],
+        row_shares=[5, 1.8, 2.4, 4],
     )
     return rrb.Blueprint(
         rrb.Horizontal(

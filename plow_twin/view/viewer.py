@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 from plow_twin.errors import RecordingError
 
@@ -59,7 +60,7 @@ def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) ->
     RecordingError
         It is not installed or does not answer.
     """
-    port = _free_port()
+    port, web_port = free_port(), free_port() if web_port == 0 else web_port
     command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY, *options]
     if web_port is not None:
         command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
@@ -68,9 +69,7 @@ def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) ->
         command = [bound, "--pdeathsig", "KILL", *command]
     environment = {"RUST_LOG": "warn", **os.environ}
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)
-    url = f"rerun+http://{LOOPBACK}:{port}/proxy"
-    page = f"http://{LOOPBACK}:{web_port}/?url=rerun%2Bhttp%3A%2F%2F{LOOPBACK}%3A{port}%2Fproxy"
-    viewer = Viewer(process, url, "" if web_port is None else page)
+    viewer = Viewer(process, _address(port), "" if web_port is None else page_address(web_port, port))
     deadline = time.monotonic() + _START_S
     while not _answers(port):
         if process.poll() is not None or time.monotonic() > deadline:
@@ -80,7 +79,17 @@ def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) ->
     return viewer
 
 
-def _free_port() -> int:
+def _address(port: int) -> str:
+    return f"rerun+http://{LOOPBACK}:{port}/proxy"
+
+
+def page_address(web_port: int, port: int) -> str:
+    """Return the address of the page that shows the data on a port; without it the page is empty."""
+    return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}"
+
+
+def free_port() -> int:
+    """Return a port of the loopback address that nobody uses."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])

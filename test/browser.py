@@ -1,0 +1,91 @@
+"""A headless Chromium driven by its own protocol: a page opened, looked at as a picture, and its console read."""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import ClientConnection, connect
+
+#: The browser's program, or None.
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+#: What draws WebGL without a graphics card.
+_OPTIONS = (
+    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--remote-debugging-port=0",
+    "--window-size=700,450",
+)  # fmt: skip
+
+
+class Page:
+    """An open page; `requests` are the addresses that it has asked for, `errors` what it has complained of."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket = socket
+        self._number = 0
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        for domain in ("Page", "Network", "Runtime"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **params: Any) -> dict[str, Any]:
+        """Call the browser and return its answer; events that come meanwhile are noted."""
+        self._number += 1
+        self._socket.send(json.dumps({"id": self._number, "method": method, "params": params}))
+        while True:
+            message = json.loads(self._socket.recv(timeout=60.0))
+            if message.get("id") == self._number:
+                assert "error" not in message, message
+                found: dict[str, Any] = message["result"]
+                return found
+            self._note(message)
+
+    def open(self, url: str) -> None:
+        """Go to an address and wait until it has been loaded."""
+        self.call("Page.navigate", url=url)
+        while True:
+            message = json.loads(self._socket.recv(timeout=60.0))
+            self._note(message)
+            if message.get("method") == "Page.loadEventFired":
+                return
+
+    def _note(self, message: dict[str, Any]) -> None:
+        if message.get("method") == "Network.requestWillBeSent":
+            self.requests.append(message["params"]["request"]["url"])
+        elif message.get("method") == "Runtime.exceptionThrown":
+            self.errors.append(str(message["params"]["exceptionDetails"]))
+
+    def picture(self) -> bytes:
+        """Return the page as a PNG."""
+        return base64.b64decode(self.call("Page.captureScreenshot")["data"])
+
+
+@contextmanager
+def page(folder: Path, url: str) -> Iterator[Page]:
+    """Open a page in a browser of its own, whose files lie in `folder`."""
+    assert CHROMIUM is not None
+    command = [CHROMIUM, *_OPTIONS, f"--user-data-dir={folder}", "about:blank"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        place, deadline = folder / "DevToolsActivePort", time.monotonic() + 60.0
+        while not (place.exists() and "\n" in place.read_text()):
+            assert process.poll() is None and time.monotonic() < deadline, "the browser does not answer"
+            time.sleep(0.05)
+        port = place.read_text().split()[0]
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=10) as answer:
+            target = next(one for one in json.load(answer) if one["type"] == "page")
+        with connect(target["webSocketDebuggerUrl"], max_size=None) as socket:
+            opened = Page(socket)
+            opened.open(url)
+            yield opened
+    finally:
+        process.terminate()
+        process.wait(20)
