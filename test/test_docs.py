@@ -50,6 +50,54 @@ def test_every_public_name_is_on_the_reference_page_and_there_is_no_other() -> N
     listed = re.findall(r"^::: plow_twin\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
     assert len(listed) == len({*listed}) > 30
     assert {*listed} == public_names()
+    assert all(hasattr(plow_twin, name) for name in listed)
+
+
+def test_every_page_is_in_the_site_s_contents() -> None:
+    contents = (ROOT / "mkdocs.yml").read_text().partition("nav:")[2]
+    made = {"index.md", "examples.md"}
+    assert {*re.findall(r": (\w+\.md)$", contents, re.MULTILINE)} == made | {
+        page.name for page in (ROOT / "docs").glob("*.md")
+    }
+
+
+def test_the_figures_of_the_short_pages_are_those_measured() -> None:
+    """`make bench` rewrites the log; what README and the short page quote must stand there."""
+    log = (ROOT / "docs" / "benchmark_log.md").read_text()
+    start = log.index("**KV, 20 s, output each 0.1 s**")
+    measured = [line.split(" | ") for line in log[start:].split("\n\n")[1].splitlines()[2:]]
+    rows = {float(row[0].removeprefix("| ")): row for row in measured}
+    for page, sign in ((ROOT / "README.md", " x"), (ROOT / "docs" / "benchmark.md", "x")):
+        quoted = re.findall(r"^\| (\S+) \| ([\d.]+) ms \| (.*) \|$", page.read_text(), re.MULTILINE)
+        assert len(quoted) == 3, page
+        for error, wall, peers in quoted:
+            row = rows[float(error)]
+            assert row[1] == f"{wall} ms"
+            for cell, peer in zip((row[4], row[5], row[6], row[8]), peers.split(" | "), strict=True):
+                assert peer == cell == "not reached" or f"**{peer.removesuffix(sign)}x**" in cell, (page, error, peer)
+    for text in ("1447 times real time", "0.24 of a core", "1.88 s at", "0.18 of a core", "not reached"):
+        assert text in log
+
+
+def test_the_picture_of_the_rooms_is_the_script_s() -> None:
+    made = runpy.run_path(str(ROOT / "tools" / "architecture.py"))
+    assert made["OUT"].read_text() == made["drawing"]()
+    rooms = {name for row in made["ROOMS"] for name, _ in row}
+    folders = {path.parent.name for path in (ROOT / "plow_twin").glob("*/__init__.py")}
+    assert folders <= rooms
+
+
+def test_the_tutorial_s_scene_is_the_example_s() -> None:
+    (scene,) = blocks(ROOT / "docs" / "tutorial.md", "yaml")
+    assert scene == (ROOT / "examples" / "first_scene" / "scene.yaml").read_text()
+
+
+def test_every_test_that_shows_a_promise_exists() -> None:
+    text = (ROOT / "docs" / "operators.md").read_text()
+    named = re.findall(r"`(test_\w+\.py)::(\w+)`", text)
+    assert len(named) > 60
+    sources = {file: (ROOT / "test" / file).read_text() for file, _ in named}
+    assert [(file, test) for file, test in named if f"def {test}(" not in sources[file]] == []
     rows = [row for row in text.splitlines() if row.startswith("| ") and "shown by" not in row]
     assert all("::test_" in row or "benchmark/" in row for row in rows)
 
