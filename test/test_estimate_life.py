@@ -59,12 +59,19 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     file = tmp_path / "scene.yaml"
     file.write_text(dump_scene(scene))
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34", "--horizon", "20000", "--stop", "1000", "--json"]
-    command = [sys.executable, "-m", "plow_twin", "forecast", str(file), *limits]
+    picture = tmp_path / "plots" / "forecast.png"
+    command = [sys.executable, "-m", "plow_twin", "forecast", str(file), *limits, "--plot", str(picture)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=110)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["p50"]["passes"] == pytest.approx(facts["p50"]["km"] * 1000.0 / 250.0)
     assert 0.0 <= facts["probability_before_stop"] <= 1.0
+    assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+    # the clearance is at its limit when the limit is reached
+    now = life.clearances(np.zeros(1))[1, 0]
+    assert now == pytest.approx([0.025, 0.030], abs=1e-9)
+    late = life.clearances(np.array([0.99 * p50]))[1, 0]
+    assert max(late - [0.028, 0.034]) == pytest.approx(0.0, abs=3e-4)
 
 
 def test_a_scene_without_wear_or_period_is_refused() -> None:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     "the wear coefficient and the clearances now.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
+@click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="PNG of clearances and probability.")
 @json_option
 @quiet_option
 def forecast(
@@ -52,6 +53,7 @@ def forecast(
     estimated: Path | None,
     history: Path | None,
     seed: int,
+    plot: Path | None,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -70,13 +72,20 @@ def forecast(
     with busy("forecasting", quiet or as_json):
         if history is None:
             model, deviation = _now(model, facts_now)
-            facts = run(model, plan, deviation).as_dict()
+            found = run(model, plan, deviation)
+            facts = found.as_dict()
         else:
             known = coefficient(model, _history(history))
             low, high = (float(value) for value in known.deviation)
             model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]))
-            facts = run(model, plan, (low, high), known).as_dict()
+            found = run(model, plan, (low, high), known)
+            facts = found.as_dict()
             facts["coefficient_m2_n"] = asdict(known.interval())
+    if plot is not None:
+        from plow_twin.view.forecast import draw_forecast
+
+        plot.parent.mkdir(parents=True, exist_ok=True)
+        draw_forecast(found, plot)
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:

@@ -44,9 +44,13 @@ class Forecast:
 
     hours : (draws,) sorted; infinite where the limit is not reached within the horizon
     path : the wear as it goes on at the clearances believed
+    rate : (draws,) exposure in an hour in 1/N
+    now : (draws, 2) clearances now in m
     """
 
     hours: Array
+    rate: Array
+    now: Array
     speed_m_s: float
     plan: Plan
     path: Path
@@ -59,6 +63,19 @@ class Forecast:
     def probability_before(self, hours: float) -> float:
         """Return the probability that the limit is reached before a time."""
         return float(np.mean(self.hours <= hours))
+
+    def clearances(self, hours: Array) -> Array:
+        """Return P10, P50 and P90 of both clearances in m after some hours, shape (3, n, 2).
+
+        Infinite beyond the end of the path, where a limit has been reached.
+        """
+        grown = self.path.clearance_growth()
+        exposure = np.multiply.outer(self.rate, hours)
+        each = [
+            self.now[:, axis, None] + np.interp(exposure, self.path.exposure, grown[:, axis], right=np.inf)
+            for axis in range(2)
+        ]
+        return np.quantile(np.stack(each, axis=2), (0.1, 0.5, 0.9), axis=0, method="lower")
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON; null stands for `not reached in the horizon`."""
@@ -132,8 +149,10 @@ def forecast(
             for axis, limit_m in enumerate((plan.limit_horizontal_m, plan.limit_vertical_m))
         ]
     ).min(axis=0)
-    hours = needed * wear.pad_area_m2 / (coefficient * load * wear.travel_speed_m_s) / HOUR_S
-    return Forecast(np.where(hours <= plan.horizon_h, hours, np.inf), wear.travel_speed_m_s, plan, path)
+    rate = coefficient * load * wear.travel_speed_m_s * HOUR_S / wear.pad_area_m2
+    hours = needed / rate
+    reached = np.where(hours <= plan.horizon_h, hours, np.inf)
+    return Forecast(reached, rate, size + now, wear.travel_speed_m_s, plan, path)
 
 
 def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:

@@ -1,0 +1,60 @@
+"""The picture of a forecast: the clearances as they may grow, and when the first of them reaches its limit."""
+
+from __future__ import annotations
+
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from plow_twin.estimate.forecast import Forecast
+
+#: Moments at which the clearances are drawn.
+_MOMENTS = 120
+_COLOURS = ("#1f4e9c", "#d62728")
+
+
+def draw_forecast(found: Forecast, path: FilePath) -> None:
+    """Write a PNG: P10, P50 and P90 of both clearances over time, and the probability that a limit is reached."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2)
+    plan = found.plan
+    reached = found.hours[np.isfinite(found.hours)]
+    # where all is reached now there is no time to show
+    last = 1.3 * float(np.quantile(reached, 0.95)) if len(reached) else 0.0
+    end = min(plan.horizon_h, last) if last > 0.0 else plan.horizon_h
+    hours = np.linspace(0.0, end, _MOMENTS)
+    growing = 1e3 * found.clearances(hours)
+    limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
+    for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
+        # infinite where a limit is behind
+        low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
+        middle[~np.isfinite(growing[1, :, axis])] = np.nan
+        left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)
+        left.plot(hours, middle, color=colour, label=f"{name}, P10 to P90")
+        left.axhline(1e3 * limit, color=colour, linestyle="--", linewidth=1.0)
+    left.set(
+        xlabel="hours of operation", ylabel="clearance [mm]", title="Clearances; their limits dashed", xlim=(0.0, end)
+    )
+    left.legend(loc="lower right")
+    share = np.searchsorted(np.sort(found.hours), hours, side="right") / len(found.hours)
+    right.plot(hours, 100.0 * share, color="black")
+    for name, quantile in (("P10", 0.1), ("P50", 0.5), ("P90", 0.9)):
+        at = found.quantile(quantile)
+        if at is not None and at <= end:
+            right.plot([at, at], [0.0, 100.0 * quantile], color="grey", linewidth=1.0)
+            right.annotate(
+                f"{name} {at:.0f} h", (at, 100.0 * quantile), xytext=(4.0, -10.0), textcoords="offset points"
+            )
+    if plan.stop_h is not None and plan.stop_h <= end:
+        right.axvline(plan.stop_h, color="#1b7837", linestyle=":", label="planned stop")
+        right.legend(loc="upper left")
+    missed = 100.0 * float(np.mean(~np.isfinite(found.hours)))
+    right.set(xlabel="hours of operation", ylabel="probability that a limit is reached [%]", xlim=(0.0, end))
+    right.set(ylim=(0.0, 102.0), title=f"Not reached in {plan.horizon_h:g} h: {missed:.0f} %")
+    figure.savefig(path, dpi=110, format="png")
