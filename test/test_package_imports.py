@@ -30,7 +30,7 @@ ROOMS = {
     "stream": CORE,
     "estimate": CORE,
     "record": CORE | {"build", "scene_file", "stream", "estimate"},
-    "view": CORE | {"scene_file", "stream", "record"},
+    "view": CORE | {"scene_file", "stream", "estimate", "record"},
     "study": CORE | {"build", "scene_file", "stream", "record", "view"},
     "live": CORE | {"scene_file", "stream", "estimate", "record"},
     "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "live"},
