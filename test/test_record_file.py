@@ -7,6 +7,7 @@ import math
 import random
 import re
 import runpy
+import struct
 import subprocess
 import sys
 from collections import Counter
@@ -30,6 +31,7 @@ from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, to_message
 from plow_twin.record.messages import JointState, Odometry, WrenchStamped
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
+from plow_twin.record.replay import replay
 from plow_twin.stream.journal import (
     Digest,
     Entry,
@@ -191,6 +193,62 @@ def test_a_damaged_byte_costs_one_chunk_and_is_reported(run: Run, tmp_path: Path
         rest = iter(whole)
         assert 0 < len(records) < len(whole)
         assert all(record in rest for record in records)  # in order, none invented
+
+
+def write_large(source: Path, target: Path, images: int, image_size: int, attachments: int) -> None:
+    """Copy a recording with somebody's camera and large attachments in it; their bytes are holes in the file."""
+
+    def text(value: str) -> bytes:
+        return struct.pack("<I", len(value)) + value.encode()
+
+    data = source.read_bytes()
+    head = 8
+    for _ in range(2):  # the file's header, and that of the run
+        head += 9 + struct.unpack_from("<Q", data, head + 1)[0]
+    schema = struct.pack("<H", 60_000) + text("sensor_msgs/msg/Image") + text("ros2msg") + text("uint8[] data")
+    channel = struct.pack("<HH", 60_000, 60_000) + text("/camera") + text("cdr") + struct.pack("<I", 0)
+    with target.open("wb") as out:
+        out.write(data[:head])
+        for opcode, record in ((3, schema), (4, channel)):
+            out.write(struct.pack("<BQ", opcode, len(record)) + record)
+        for _ in range(attachments):
+            out.write(struct.pack("<BQ", 9, 300_000_000))
+            out.seek(300_000_000, 1)
+        for _ in range(images):
+            size = 31 + image_size
+            out.write(struct.pack("<BQQQQIIQ", 6, 40 + size, 0, 0, size, 0, 0, size))
+            out.write(struct.pack("<BQHIQQ", 5, 22 + image_size, 60_000, 0, 0, 0))
+            out.seek(image_size, 1)
+        out.write(data[head:])
+
+
+def check_large(run: Run, folder: Path, images: int, image_size: int, attachments: int) -> int:
+    """Replay such a recording in a process of its own; return the most memory that it took [B]."""
+    file = folder / "large.mcap"
+    write_large(run.file, file, images, image_size, attachments)
+    code = (
+        "import resource, sys; from pathlib import Path; from plow_twin.record.replay import replay\n"
+        "report = replay(Path(sys.argv[1]))\n"
+        "most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "print(report.exit_code, report.messages_compared, 1024 * most)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(file)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    code_, compared, most = map(int, done.stdout.split())
+    assert (code_, compared) == (0, replay(run.folder).messages_compared)
+    return most
+
+
+def test_attachments_and_other_topics_of_any_size_are_passed_over(run: Run, tmp_path: Path) -> None:
+    check_large(run, tmp_path, images=2, image_size=1_000_000, attachments=1)
+
+
+@pytest.mark.stress
+def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) -> None:
+    small = check_large(run, tmp_path, images=0, image_size=0, attachments=0)
+    large = check_large(run, tmp_path, images=50, image_size=80_000_000, attachments=20)
+    assert (tmp_path / "large.mcap").stat().st_size > 10_000_000_000
+    assert large - small < 5 * 80_000_000
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.journal import Entry, Pose
+from plow_twin.study.analysis import thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
 from plow_twin.study.analysis.loads import reversals
 
@@ -155,6 +158,16 @@ def test_a_run_of_ours_is_analysed_by_its_journal(tmp_path: Path) -> None:
     assert found.predictions[0].loads.duration_s == pytest.approx(0.999)
 
 
+def test_poses_in_the_journal_are_measured_ones(tmp_path: Path) -> None:
+    entries: list[Entry] = [paper_sample(index) for index in range(500)]
+    entries[20::21] = [Pose(BASE_NS + index * STEP_NS, (1e-3, 2e-3, 3e-3)) for index in range(20, 500, 21)]
+    run = record_run(tmp_path / "run", entries)
+    found = analyse(run.folder)
+    assert {name: one.n for name, one in found.comparisons(found.predictions[0]).items()} == dict.fromkeys(
+        ("x", "y", "theta"), len(range(20, 500, 21))
+    )
+
+
 def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
     with (tmp_path / "load.csv").open("w") as stream:
         stream.write("t,fx,fy,m\n")
@@ -255,6 +268,20 @@ def test_mutated_files_give_an_error_or_counted_loss(motion: tuple[np.ndarray, .
 @pytest.mark.timeout(3600)
 def test_mutated_files_many_times(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
     mutate_many(tmp_path, motion, range(1000, 11_000))
+
+
+def test_rows_beyond_what_fits_are_kept_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thinned, "MOST_ROWS", 100)
+    rows, signal = thinned.Thinned(1), thinned.ThinnedSignal()
+    for begin, end in pairwise((0, 1, 70, 71, 350, 900, 901)):
+        stamps = np.arange(begin, end)
+        rows.add(stamps, 2.0 * stamps[:, None])
+    for stamp in range(901):
+        signal.add(stamp, 2.0 * stamp)
+    assert (rows.rows, rows.stride) == (901, 16)
+    for stamps, values in (rows.series(), signal.series()):
+        np.testing.assert_array_equal(stamps, np.arange(0, 901, 16))
+        np.testing.assert_array_equal(values.ravel(), 2.0 * stamps)
 
 
 def test_turning_points_keep_peaks_and_ends() -> None:

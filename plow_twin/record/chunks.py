@@ -28,6 +28,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 #: A longer record, or a chunk that says it holds more, is damage [B].
 RECORD_LIMIT: Final = 256 * 1024 * 1024
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
+_ATTACHMENT: Final = 0x09
 _HEAD: Final = struct.Struct("<BQ")
 _INDEX_HEAD: Final = struct.Struct("<BQH")
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
@@ -119,7 +120,7 @@ class ChunkReader:
                 head = os.pread(descriptor, _HEAD.size, place)
                 opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
                 begin = place + _HEAD.size
-                if length > RECORD_LIMIT:
+                if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
                 if begin + length > size:
                     if self.more is None:

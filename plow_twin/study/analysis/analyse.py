@@ -25,14 +25,21 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.journal import Pose
+from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis.loads import LoadTotals
 from plow_twin.study.analysis.signals import Comparison, compare
+from plow_twin.study.analysis.thinned import Thinned, ThinnedSignal
 
 Array = NDArray[np.float64]
 
 #: Columns of the prediction that are kept for the comparison.
-_POSE: Final = ("x", "y", "theta")
+_COLUMNS: Final = (
+    *("x", "y", "theta"),
+    *(f"force_{name}" for name in PAIR_NAMES),
+    *(f"gap_{name}" for name in PAIR_NAMES),
+)
 #: Tolerance of a run that is made of another recording.
 _TOLERANCE: Final = 1e-9
 #: Receives the share of the work done, 0..1.
@@ -41,53 +48,54 @@ OnProgress = Callable[[float], object]
 
 @dataclass
 class Prediction:
-    """What one scene predicts: rows by stretch without a reset, and the sums of its contacts."""
+    """What one scene predicts: its rows, and the sums of its contacts over all of them."""
 
     name: str
     scene: Scene
     loads: LoadTotals
-    stretches: list[list[Walked]] = field(default_factory=lambda: [[]])
+    longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
+    present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
+    #: clearance under `CLEARANCE_NAMES`, of all stretches without a reset
+    clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
     def walked(self, part: Walked) -> None:
         """Take in a batch."""
         self.loads.add(part)
-        self.stretches[-1].append(part)
+        rows, published = part.rows, part.publications
+        self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, rows.penetration)))
+        self.clearance.add(published.stamp_ns[published.slow_index], published.clearance)
 
     def restart(self) -> None:
         """Begin a new stretch: the stamps may go back."""
         self.loads.restart()
-        if self.stretches[-1]:
-            self.stretches.append([])
+        self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
+
+    def _longer(self) -> Thinned:
+        return self.present if self.present.rows > self.longest.rows else self.longest
 
     def series(self) -> tuple[NDArray[np.int64], dict[str, Array]]:
         """Return stamps and columns of the longest stretch."""
-        longest = max(self.stretches, key=lambda parts: sum(len(part.stamp_ns) for part in parts))
-        if not longest:
-            return np.zeros(0, np.int64), {}
-        stamps = np.concatenate([part.stamp_ns for part in longest])
-        pose = np.concatenate([part.rows.q for part in longest])
-        force = np.concatenate([part.rows.force for part in longest])
-        penetration = np.concatenate([part.rows.penetration for part in longest])
-        columns = {name: pose[:, index] for index, name in enumerate(_POSE)}
-        columns |= {f"force_{name}": force[:, pair] for pair, name in enumerate(PAIR_NAMES)}
-        columns |= {f"gap_{name}": penetration[:, pair] for pair, name in enumerate(PAIR_NAMES)}
-        return stamps, columns
+        stamps, columns = self._longer().series()
+        return stamps, {name: columns[:, place] for place, name in enumerate(_COLUMNS)} if len(stamps) else {}
+
+    @property
+    def stride(self) -> int:
+        """One of so many rows of the longest stretch is kept for the signals."""
+        return self._longer().stride
 
 
 @dataclass
 class Measured:
-    """Measured values by signal, as they came."""
+    """Measured values by signal, as they came; of very many every second, fourth, ... is kept."""
 
-    stamps: dict[str, list[int]] = field(default_factory=dict)
-    values: dict[str, list[float]] = field(default_factory=dict)
+    signals: dict[str, ThinnedSignal] = field(default_factory=dict)
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float]) -> None:
         """Take in the numbers of one message; what is not finite was not measured."""
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
         for name, value in numbers.items():
             if math.isfinite(value) and stamp_ns > 0:
-                self.stamps.setdefault(prefix + name, []).append(stamp_ns)
-                self.values.setdefault(prefix + name, []).append(value)
+                self.signals.setdefault(prefix + name, ThinnedSignal()).add(stamp_ns, value)
 
 
 @dataclass
@@ -117,10 +125,10 @@ class Analysis:
         times = (stamps - stamps[0]) * 1e-9
         rising = np.concatenate(([True], np.diff(times) > 0.0))
         for name, column in columns.items():
-            if name not in self.measured.stamps:
+            if name not in self.measured.signals:
                 continue
-            t_measured = (np.array(self.measured.stamps[name], np.int64) - stamps[0]) * 1e-9
-            one = compare(times[rising], column[rising], t_measured, np.array(self.measured.values[name]))
+            at, values = self.measured.signals[name].series()
+            one = compare(times[rising], column[rising], (at - stamps[0]) * 1e-9, values)
             if one is not None:
                 found[name] = one
         return found
@@ -143,6 +151,8 @@ class Analysis:
     def _prediction(self, prediction: Prediction) -> dict[str, Any]:
         signals = {name: found.facts() for name, found in self.comparisons(prediction).items()}
         facts: dict[str, Any] = {"signals": signals, "loads": prediction.loads.facts()}
+        if prediction.stride > 1:
+            facts["signals_of_one_row_in"] = prediction.stride
         confusion = self._confusion(prediction)
         return facts if confusion is None else facts | {"contact_set_confusion": confusion}
 
@@ -152,14 +162,13 @@ class Analysis:
         found = {}
         for name in PAIR_NAMES:
             key = f"force_{name}"
-            if key not in self.measured.stamps or not len(stamps):
+            if key not in self.measured.signals or not len(stamps):
                 continue
-            at = np.array(self.measured.stamps[key], np.int64)
+            at, values = self.measured.signals[key].series()
             inside = (at >= stamps[0]) & (at <= stamps[-1])
             place = np.minimum(np.searchsorted(stamps, at[inside]), len(stamps) - 1)
             predicted = columns[key][place] > 0.0
-            largest = max(1.0, float(np.max(np.abs(self.measured.values[key]))))
-            measured = np.array(self.measured.values[key])[inside] > 0.01 * largest
+            measured = values[inside] > 0.01 * max(1.0, float(np.max(np.abs(values))))
             found[name] = {
                 "both": int((predicted & measured).sum()),
                 "predicted_only": int((predicted & ~measured).sum()),
@@ -252,6 +261,7 @@ def _walk_own(
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
     walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part)
+    journalled = Measured()  # where the node estimates
 
     def so_far() -> Analysis:
         losses = {topic: count for topic, count in reader.lost.items() if count}
@@ -260,10 +270,14 @@ def _walk_own(
         if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
             losses[reader.status.value] = 1
         measured, unknown = _measured_beside(path, mapping, header.node)
+        measured.signals = journalled.signals | measured.signals
         return Analysis(reader.path, "run", predictions, measured, {"samples_used": walk.used}, losses, unknown)
 
     for batch in reader.batches(outputs=False):
         walk.add(batch.entries)
+        for _, entry in sorted(batch.entries.others.items()):
+            if isinstance(entry, Pose):
+                journalled.add("head_pose", entry.stamp_ns, dict(zip(("x", "y", "theta"), entry.pose, strict=True)))
         if not len(batch.entries) and reader.tail is not None:
             on_caught_up(so_far())
         if on_progress is not None:

@@ -21,7 +21,7 @@ _PAGE: Final = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ facts.run }}</title>
 <style>body{font:15px/1.5 system-ui,sans-serif;margin:2em auto;max-width:70em;padding:0 1em;color:#222}
 table{border-collapse:collapse;margin:1em 0}td,th{border:1px solid #ccc;padding:.25em .6em;text-align:right}
-th:first-child,td:first-child{text-align:left}img{max-width:100%}</style></head><body>
+th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style></head><body>
 <h1>{{ facts.run }}</h1>
 <p>{{ facts.kind }}; {{ facts.input.samples_used }} samples used, {{ "%.1f" | format(facts.loads.duration_s) }} s.
 {% if facts.lost %}Lost: {{ facts.lost }}.{% endif %}
@@ -45,12 +45,14 @@ th:first-child,td:first-child{text-align:left}img{max-width:100%}</style></head>
 <table><tr><th>pass</th><th>from [s]</th><th>to [s]</th><th>from [m]</th><th>to [m]</th><th>impacts</th>
 <th>largest force [kN]</th><th>taken by contacts [kJ]</th></tr>{% for p in part.loads.passes %}
 <tr><td>{{ loop.index }}</td><td>{{ "%.1f" | format(p.start_s) }}</td><td>{{ "%.1f" | format(p.end_s) }}</td>
-<td>{{ "%.1f" | format(p.start_m) }}</td><td>{{ "%.1f" | format(p.end_m) }}</td><td>{{ p.impacts }}</td>
+<td>{{ "%.1f" | format(p.start_m | round(1) + 0) }}</td><td>{{ "%.1f" | format(p.end_m | round(1) + 0) }}</td>
+<td>{{ p.impacts }}</td>
 <td>{{ "%.2f" | format(p.largest_force_n / 1e3) }}</td><td>{{ "%.3f" | format(p.contact_loss_j / 1e3) }}</td>
 </tr>{% endfor %}</table>
 <h3>Rainflow counts of the contact force</h3>
 <table><tr><th>pair</th><th>range up to [kN]: cycles</th></tr>{% for name, bins in part.loads.cycles.items() %}
-<tr><td>{{ name }}</td><td>{% for b in bins %}{% if b.count %}{{ "%.1f" | format(b.range_n / 1e3) }}: {{ b.count }};
+<tr><td>{{ name }}</td><td class="long">
+{% for b in bins %}{% if b.count %}{{ "%.1f" | format(b.range_n / 1e3) }}: {{ b.count }};
 {% endif %}{% endfor %}</td></tr>{% endfor %}</table>
 {% endfor %}
 <h2>Course</h2><img alt="Pose and forces in time" src="data:image/png;base64,{{ picture }}">
@@ -86,15 +88,10 @@ def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
     stamps, columns = prediction.series()
     if len(stamps):
         parquet.write_table(pa.table({"stamp_ns": stamps, **columns}), out / f"predicted{suffix}.parquet")
-    clearance = [
-        (part.publications.stamp_ns[part.publications.slow_index], part.publications.clearance)
-        for parts in prediction.stretches
-        for part in parts
-    ]
-    if clearance:
+    times, values = prediction.clearance.series()
+    if len(times):
         from plow_twin.stream.outputs import CLEARANCE_NAMES
 
-        times, values = (np.concatenate(column) for column in zip(*clearance, strict=True))
         table = {"stamp_ns": times} | {name: values[:, index] for index, name in enumerate(CLEARANCE_NAMES)}
         parquet.write_table(pa.table(table), out / f"clearance{suffix}.parquet")
     if prediction.loads.face:
@@ -108,14 +105,14 @@ def _write_measured(found: Analysis, out: Path) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    measured = found.measured
-    if not measured.stamps:
+    series = {name: signal.series() for name, signal in found.measured.signals.items()}
+    if not series:
         return
-    names = [name for name, stamps in measured.stamps.items() for _ in stamps]
+    places = np.repeat(np.arange(len(series), dtype=np.int32), [len(stamps) for stamps, _ in series.values()])
     table = {
-        "signal": pa.array(names).dictionary_encode(),
-        "stamp_ns": np.concatenate([np.array(stamps, np.int64) for stamps in measured.stamps.values()]),
-        "value": np.concatenate([np.array(values) for values in measured.values.values()]),
+        "signal": pa.DictionaryArray.from_arrays(places, list(series)),
+        "stamp_ns": np.concatenate([stamps for stamps, _ in series.values()]),
+        "value": np.concatenate([values for _, values in series.values()]),
     }
     parquet.write_table(pa.table(table), out / "measured.parquet")
 
@@ -142,10 +139,10 @@ def _picture(found: Analysis) -> str:
         force = np.max([columns[f"force_{pair}"][:count] for pair in PAIR_NAMES], axis=0).reshape(-1, thin).max(axis=1)
         axes[3].plot(times[:count:thin], force / 1e3, lw=0.7, label=label)
     for axis, name in zip(axes, ("x", "y", "theta"), strict=False):
-        if name in found.measured.stamps and start is not None:
-            at = (np.array(found.measured.stamps[name], np.int64) - start) * 1e-9
-            thin = max(1, len(at) // _MOST_POINTS)
-            axis.plot(at[::thin], found.measured.values[name][::thin], ".", ms=1.5, color="0.3", label="measured")
+        if name in found.measured.signals and start is not None:
+            stamps, values = found.measured.signals[name].series()
+            at, thin = (stamps - start) * 1e-9, max(1, len(stamps) // _MOST_POINTS)
+            axis.plot(at[::thin], values[::thin], ".", ms=1.5, color="0.3", label="measured")
     for axis, text in zip(axes, ("x [m]", "y [m]", "theta [rad]", "largest force [kN]"), strict=True):
         axis.set_ylabel(text)
         axis.legend(loc="upper right", fontsize=8)

@@ -1,0 +1,62 @@
+"""Rows and values in bounded memory: of more than fit, every second, then every fourth, ... is kept."""
+
+from __future__ import annotations
+
+from array import array
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Rows that are kept: 150 MB of a prediction, 16 MB of a measured signal.
+MOST_ROWS: Final = 1_000_000
+
+
+class Thinned:
+    """Rows of some columns with their stamps; `rows` came, one in `stride` is kept."""
+
+    def __init__(self, columns: int) -> None:
+        self._stamps: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+        self._values: list[Array] = [np.zeros((0, columns))]
+        self._kept = self.rows = 0
+        self.stride = 1
+
+    def add(self, stamp_ns: NDArray[np.int64], values: Array) -> None:
+        """Take in rows, shapes (n,) and (n, columns)."""
+        chosen = slice(-self.rows % self.stride, None, self.stride)
+        self._stamps.append(stamp_ns[chosen].copy())
+        self._values.append(values[chosen].copy())
+        self.rows += len(stamp_ns)
+        self._kept += len(self._stamps[-1])
+        while self._kept > MOST_ROWS:
+            stamps, kept = self.series()
+            self._stamps, self._values = [stamps[::2].copy()], [kept[::2].copy()]
+            self._kept, self.stride = len(self._stamps[0]), 2 * self.stride
+
+    def series(self) -> tuple[NDArray[np.int64], Array]:
+        """Return the stamps [ns] and the rows that are kept, shapes (m,) and (m, columns)."""
+        self._stamps, self._values = [np.concatenate(self._stamps)], [np.concatenate(self._values)]
+        return self._stamps[0], self._values[0]
+
+
+class ThinnedSignal:
+    """Values with their stamps, one at a time."""
+
+    def __init__(self) -> None:
+        self._stamps, self._values = array("q"), array("d")
+        self._came, self._stride = 0, 1
+
+    def add(self, stamp_ns: int, value: float) -> None:
+        """Take in a value."""
+        if self._came % self._stride == 0:
+            self._stamps.append(stamp_ns)
+            self._values.append(value)
+        self._came += 1
+        if len(self._stamps) > MOST_ROWS:
+            self._stamps, self._values, self._stride = self._stamps[::2], self._values[::2], 2 * self._stride
+
+    def series(self) -> tuple[NDArray[np.int64], Array]:
+        """Return the stamps [ns] and the values that are kept, shape (m,) each."""
+        return np.array(self._stamps, np.int64), np.array(self._values)
