@@ -20,6 +20,8 @@ from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.measurements import EstimateError, Load, Poses
 from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.estimate.unknowns import GAIN, Spread, Unknowns
+from plow_twin.model.loads import compile_loads
 
 __all__ = ["motion"]  # a fixture
 
@@ -162,6 +164,20 @@ def test_a_wall_never_touched_is_not_observable() -> None:
     assert result.horizontal_state is not State.ESTIMATED
     assert result.horizontal.p05 <= scene.clearance.horizontal_m <= result.horizontal.p95
     assert result.horizontal.p95 - result.horizontal.p05 > 0.01
+
+
+def test_what_is_stated_of_the_measurements_is_believed() -> None:
+    """Noise is not taken to be less than stated, and intervals follow; so does the prior of the load's gains."""
+    scene = preset("paper")
+    t = np.arange(0.0, 10.0, 0.01)
+    wrench = compile_loads(scene.loads).at(t)
+    run = simulate(scene, 9.9, 0.02, 1e-6)
+    poses, _ = Poses.of(run.t, run.q, (1e-3, 1e-3, 4e-3))
+    load, _ = Load.of(t, wrench, (0.0, 0.0, 1.0 * float(np.sqrt((wrench[:, 2] ** 2).mean()))))
+    assert Unknowns(scene, Spread.stated(load, poses)).deviations()[GAIN].tolist() == [0.07, 0.07, 1.0]
+    result = estimate(scene, load, poses)
+    assert result.noise == (1e-3, 1e-3, 4e-3)
+    assert result.horizontal.p95 - result.horizontal.p05 > 1e-4
 
 
 def test_a_bag_is_read_by_its_mapping(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from plow_twin.live.part import Part
 from plow_twin.live.solver_start import Preparation
 from plow_twin.record.doctor import examine
 from plow_twin.record.mapping import read_map, time_ns
+from plow_twin.record.measured import read_recording
 from plow_twin.record.reader import EntryRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import Arrived
@@ -108,7 +109,10 @@ def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> N
     path = tmp_path / "all.csv"
     path.write_text("t,fx,fy,m,x,y,theta,top_left_top\n" + "\n".join(rows) + "\n")
     (tmp_path / "map.yaml").write_text("excitation: {topic: all}\nhead_pose: {topic: all}\ngaps: {topic: all}\n")
-    values = _run(path, tmp_path / "map.yaml", record_path=str(tmp_path / "run"))["input"][2]
+    stated = {"head_pose_deviation": [1e-4, 2e-4, 3e-4], "excitation_deviation": [1e3, 0.0, 2e3]}
+    values = _run(path, tmp_path / "map.yaml", record_path=str(tmp_path / "run"), **stated)["input"][2]
+    measured = read_recording(tmp_path / "run")
+    assert (measured.pose_deviation, measured.load_deviation) == ((1e-4, 2e-4, 3e-4), (1e3, 0.0, 2e3))
     assert (values["samples_used"], values["head_pose_used"], values["gaps_used"]) == ("100", "1", "2")
     assert values["head_pose_dropped"] == "1"
     entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]

@@ -114,8 +114,8 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     from plow_twin.record.measured import read_measured, read_recording
 
     measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
-    load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:])
-    poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:])
+    load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:], measured.load_deviation)
+    poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
     lost = measured.unreadable + lost_load + lost_poses
     return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost), {}))
 

@@ -14,7 +14,7 @@ from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.start import range_of_motion
-from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, SIZE, SOFTNESS, Unknowns
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, SIZE, SOFTNESS, Spread, Unknowns
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, sandwich
 from plow_twin.model.scene import Scene
 
@@ -66,7 +66,7 @@ def estimate_window(scene: Scene, load: Load, poses: Poses, lost: int = 0, guess
 
     Where the fit from `guess` does not hold, all is searched as without one.
     """
-    unknowns = Unknowns(scene)
+    unknowns = Unknowns(scene, Spread.stated(load, poses))
     poses = poses.between(float(load.t[0]), float(load.t[-1]) + 1e-9)
     if len(poses.t) < FEWEST_POSES:
         return prior_of(unknowns, (float(load.t[0]), float(load.t[-1])), lost), ()

@@ -214,7 +214,7 @@ def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations
     jitter = unforeseen(problem, point, jacobian, seed)
     while done < iterations and problem.forward.work < MOST_WORK:
         done += 1
-        noise = noise_of(point.residual, noise, jitter)
+        noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.spread.noise)
         variance = noise**2 + JITTER_WEIGHT * jitter
         point.cost = problem.cost(point, variance)
         normal, gradient = normal_equations(problem, point, jacobian, variance)
@@ -229,7 +229,7 @@ def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations
             converged = True
             break
         jitter = unforeseen(problem, point, jacobian, seed)
-    noise = noise_of(point.residual, noise, jitter)
+    noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.spread.noise)
     variance = noise**2 + JITTER_WEIGHT * jitter
     point.cost = problem.cost(point, variance)
     normal, _ = normal_equations(problem, point, jacobian, variance)

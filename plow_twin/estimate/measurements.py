@@ -13,6 +13,9 @@ from scipy.linalg import solveh_banded
 from plow_twin.errors import PlowTwinError
 
 Array = NDArray[np.float64]
+Deviation = tuple[float, ...]
+#: Nothing is stated of how well something was measured.
+UNSTATED: Deviation = (0.0, 0.0, 0.0)
 
 #: Least number of points between two knots at which a load is averaged.
 _FINER = 8
@@ -34,13 +37,16 @@ class Poses:
         Stamps in s, strictly increasing.
     q : ndarray, shape (n, 3)
         x, y [m] and theta [rad]; NaN where a component was not measured.
+    deviation : tuple of 3 float
+        Stated standard deviation of each component; 0 where none is.
     """
 
     t: Array
     q: Array
+    deviation: Deviation = UNSTATED
 
     @staticmethod
-    def of(t: ArrayLike, q: ArrayLike) -> tuple[Poses, int]:
+    def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
         """Put rows in order of time; return them and how many had to be left out.
 
         Rows without a finite stamp, without any finite component, or with a stamp that is there already are left out.
@@ -55,12 +61,12 @@ class Poses:
             raise EstimateError(f"poses: got t {times.shape} and q {rows.shape}, expected (n,) and (n, 3)")
         rows[~np.isfinite(rows)] = np.nan
         index = _in_order(times, np.isfinite(rows).any(axis=1))
-        return Poses(times[index], rows[index]), len(times) - len(index)
+        return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def between(self, start: float, end: float) -> Poses:
         """Return the poses stamped in [start, end)."""
         inside = (self.t >= start) & (self.t < end)
-        return Poses(self.t[inside], self.q[inside])
+        return Poses(self.t[inside], self.q[inside], self.deviation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +79,16 @@ class Load:
         Times in s, strictly increasing.
     wrench : ndarray, shape (n, 3)
         Fx, Fy [N] and M [N m] about the cavity's centre, without gravity.
+    deviation : tuple of 3 float
+        Stated standard deviation of each component; 0 where none is.
     """
 
     t: Array
     wrench: Array
+    deviation: Deviation = UNSTATED
 
     @staticmethod
-    def of(t: ArrayLike, wrench: ArrayLike) -> tuple[Load, int]:
+    def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
         """Put samples in order of time; return them and how many had to be left out (not finite, stamp repeated).
 
         Raises
@@ -93,13 +102,19 @@ class Load:
         index = _in_order(times, np.isfinite(rows).all(axis=1))
         if len(index) < 2:
             raise EstimateError(f"load: got {len(index)} samples that can be used, expected at least 2")
-        return Load(times[index], rows[index]), len(times) - len(index)
+        return Load(times[index], rows[index], deviation), len(times) - len(index)
 
     def between(self, start: float, end: float) -> Load:
         """Return the samples that matter in [start, end]."""
         first = max(int(np.searchsorted(self.t, start, side="right")) - 1, 0)
         last = min(int(np.searchsorted(self.t, end, side="left")) + 1, len(self.t))
         return Load(self.t[first:last], self.wrench[first:last])
+
+    def gain_deviations(self) -> Array:
+        """Return the stated deviations as shares of the components' root mean squares, shape (3,); 0 without a load."""
+        size = np.sqrt((self.wrench**2).mean(axis=0))
+        shares: Array = np.divide(self.deviation, size, out=np.zeros(3), where=size > 0.0)
+        return shares
 
     def period(self) -> float:
         """Return the period in s of the strongest oscillation, or a tenth of the span where there is none."""

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
@@ -49,6 +50,10 @@ _SOFTEST = 0.12
 _LEAST_CLEARANCE = 5e-4
 
 
+#: Largest prior deviation of a load's gain.
+_MOST_GAIN = 1.0
+
+
 @dataclass(frozen=True)
 class Spread:
     """Standard deviations of the prior about the nominal scene."""
@@ -57,10 +62,18 @@ class Spread:
     #: of ln(u + u0) and of ln of the damping (of the logit of a restitution)
     softness: float = 2.5
     damping: float = 1.2
-    gain: float = 0.07
+    gain: tuple[float, float, float] = (0.07, 0.07, 0.07)
     bias_m: float = 5e-3
     bias_rad: float = 0.02
     delay_s: float = 0.05
+    #: least noise of the sensor that is believed: x, y [m], theta [rad]
+    noise: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    @staticmethod
+    def stated(load: Load, poses: Poses) -> Spread:
+        """Return the prior where deviations are stated; that of a load is taken to move all its samples alike."""
+        fx, fy, moment = np.minimum(np.hypot(Spread().gain, load.gain_deviations()), _MOST_GAIN).tolist()
+        return Spread(gain=(fx, fy, moment), noise=poses.deviation)
 
 
 @dataclass(frozen=True)
@@ -95,7 +108,7 @@ class Unknowns:
         s = self.spread
         return np.array(
             [
-                s.clearance_m, s.clearance_m, s.softness, s.damping if self.damped else 1e-6, s.gain, s.gain, s.gain,
+                s.clearance_m, s.clearance_m, s.softness, s.damping if self.damped else 1e-6, *s.gain,
                 s.bias_m, s.bias_m, s.bias_rad, s.delay_s,
             ]
         )  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
+from plow_twin.estimate.measurements import FEWEST_POSES, UNSTATED, Deviation, Load, Poses
 
 Array = NDArray[np.float64]
 Row = tuple[int, float, float, float]
@@ -47,9 +47,19 @@ class Windows:
     ----------
     length_s, interval_s, wait_s : float
         Full length of a window, distance of their ends, and how long late data are waited for, in s.
+    poses, load : tuple of 3 float
+        Stated deviations of what is measured; that of the load until another one is stated.
     """
 
-    def __init__(self, length_s: float, interval_s: float, wait_s: float) -> None:
+    def __init__(
+        self,
+        length_s: float,
+        interval_s: float,
+        wait_s: float,
+        poses: Deviation = UNSTATED,
+        load: Deviation = UNSTATED,
+    ) -> None:
+        self._pose_deviation, self._load_deviation = poses, load
         self._length_ns, self._interval_ns = round(length_s * 1e9), round(interval_s * 1e9)
         self._wait_ns = round(wait_s * 1e9)
         self.restart()
@@ -60,6 +70,10 @@ class Windows:
         self._poses: list[Row] = []
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
+
+    def take_spread(self, deviation: Deviation) -> None:
+        """Take in how well the load is known from here on: Fx, Fy [N], M [N m]."""
+        self._load_deviation = deviation
 
     def take_pose(self, stamp_ns: int, q: tuple[float, ...]) -> None:
         """Take in a measured pose x, y [m], theta [rad]."""
@@ -94,8 +108,8 @@ class Windows:
         if end_ns - start_ns < LEAST_SHARE * self._length_ns or len(poses) < FEWEST_POSES or len(stamps) < 2:
             return None
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
-        load, lost_load = Load.of(*_table(rows, start_ns))
-        pose, lost_poses = Poses.of(*_table(poses, start_ns))
+        load, lost_load = Load.of(*_table(rows, start_ns), self._load_deviation)
+        pose, lost_poses = Poses.of(*_table(poses, start_ns), self._pose_deviation)
         return Window(start_ns, end_ns, load, pose, len(rows), len(poses), lost_load + lost_poses)
 
 

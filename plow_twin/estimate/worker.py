@@ -22,6 +22,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from plow_twin.estimate.estimate import Guess, estimate_window, warm_up
+from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.result import Estimate
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.model.scene import Scene
@@ -68,11 +69,19 @@ class Worker:
     ----------
     scene : Scene
         The nominal scene.
-    length_s, interval_s, wait_s : float
+    length_s, interval_s, wait_s, poses, load
         As of `Windows`.
     """
 
-    def __init__(self, scene: Scene, length_s: float, interval_s: float, wait_s: float) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        length_s: float,
+        interval_s: float,
+        wait_s: float,
+        poses: Deviation = UNSTATED,
+        load: Deviation = UNSTATED,
+    ) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno())]
         # one thread of linear algebra: it is to take no more than one core
@@ -82,7 +91,7 @@ class Worker:
         )
         far.close()
         self._connection = near
-        self._connection.send((scene, length_s, interval_s, wait_s))
+        self._connection.send((scene, length_s, interval_s, wait_s, poses, load))
         self._waiting: deque[tuple[Any, ...]] = deque()
         self._restarts = 0
         self._closed = threading.Event()
@@ -98,6 +107,10 @@ class Worker:
     def take_pose(self, stamp_ns: int, q: tuple[float, ...]) -> None:
         """Take in a measured pose."""
         self._waiting.append((stamp_ns, q, False))
+
+    def take_spread(self, deviation: Deviation) -> None:
+        """Take in how well the load is known from here on."""
+        self._waiting.append((deviation,))
 
     def restart(self) -> None:
         """Let the windows begin anew."""
@@ -145,8 +158,8 @@ class Worker:
 
 def serve(connection: Connection) -> None:
     """Estimate what comes until the other side is gone."""
-    scene, length_s, interval_s, wait_s = connection.recv()
-    windows = Windows(length_s, interval_s, wait_s)
+    scene, *given = connection.recv()
+    windows = Windows(*given)
     warm_up(scene)
     guess: Guess = ()
     skipped = restarts = 0
@@ -170,8 +183,11 @@ def serve(connection: Connection) -> None:
         guess, skipped = following, 0
 
 
-def take(windows: Windows, item: tuple[int, tuple[float, ...], bool]) -> Window | None:
+def take(windows: Windows, item: tuple[Any, ...]) -> Window | None:
     """Take in one item as `Worker` sends it; return the window that is due, if one is."""
+    if len(item) == 1:
+        windows.take_spread(*item)
+        return None
     stamp_ns, values, is_load = item
     if is_load:
         return windows.take_load(stamp_ns, values)

@@ -12,7 +12,7 @@ from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.parameters import Settings
 from plow_twin.model.scene import Scene
 from plow_twin.record import messages as plain
-from plow_twin.stream.journal import Entry, Estimated, Pose, Reset, Sample, SetWear
+from plow_twin.stream.journal import Entry, Estimated, Pose, Reset, Sample, SetWear, Spread
 from plow_twin.stream.session import Session
 
 #: Base names of what `estimate` tells; each has its points `<name>/p05` and `<name>/p95` too.
@@ -30,7 +30,7 @@ class Estimation:
     def __init__(self, settings: Settings, scene: Scene) -> None:
         self._frame_id = settings.frame_id
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
-        self._worker = Worker(scene, *span)
+        self._worker = Worker(scene, *span, settings.head_pose_deviation, settings.excitation_deviation)
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
@@ -54,6 +54,8 @@ class Estimation:
                 self._worker.take_load(stamp_ns, wrench)
             case Pose(stamp_ns, pose):
                 self._worker.take_pose(stamp_ns, pose)
+            case Spread(_, deviation):
+                self._worker.take_spread(deviation)
             case SetWear():
                 self._worker.restart()
                 self.entry = None

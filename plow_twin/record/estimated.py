@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
+from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import Estimated, Pose, Reset, SetWear
+from plow_twin.stream.journal import Estimated, Pose, Reset, SetWear, Spread
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +29,8 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
     if not settings.get("estimate"):
         return
     names = ("estimate_window", "estimate_interval", "rollback_span")
-    windows = Windows(*(float(settings[name]) for name in names))
+    length_s, interval_s, wait_s = (float(settings[name]) for name in names)
+    windows = Windows(length_s, interval_s, wait_s, *stated(settings))
     formed: dict[int, Window] = {}
     for batch in reader.batches(outputs=False):
         entries = batch.entries
@@ -41,12 +44,20 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
             match entries.others[index]:
                 case Pose(stamp_ns, pose):
                     windows.take_pose(stamp_ns, pose)
+                case Spread(_, deviation):
+                    windows.take_spread(deviation)
                 case Reset() | SetWear():
                     windows.restart()
                     formed.clear()
                 case Estimated(end_ns=end_ns) as entry:
                     yield LiveEstimate(entry, _whole(formed.get(end_ns), entry))
                     formed = {end: window for end, window in formed.items() if end > end_ns}
+
+
+def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
+    """Return the deviations of poses and load that the node's parameters state."""
+    poses, load = (parameters.get(f"{name}_deviation", UNSTATED) for name in ("head_pose", "excitation"))
+    return tuple(map(float, poses)), tuple(map(float, load))
 
 
 def _whole(window: Window | None, entry: Estimated) -> Window | None:

@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
+from plow_twin.record.estimated import stated
 from plow_twin.record.mapping import ROLES, roles_by_source
 from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Pose
+from plow_twin.stream.journal import Pose, Spread
 
 Array = NDArray[np.float64]
 
@@ -36,13 +38,16 @@ class Measured:
     """What a folder holds.
 
     load : (n, 4) t [s], Fx, Fy [N], M [N m] believed; poses : (k, 4) t [s], x, y [m], theta [rad], NaN where a cell is
-    empty; unreadable : rows that are not numbers.
+    empty; unreadable : rows that are not numbers; pose_deviation, load_deviation : stated standard deviations, 0 where
+    none is.
     """
 
     scene: Scene
     load: Array
     poses: Array
     unreadable: int
+    pose_deviation: Deviation = UNSTATED
+    load_deviation: Deviation = UNSTATED
 
 
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
@@ -75,7 +80,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     SceneError
         When the scene cannot be used.
     """
-    own = own_run(path)
+    own, deviations = own_run(path), (UNSTATED, UNSTATED)
     if own is None:
         file = scene or (path / SCENE_FILE if path.is_dir() else path.with_name(SCENE_FILE))
         if scene is None and not file.is_file():
@@ -86,7 +91,9 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     else:
         given = scene is not None
         model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
-        loads, journalled = _journal(own)
+        loads, journalled, spread = _journal(own)
+        of_poses, of_load = stated(own.header.parameters)
+        deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
         rows, unfit = {"head_pose": journalled}, 0
         if mapping is not None or not len(journalled):
             folder = path if path.is_dir() else path.parent
@@ -99,17 +106,21 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     origin = loads[0, 0]
     for table in (loads, poses):
         table[:, 0] = (table[:, 0] - origin) * 1e-9
-    return Measured(model, loads, poses, unfit)
+    return Measured(model, loads, poses, unfit, *deviations)
 
 
-def _journal(reader: RunReader) -> tuple[Array, Array]:
-    """Return the samples and the measured poses of a run's journal, shape (n, 4) each, stamps in ns."""
-    loads, poses = [np.zeros((0, 4))], []
+def _journal(reader: RunReader) -> tuple[Array, Array, Array]:
+    """Return samples and poses of a journal, (n, 4) each, stamps in ns, and the largest deviation of the load, (3,)."""
+    loads, poses, spread = [np.zeros((0, 4))], [], np.zeros(3)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         loads.append(np.column_stack([entries.stamp_ns, entries.wrench])[entries.sample])
-        poses += [(entry.stamp_ns, *entry.pose) for entry in entries.others.values() if isinstance(entry, Pose)]
-    return np.concatenate(loads), np.array(poses, dtype=np.float64).reshape(-1, 4)
+        for entry in entries.others.values():
+            if isinstance(entry, Pose):
+                poses.append((entry.stamp_ns, *entry.pose))
+            elif isinstance(entry, Spread):
+                spread = np.maximum(spread, entry.deviation)
+    return np.concatenate(loads), np.array(poses, dtype=np.float64).reshape(-1, 4), spread
 
 
 def _collect(
