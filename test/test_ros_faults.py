@@ -22,12 +22,13 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from geometry_msgs.msg import WrenchStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from ros_processes import Bench, bench, value
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -172,6 +173,42 @@ def test_one_corrupt_sample_in_a_hundred_is_counted_to_the_last_one(tmp_path: Pa
         assert {key: int(figures[f"dropped_{key}"]) for key in expected} == expected
         assert int(figures["samples_used"]) == sent - sum(expected.values())
     assert sum(expected.values()) > 60
+
+
+def test_damaged_bytes_on_every_input_are_counted_to_the_last_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(12)
+
+    def damaged(message: Any) -> bytes:
+        data = np.frombuffer(serialize_message(message), np.uint8).copy()
+        data[rng.integers(4, len(data), 3)] = rng.integers(0, 256, 3)
+        return data[: rng.integers(4, len(data) + 1)].tobytes()
+
+    reliable = {"qos_overrides.{ns}/tool_forces.subscription.reliability": "reliable"}
+    settings = {"excitation_source": "tool_forces", "record_path": tmp_path / "run", "excitation_timeout": 3600.0}
+    with bench(tmp_path, **settings, **reliable) as running:
+        probe = running.probe
+        tools = probe.publisher(JointState, "tool_forces", 5000)
+        kinds = {"excitation": WrenchStamped, "travel": TwistStamped, "head_pose": PoseStamped, "gaps": JointState}
+        others = [probe.publisher(kind, topic, 1000) for topic, kind in kinds.items()]
+        for index in range(3000):
+            message = JointState(name=["fx1", "fx2", "fx3", "fy"], effort=[1e4 * math.sin(2e-3 * index)] * 4)
+            set_stamp(message.header, T0 + index * MS)
+            tools.publish(damaged(message) if rng.random() < 0.02 else message)
+            if index % 10 == 0:
+                for publisher in others:
+                    publisher.publish(damaged(publisher.msg_type()))
+            probe.pace(index)
+
+        def sent() -> int:
+            figures = probe.figures("input")
+            return _accounted(figures) - int(figures["dropped_not_selected"])
+
+        probe.until(lambda: sent() == 3000, "all that was sent")
+        assert running.twin.stop() == 0
+    report = replay(tmp_path / "run")
+    assert report.exit_code == 0 and report.samples > 2900
+    # the file tells the same to the message
+    assert sum(report.inputs["tool_forces"].values()) == 3000
 
 
 @pytest.mark.parametrize("step_s", [-10.0, 30.0])
