@@ -134,6 +134,16 @@ def answers(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
+def test_view_refuses_what_cannot_be_drawn(run: Run, tmp_path: Path) -> None:
+    for option, value in (("--exaggerate", "1e+308"), ("--exaggerate", "nan"), ("--with", "nowhere.yaml")):
+        refused = plow_twin("view", run.folder, "--out", tmp_path / "x.rrd", option, value)
+        assert refused.returncode == 2 and value in refused.stderr and "Traceback" not in refused.stderr
+    # a run under its scene's own loads has none in its journal
+    own = rewrite(run.file, tmp_path / "own.mcap", metadata=lambda record: {**record, "excitation_source": "scene"})
+    refused = plow_twin("view", own, "--out", tmp_path / "x.rrd", "--with", "paper")
+    assert refused.returncode == 1 and "excitation_source" in refused.stderr
+
+
 @pytest.fixture(scope="module")
 def served(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address that `view --web` names, while it serves."""

@@ -19,12 +19,20 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
+#: A clearance that is drawn wider than that is nowhere near the frame.
+_MOST_EXAGGERATED = 1e4
+
+
 @click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but parts of the recording are missing.")
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; by default beside the .mcap."
 )
-@click.option("--exaggerate", type=POSITIVE, help="How many times as wide the clearance is drawn beside the true one.")
+@click.option(
+    "--exaggerate",
+    type=POSITIVE,
+    help="How many times as wide the clearance is drawn beside the true one.",
+)
 @click.option(
     "--with",
     "others",
@@ -59,6 +67,10 @@ def view(
 
     if not follow and not recording.exists():
         raise click.BadParameter(f"{recording}: does not exist", param_hint="RECORDING")
+    if exaggerate is not None and exaggerate > _MOST_EXAGGERATED:
+        raise click.BadParameter(
+            f"got {exaggerate:g}, expected at most {_MOST_EXAGGERATED:g}", param_hint="--exaggerate"
+        )
     if png is not None and others:
         raise click.UsageError("--with cannot be combined with --png: a picture shows the run alone")
     if follow:

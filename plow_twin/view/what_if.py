@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import rerun as rr
 
+from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.header import RunHeader
 from plow_twin.record.importing import JournalWalk, Walked, Walker
@@ -18,7 +19,13 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 
 
 class WhatIf:
-    """Walk other scenes, by name, through the journal of a run, and draw their forces; without any nothing is done."""
+    """Walk other scenes, by name, through the journal of a run, and draw their forces; without any nothing is done.
+
+    Raises
+    ------
+    RecordingError
+        The run was under loads of its own scene: there is no load in its journal.
+    """
 
     def __init__(
         self,
@@ -28,6 +35,8 @@ class WhatIf:
         others: Mapping[str, Scene],
         span_ns: int,
     ) -> None:
+        if others and header.excitation_source == "scene":
+            raise RecordingError("other scenes: excitation_source: got scene, expected a run under sampled loads")
         entities = layout.what_if_curves(stream, tuple(others)) if others else ()
         self._curves = [Curves(stream, axis, [entity], span_ns) for entity in entities]
         self._walk = JournalWalk((), [self._walker(header, scene, n + 1) for n, scene in enumerate(others.values())])
