@@ -115,7 +115,10 @@ def test_members_are_drawn_with_the_estimate_s_correlation(known: list[tuple[Tru
         pytest.param("kelvin_voigt", marks=pytest.mark.stress),
         pytest.param("jam", marks=pytest.mark.stress),
         "shift",
-        *(pytest.param(name, marks=pytest.mark.stress) for name in ("exponent", "shape", "scale", "stuck", "noisier")),
+        *(
+            pytest.param(name, marks=pytest.mark.stress)
+            for name in ("exponent", "shape", "scale", "stuck", "noisier", "hard_shape", "hard_kelvin_voigt")
+        ),
     ],
 )
 def test_what_is_outside_the_model_is_flagged_and_withdrawn(name: str) -> None:
@@ -199,6 +202,24 @@ def test_without_measurements_the_prior_is_what_there_is() -> None:
     result = estimate(nominal, load, poses, lost)
     assert (result.horizontal_state, result.vertical_state, result.lost) == (State.PRIOR, State.PRIOR, 2)
     assert result.horizontal.p05 < 0.025 < result.horizontal.p95
+
+
+def test_a_component_never_measured_is_said_and_nothing_is_estimated(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, _ = known[0]
+    q = truth.poses.q.copy()
+    q[:, 2] = np.nan
+    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, q))
+    assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
+    assert result.reasons == ("theta: measured 0 times, expected at least 20",)
+    assert result.horizontal.p05 < truth.clearance[0] < result.horizontal.p95
+
+
+def test_members_that_leave_the_range_are_left_out_and_counted(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, result = known[0]
+    soft = replace(result, stiffness=Interval(2e7, 1e6, 4e7), correlation=None)
+    forces = forces_of(truth.nominal, soft, truth.load.between(0.0, 6.0), 60, 3.2)
+    assert forces.left_out > 0 and forces.members + forces.left_out == 60
+    assert np.isfinite(forces.force).all()
 
 
 def test_arrays_of_the_wrong_shape_are_named() -> None:

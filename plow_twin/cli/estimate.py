@@ -148,11 +148,11 @@ def _repeated(source: Path) -> _Task | None:
 
 
 def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
-    """Return the forces under the load believed; None where nothing holds that they could be drawn from."""
+    """Return the forces under the load believed; None where nothing was estimated that they could be drawn from."""
     from plow_twin.estimate.forces import forces_of
     from plow_twin.estimate.result import State
 
-    if State.WITHDRAWN in (result.horizontal_state, result.vertical_state):
+    if {State.WITHDRAWN, State.PRIOR} & {result.horizontal_state, result.vertical_state} or result.noise is None:
         return None
     return forces_of(task.scene, result, task.load, members, task.load.period())
 

@@ -35,6 +35,10 @@ NARROW, NARROW_M = 1.58, 8e-4
 _WINDOWS: Final = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
 #: Parts of a period in which the scatter is told.
 _PHASES = 20
+#: Parts of a period in which the mean path is told, and fewest measurements in one.
+_PATH_PHASES, _FEWEST_OF_PHASE = 40, 9
+#: Delays for which it is compared, in s.
+_LAGS_S: Final = np.linspace(-0.1, 0.1, 11)
 #: Draws of each round.
 _DRAWS: Final = (40, 40, 40)
 #: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
@@ -66,6 +70,8 @@ class Bounced:
     ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
     noise : (3,) standard deviation of the measurements
     distance : of the measured motion from the drawn ones near it, over that of drawn ones among themselves
+    path : mean square of how far the mean pose at each phase of the load is from what the drawn ones foretell, in
+        standard deviations: some 0.5 where the model is right
     """
 
     clearance: Array
@@ -76,6 +82,7 @@ class Bounced:
     ln_damping: tuple[float, float]
     noise: Array
     distance: float
+    path: float
 
 
 def bounces(unknowns: Unknowns, poses: Poses, softness: float) -> bool:
@@ -101,6 +108,7 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
     """Compare the measured motion with drawn ones; None where too few can be run."""
     eye = _Eye(unknowns, poses, period)
     measured = eye.features(eye.q)
+    paths: list[Array] = []
     rng, most_work = np.random.default_rng(seed), forward.work + _MOST_WORK
     centre = range_of_motion(unknowns.scene, poses)[0] - _OVERRATED
     mean = np.array([_LN_PENETRATION[0], unknowns.nominal()[DAMPING], 1.0, 1.0, 1.0])
@@ -115,9 +123,11 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
             numbers = mean + spread * rng.standard_normal(5)
             numbers[0] = np.clip(numbers[0], *np.log(_BOUNDS))
             clearance = np.maximum(centre + about * rng.standard_normal(2), 5e-4)
-            seen = eye.look(forward, clearance, numbers, rng)
-            if seen is not None:
+            looked = eye.look(forward, clearance, numbers, rng)
+            if looked is not None:
+                seen, path = looked
                 features.append(seen)
+                paths.append(path)
                 targets.append(np.concatenate([clearance - seen[:2], -seen[2:4], numbers]))
         if len(features) < _FEWEST:
             return None
@@ -137,7 +147,19 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
         (float(found.value[5]), float(found.deviation[5])),
         eye.noise,
         found.distance,
+        _off_path(eye, np.array(features)[:, 4:], np.array(paths), measured[4:]),
     )
+
+
+def _off_path(eye: _Eye, features: Array, paths: Array, measured: Array) -> float:
+    """Return how far the measured mean path is from the one that the drawn motions foretell; 0 without enough of it."""
+    there = np.isfinite(paths).all(axis=0) & np.isfinite(eye.path(eye.q))
+    if there.sum() < _PATH_PHASES:
+        return 0.0
+    found = _regress(features, paths[:, there], measured)
+    # stamps may be late or early: a delay is no other path
+    off = [(eye.path(eye.q, lag_s)[there] - found.value) / found.deviation for lag_s in _LAGS_S]
+    return float(min(np.nanmean(one**2) for one in off))
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,10 +199,13 @@ class _Eye:
         self._there = np.isfinite(poses.q)
         self.q = filled(poses)
         self.noise = noise_level(self.q)
+        self._period = period
         self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * _PHASES).astype(int), _PHASES - 1)
 
-    def look(self, forward: Forward, clearance: Array, numbers: Array, rng: np.random.Generator) -> Array | None:
-        """Return the features of a simulated motion; None where it cannot be run."""
+    def look(
+        self, forward: Forward, clearance: Array, numbers: Array, rng: np.random.Generator
+    ) -> tuple[Array, Array] | None:
+        """Return the features and the path of a simulated motion; None where it cannot be run."""
         unknowns = self._unknowns
         vector = unknowns.nominal()
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
@@ -193,7 +218,23 @@ class _Eye:
         white = rng.standard_normal(self.q.shape)
         edges = np.array([0, len(self._t)])
         run = forward.run(replace(scene, contact=contact), vector[GAIN], self._t[:1] - 0.1, start[None], edges, self._t)
-        return None if run is None else self.features(self._seen(run.q, white))
+        if run is None:
+            return None
+        seen = self._seen(run.q, white)
+        return self.features(seen), self.path(seen)
+
+    def path(self, q: Array, lag_s: float = 0.0) -> Array:
+        """Return the mean pose at each phase of the load, its mean taken away, shape (120,); NaN where unknown."""
+        phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * _PATH_PHASES).astype(int) % _PATH_PHASES
+        out = np.full((_PATH_PHASES, 3), np.nan)
+        for i in range(3):
+            there = self._there[:, i]
+            count = np.bincount(phase[there], minlength=_PATH_PHASES)
+            total = np.bincount(phase[there], q[there, i], minlength=_PATH_PHASES)
+            known = count >= _FEWEST_OF_PHASE
+            out[known, i] = total[known] / count[known]
+            out[:, i] -= out[known, i].mean() if known.any() else 0.0
+        return out.ravel()
 
     def _seen(self, q: Array, white: Array) -> Array:
         """Return a motion with as much noise as makes its quick changes as large as those measured.

@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 MEMBERS: Final = 256
 #: Tolerance of the pose relative to the clearance.
 TOLERANCE: Final = 1e-4
+#: Fewest of them: fewer have no 5 % point.
+_FEWEST = 20
 #: Quantiles that are told.
 POINTS: Final = (0.05, 0.5, 0.95)
 _LEAST_CLEARANCE = 5e-4
@@ -44,6 +46,7 @@ class Forces:
     t : (n,) in s
     force : (3, n, 8) of each pair at these times in N
     peak, impulse : (3, 8) largest force in N and impulse in N s from the first to the last of them
+    members, left_out : twins behind it, and those that left the model's range
     """
 
     t: Array
@@ -51,6 +54,7 @@ class Forces:
     peak: Array
     impulse: Array
     members: int
+    left_out: int
 
     def as_dict(self) -> dict[str, Any]:
         """Return peaks and impulses for JSON."""
@@ -61,7 +65,8 @@ class Forces:
             }
             for index, name in enumerate(PAIR_NAMES)
         }
-        return {"members": self.members, "t_start": float(self.t[0]), "t_end": float(self.t[-1]), "pairs": pairs}
+        counts = {"members": self.members, "left_out": self.left_out}
+        return {**counts, "t_start": float(self.t[0]), "t_end": float(self.t[-1]), "pairs": pairs}
 
     def table(self) -> tuple[list[str], Array]:
         """Return the names of the columns and the rows of the forces over time."""
@@ -94,27 +99,38 @@ class ForceEnsemble:
     ) -> None:
         if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
             raise ForcesError(f"estimate: got a withdrawn one ({'; '.join(found.reasons)}), expected one that holds")
-        if members < 20:
-            raise ForcesError(f"members: got {members}, expected at least 20")
+        if members < _FEWEST:
+            raise ForcesError(f"members: got {members}, expected at least {_FEWEST}")
         scenes, self._gain = draw_scenes(scene, found, members, np.random.default_rng(seed))
         self._twins = TwinBatch(scenes, tol=TOLERANCE, start=start)
+        self._good = np.ones(members, dtype=bool)
 
     def __len__(self) -> int:
         return len(self._twins)
 
     def advance(self, t: Array, wrench: Array) -> Forces:
-        """Advance all members through samples of the load believed; `t` (n,) in s, `wrench` (n, 3)."""
+        """Advance all members through samples of the load believed; `t` (n,) in s, `wrench` (n, 3).
+
+        Raises
+        ------
+        ForcesError
+            Where fewer than 20 members are within the model's range.
+        """
         force = np.zeros((len(POINTS), len(t), PAIR_COUNT))
         peak, impulse = np.zeros((len(self), PAIR_COUNT)), np.zeros((len(self), PAIR_COUNT))
         for first in range(0, len(t), _CALL):
             part = slice(first, first + _CALL)
             batch = self._twins.advance_samples(t[part], wrench[part] * self._gain[:, None, :])
-            if (batch.status != 0).any():
-                raise ForcesError(f"t = {t[first]:.3f} s: got a member that left the model's range, expected none")
-            force[:, part] = quantiles(batch.force)
+            self._good &= (batch.status == 0).all(axis=1)
+            if self._good.sum() < _FEWEST:
+                raise ForcesError(
+                    f"t = {t[first]:.3f} s: got {self._good.sum()} members within the model's range, expected {_FEWEST}"
+                )
+            force[:, part] = quantiles(batch.force[self._good])
             np.maximum(peak, batch.peak.max(axis=1), out=peak)
             impulse += batch.impulse.sum(axis=1)
-        return Forces(t, force, quantiles(peak), quantiles(impulse), len(self))
+        good, left = self._good, int((~self._good).sum())
+        return Forces(t, force, quantiles(peak[good]), quantiles(impulse[good]), len(self) - left, left)
 
 
 def quantiles(values: Array) -> Array:
