@@ -9,9 +9,11 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numba
+
+from plow_twin.kernel.linked import LinkedCompiler
 
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
@@ -34,7 +36,7 @@ SOURCE_DIGEST: Final = _source_digest()
 
 
 def kernel(
-    *, fast: bool = False, inline: bool = False, entry: bool = False
+    *, fast: bool = False, inline: Literal["code", "source"] | None = None, entry: bool = False
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a function.
 
@@ -42,16 +44,20 @@ def kernel(
     ----------
     fast : bool
         Allow reordered and fused sums.
-    inline : bool
-        Inline it into its callers.
+    inline : {"code", "source"}, optional
+        Inline it into its callers: its code, or its source, which compiles more slowly but follows the caller's `fast`
+        and may return records, which numba's functions cannot.
     entry : bool
         Python calls it too, not kernels alone: that takes a wrapper, which costs a tenth of the time of compiling.
     """
     options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
-    if inline:
+    if inline == "source":
         options["inline"] = "always"
     else:
+        options["forceinline"] = inline == "code"
         options["no_cpython_wrapper"], options["no_cfunc_wrapper"] = not entry, True
+        if not entry:
+            options["pipeline_class"] = LinkedCompiler
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)

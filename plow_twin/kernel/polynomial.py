@@ -31,7 +31,7 @@ def to_bernstein(g: Array, n: int, h: float, inverse_binomial: Array, b: Array) 
             b[j] += b[j - 1]
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def _halve(left: Array, right: Array, n: int) -> None:
     """Split Bernstein coefficients in `left` at the middle: left half in place, right half to `right`."""
     for r in range(n + 1):

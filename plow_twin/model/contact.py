@@ -18,7 +18,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, splat
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def free_force(
     penetration: float,
     rate: float,
@@ -39,7 +39,7 @@ def free_force(
     return elastic * (1.0 + damping_factor * rate) + viscous * rate
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def normal_force(
     penetration: float,
     rate: float,
@@ -55,7 +55,7 @@ def normal_force(
     return max(0.0, free_force(penetration, rate, stiffness, exponent, damping_factor, viscous, ramp))
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="code")
 def ramp_terms(square: NDArray[np.float64], cube: NDArray[np.float64], k: int, ramp: float) -> Any:
     """Return coefficient k of u^2 (3 - 2 u), u = d / ramp, of the eight columns, from those of d^2 and d^3."""
     return row(square, k) * (3.0 / (ramp * ramp)) - row(cube, k) * (2.0 / (ramp * ramp * ramp))
@@ -82,7 +82,7 @@ def power_term(
     return total / (k * base[shift, lane])
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="code")
 def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, exponent: float) -> Any:
     """Return coefficient k >= 1 of the eight columns of base^exponent, times base[0]: `power_term` without a shift."""
     # the newest orders come last: most of the sum need not wait for them
@@ -100,7 +100,7 @@ def power_terms(base: NDArray[np.float64], power: NDArray[np.float64], k: int, e
     return (even + odd) * (1.0 / k)
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="code")
 def root_terms(newest: Any, root: NDArray[np.float64], k: int) -> Any:
     """Return coefficient k >= 1 of the square roots of eight series, times 2 root[0]; `newest` are the series' own.
 

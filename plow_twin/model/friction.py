@@ -12,7 +12,7 @@ import math
 from plow_twin.kernel.compiler import kernel
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def friction_force(normal: float, slip_rate: float, coefficient: float, speed: float) -> float:
     """Return T in N for the normal force N in N and the slip rate in m/s; it has the slip rate's sign."""
     return coefficient * normal * math.tanh(slip_rate / speed)

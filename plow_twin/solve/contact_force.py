@@ -6,13 +6,13 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import free_force, normal_force
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def law_force(p, state, pair, penetration, rate):
     """Return the law's force of a pair in N, negative where it would pull."""
     return free_force(penetration, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def pair_force(p, state, pair, penetration, rate):
     """Return the force of a pair in N: zero outside the wall and where it would pull."""
     return normal_force(penetration, rate, p.stiffness, p.exponent, state.damping_factor[pair], p.viscous, p.ramp)

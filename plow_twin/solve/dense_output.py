@@ -14,13 +14,13 @@ from plow_twin.solve.modes import any_penetrates
 from plow_twin.solve.state import COS, OMEGA, ON, SIN, VX, VY, X, Y
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def time_along(alpha, beta, sigma):
     """Return the time that the series' variable stands for:  t = alpha sigma + beta sigma^2 / 2."""
     return alpha * sigma + 0.5 * beta * sigma * sigma
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def sigma_at(state, used):
     """Return sigma at `used` seconds into the step."""
     if used >= state.step_size:
@@ -41,7 +41,7 @@ def sum_series(state, w, sigma, out) -> None:
     set_row(out, 0, value)
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def evaluate(p, harmonics, flight, state, w, sigma, out) -> None:
     """Write the body-coordinate state at sigma to `out`, shape (8,)."""
     if state.in_flight == 1:

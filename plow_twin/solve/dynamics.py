@@ -24,7 +24,7 @@ class Acting(NamedTuple):
     slip: int | None
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def acting(parts):
     """Return what acts in a scene beside its law."""
     terms = parts.terms
@@ -49,7 +49,7 @@ def push(p, slip, pair, force, c, s, omega, x, y, vx, vy):
     return fx, fy, torque, power
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def about_mass(p, c, s, load):
     """Return the angular acceleration that a load through the cavity's centre gives about the centre of mass.
 

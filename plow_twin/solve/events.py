@@ -131,7 +131,7 @@ def _unsafe_pairs(w, order, h):
     return bits
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def _next_mode(p, mode, viscous, fraction, ramp):
     """Return the mode that follows when a pair's first guard ends it."""
     if mode == OFF:

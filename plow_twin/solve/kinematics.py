@@ -12,7 +12,7 @@ from plow_twin.kernel.simd import row
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def row_value(rows, pair, c, s, x, y):
     """Return rows . (c, s, x, y) of one pair."""
     return rows[0, pair] * c + rows[1, pair] * s + rows[2, pair] * x + rows[3, pair] * y
@@ -24,43 +24,43 @@ def row_values(rows, c, s, x, y):
     return (row(rows, 0) * c + row(rows, 1) * s) + (row(rows, 2) * x + row(rows, 3) * y)
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def row_rate(rows, pair, c, s, omega, x, y, vx, vy):
     """Return the rate of rows . (c, s, x, y) of one pair: body axes turn with omega."""
     return row_value(rows, pair, -omega * s, omega * c, vx + omega * y, vy - omega * x)
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def penetration_at(p, state, pair, c, s, x, y):
     """Return the penetration of one pair in m, with the pad as worn as it is at the step's start."""
     return row_value(p.penetration_rows, pair, c, s, x, y) + p.penetration_rows[4, pair] - state.wear_depth[pair]
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def penetration_of(p, state, pair, y):
     """Return the penetration of one pair in body coordinates y, shape (8,)."""
     return penetration_at(p, state, pair, y[COS], y[SIN], y[X], y[Y])
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def rate_at(p, pair, c, s, omega, x, y, vx, vy):
     """Return the rate of one pair's penetration in m/s."""
     return row_rate(p.penetration_rows, pair, c, s, omega, x, y, vx, vy)
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def rate_of(p, pair, y):
     """Return the rate of one pair's penetration in body coordinates y, shape (8,)."""
     return rate_at(p, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def to_body_axes(c, s, x, y):
     """Resolve a vector in world axes along body axes."""
     return c * x + s * y, c * y - s * x
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def to_world_axes(c, s, x, y):
     """Resolve a vector in body axes along world axes."""
     return c * x - s * y, s * x + c * y

@@ -23,19 +23,19 @@ _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.
 _BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def _unowned_loads(parts):
     """Return the parts with loads that the caller keeps alive."""
     return Parts(parts.terms, unowned(parts.harmonics), unowned(parts.segments), parts.implicit)
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def _end(p, parts, state, w, totals, log) -> None:
     terms = parts.terms
     complete_step(p, parts.harmonics, terms.flight, state, w, totals, log, terms.wear, terms.fraction)
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def _next(p, parts, state, w, stop_time, budget) -> int:
     """Lay out the next step unless one is under way."""
     if state.step_size >= 0.0:
@@ -163,7 +163,7 @@ def _advance_row(p, parts, states, index, saved, w, totals, target, stop_time, b
     _read_row(p, parts, states[index], w, totals, out)
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def _follow_line(piece, start, time, before, sample) -> None:
     """Let the load run straight from one sample, held at `start`, to the next one at `time`."""
     span = time - start

@@ -119,7 +119,7 @@ def settle_modes(p, state) -> None:
     state.events_at_once = 0
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def any_penetrates(state) -> bool:
     """Tell whether any pair is inside its wall, with or without force."""
     inside = 0
@@ -151,7 +151,7 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
     return any_penetrates(state)
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def slow_touch(p) -> float:
     """Return the speed below which a pair cannot reach the release penetration by the speed of its touch alone."""
     acceleration = p.threshold[0] * p.weight / p.radius

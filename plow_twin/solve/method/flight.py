@@ -21,7 +21,7 @@ _LEAST_PHASE = 8.0
 _SAFE = 0.9
 
 
-@kernel(inline=True)
+@kernel(inline="code")
 def _amplitudes(p, one, j):
     """Return sine and cosine amplitude of a harmonic's acceleration along x, y or theta."""
     if j == 2:

@@ -127,19 +127,19 @@ def decay_rate(p, state, w, slip) -> float:
     return decay if decay > OVERDAMPED_RATIO * math.sqrt(spring) else 0.0
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def _admissible(p):
     """Return the error of a velocity in m/s that an implicit step may make."""
     return max(_GAIN * p.threshold[p.order], _NOISE * p.threshold[0])
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def stable_decay(order):
     """Return over how many decay times a series of this order is stable, with a margin."""
     return 0.3 * order
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def has_decayed(p, state) -> bool:
     """Tell whether what a change of contact has set moving is gone, by the decay times that have passed since.
 
@@ -149,7 +149,7 @@ def has_decayed(p, state) -> bool:
     return bool(state.decay_times >= wait * 2.0**state.refused)
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def note_decay(state, decay, step_size) -> None:
     """Count the decay times that pass in a step."""
     if decay > 0.0:
@@ -410,7 +410,7 @@ def lay_out(p, parts, implicit, ramp, wear, slip, state, w, span, penetrating) -
     return size > 0.0
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def at_most_stable(p, implicit, state, w, sigma):
     """Return the part of `sigma` over which an explicit step is stable."""
     if implicit is not None and w.decay[0] > 0.0 and state.beta == 0.0:

@@ -90,7 +90,7 @@ def _multiply(a, b, k):
     return _join(a, b, k, row(a, k), row(b, k))
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="code")
 def _raise(w, k, penetration, touching, exponent):
     """Write order k of penetration^exponent of the pairs that act to `w.power[0]`, and return it.
 
@@ -121,7 +121,7 @@ def _raise(w, k, penetration, touching, exponent):
     return power
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="code")
 def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
     """Return order k of the force from that of d^n:  K d^n (1 + lambda d')  or  K d^n + C psi d'."""
     force = row(w.per_pair, ACTS) * elastic_k
@@ -134,7 +134,7 @@ def _damp(p, elastic, w, k, elastic_k, rate, viscous, hysteretic, ramp):
     return force if hysteretic is None else force + row(w.per_pair, DAMPS) * _join(elastic, w.rate, k, elastic_k, rate)
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="code")
 def _ramp(p, w, k) -> None:
     """Write order k of the share of C that acts to `w.ramp[2]`: constant for pairs beyond the ramp."""
     set_row(w.ramp[0], k, _multiply(w.penetration, w.penetration, k))
@@ -146,7 +146,7 @@ def _ramp(p, w, k) -> None:
     set_row(w.ramp[2], k, share)
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="code")
 def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fraction, ramp):
     """Return order k of the eight contact forces (`model.contact`), zero for pairs that do not act.
 
@@ -214,7 +214,7 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
     return fx, fy, moment
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True, inline="source")
 def _applied(p, along_x, along_y, torque):
     """Return the accelerations that forces in head axes and moments of the pairs give, in the lanes of the rates."""
     mass, inertia = p.inverse_mass, p.inverse_inertia
@@ -260,7 +260,7 @@ def _wear(p, w, k, alpha, beta) -> None:
     set_row(w.wear, k + 1, growth * row(p.wear_per_impulse, 0) * w.inverse[k + 1])
 
 
-@kernel(inline=True)
+@kernel(inline="source")
 def one_by_one(terms):
     """Return the terms as a plain tuple, to be passed on with a star."""
     return (
