@@ -20,7 +20,7 @@ EXTRAS = {
     "view": ["rerun-sdk>=0.41", "matplotlib>=3.8"],
     "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1", "rainflow>=3.2"],
     "dask": ["distributed>=2024.1"],
-    "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9", "filterpy>=2.0"],
+    "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9", "heyoka>=7", "filterpy>=2.0"],
     "docs": ["mkdocs>=1.6,<2", "mkdocstrings[python]>=0.26"],
     "test": [
         "pytest>=8",

@@ -18,7 +18,8 @@ Member = Callable[[str], bool]
 PEERS: dict[str, Member] = {
     "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
     "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,
-    "best from Python": lambda solver: "SciPy" in solver or "scikit-sundae" in solver,
+    "heyoka": lambda solver: solver.startswith("heyoka"),
+    "best of SciPy and scikit-sundae": lambda solver: "SciPy" in solver or "scikit-sundae" in solver,
     "best multibody engine": lambda solver: solver.startswith(("MuJoCo", "Exudyn")),
     "lean jitted RK4": lambda solver: solver.startswith("lean"),
     "our RK4": lambda solver: solver == OURS_RK4,

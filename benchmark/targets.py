@@ -37,7 +37,11 @@ class Ratio:
 RATIOS = (
     Ratio("kv", 0.1, 1e-6, "CVODE from C", 30.0),
     Ratio("kv", 0.1, 1e-6, "CVODE from C, rootfinding", 30.0),
-    Ratio("kv", 0.1, 1e-6, "best from Python", 90.0),
+    Ratio("kv", 0.1, 1e-6, "best of SciPy and scikit-sundae", 90.0),
+    Ratio("kv", 0.1, 1e-6, "heyoka", 10.0),
+    Ratio("kv", 0.1, 1e-9, "heyoka", 10.0),
+    Ratio("kv", 1e-3, 1e-6, "heyoka", 10.0),
+    Ratio("kv", 1e-3, 1e-9, "heyoka", 10.0),
     Ratio("kv", 1e-3, 1e-6, "CVODE from C", 20.0),
     Ratio("kv", 1e-3, 1e-6, "CVODE from C, rootfinding", 20.0),
     Ratio("kv", 0.1, 1e-9, "CVODE from C", 60.0),

@@ -8,6 +8,7 @@ from itertools import product
 
 import cvode
 import exudyn_peer
+import heyoka_peer
 import mujoco_peer
 import numpy as np
 import python_peers
@@ -25,6 +26,7 @@ SECTION = "work_precision"
 OURS, OURS_BARE = "plow_twin events", "plow_twin events, poses only"
 OURS_RK4, LEAN_RK4 = "plow_twin RK4", "lean RK4 (numba)"
 OURS_CALL = "plow_twin simulate(), whole call"
+HEYOKA = "heyoka (Taylor, events)"
 
 
 def _decades(loosest: int, tightest: int, per_decade: int = 2) -> tuple[float, ...]:
@@ -176,6 +178,11 @@ def python_cases(scene_name: str) -> Iterator[Case]:
                     scene_name, f"CVODE {method} (scikit-sundae)", setting, output_dt,
                     partial(python_peers.prepare_sundae, p, method, rtol, output_dt),
                 )  # fmt: skip
+    if scene_name == "kv":
+        for output_dt, tol in product((SPARSE, DENSE), _LADDER):
+            yield _case(
+                scene_name, HEYOKA, f"tol={tol:.3g}", output_dt, partial(heyoka_peer.prepare, p, tol, output_dt)
+            )
     for method, rtol in ((method, rtol) for method, ladder in _SOLVE_IVP.items() for rtol in ladder):
         prepare = partial(python_peers.prepare_solve_ivp, p, method, rtol, SPARSE)
         yield _case(scene_name, f"{method} (SciPy solve_ivp)", f"rtol={rtol:.3g}", SPARSE, prepare)

@@ -262,34 +262,14 @@ def _wear(p, w, k, alpha, beta) -> None:
 
 @kernel(inline="source")
 def one_by_one(terms):
-    """Return the terms as a plain tuple, to be passed on with a star."""
-    return (
-        terms.harmonics, terms.second, terms.segments, terms.viscous, terms.hysteretic, terms.integer, terms.fraction,
-        terms.ramp, terms.wear, terms.offset, terms.free, terms.slip,
-    )  # fmt: skip
+    """Return the terms as plain tuples, to be passed on with a star: those of the load, those of the law, the others."""
+    load = terms.harmonics, terms.second, terms.segments
+    law = terms.viscous, terms.hysteretic, terms.integer, terms.fraction, terms.ramp
+    return load, law, terms.wear, terms.offset, terms.free, terms.slip
 
 
 @kernel(fast=True)
-def expand(
-    p,
-    state,
-    w,
-    limit,
-    penetrating,
-    sigma_limit,
-    harmonics,
-    second,
-    segments,
-    viscous,
-    hysteretic,
-    integer,
-    fraction,
-    ramp,
-    wear,
-    offset,
-    free,
-    slip,
-):
+def expand(p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, wear, offset, free, slip):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
     Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. Orders whose terms vanish
@@ -323,14 +303,14 @@ def expand(
         set_row(w.penetration, k, penetration)
         if k == order:
             break
-        s1_k = 0.0 if harmonics is None else load[0, k]
+        s1_k = 0.0 if load_terms[0] is None else load[0, k]
         turned, turning_by = _turned(here), pack(om, om, om, om, s1_k, om, om, s1_k)
         set_row(right, k, turned)
         set_row(left, k, turning_by)
         product = _join(left, right, k, turning_by, turned)
         turning = product * pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
         turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, second, segments)
+        fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, *load_terms)
         if offset is not None:
             # the loads' moment is about the cavity's centre, gravity acts at the centre of mass
             across = p.offset[0] * (fy + p.gravity * c) - p.offset[1] * (fx + p.gravity * s)
@@ -343,7 +323,7 @@ def expand(
             set_row(w.rate, k, rate)
             arm = row_values(p.arm_rows, c, s, x, yy)
             set_row(w.arm, k, arm)
-            force = _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fraction, ramp)
+            force = _push(p, state, w, k, penetration, rate, *law_terms)
             set_row(w.force, k, force)
             # the rows for X and Y are minus the walls' inward normals
             torque = _join(w.arm, w.force, k, arm, force)
