@@ -262,7 +262,7 @@ def _wear(p, w, k, alpha, beta) -> None:
 
 @kernel(inline="source")
 def one_by_one(terms):
-    """Return the terms as plain tuples, to be passed on with a star: those of the load, those of the law, the others."""
+    """Return the terms as plain tuples, to be passed on with a star: of the load, of the law, and the others."""
     load = terms.harmonics, terms.second, terms.segments
     law = terms.viscous, terms.hysteretic, terms.integer, terms.fraction, terms.ramp
     return load, law, terms.wear, terms.offset, terms.free, terms.slip
