@@ -11,7 +11,7 @@ import click
 from plow_twin.cli.console import json_option, output_console, progress, quiet_option, show_facts
 
 if TYPE_CHECKING:
-    from plow_twin.record.replay import ReplayReport
+    from plow_twin.record.replay_report import ReplayReport
 
 
 @click.command(

@@ -10,10 +10,10 @@ import hashlib
 import struct
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS, AlarmCheck
 from plow_twin.record.cdr import decode, encode
-from plow_twin.record.chunks import Messages, scan
+from plow_twin.record.chunks import scan
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
@@ -40,10 +40,11 @@ from plow_twin.record.reader import (
     EntryRecord,
     FileStatus,
     OutputRecord,
-    Outputs,
     RunReader,
     sample_template,
 )
+from plow_twin.record.replay_report import Divergence, ReplayReport
+from plow_twin.record.sent_messages import SentMessages
 from plow_twin.record.template import Indexes, Templates, differing, read_numbers
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.advance import AdvanceSeries
@@ -65,68 +66,6 @@ _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 #: Receives the share of the file that has been replayed, 0..1.
 ProgressCallback = Callable[[float], object]
-
-
-@dataclass(frozen=True)
-class Divergence:
-    """A difference: at advance number `step` (from 0), on `topic`, in `field`, recorded against computed."""
-
-    step: int
-    stamp_ns: int
-    topic: str
-    field: str
-    recorded: str
-    computed: str
-
-    def __str__(self) -> str:
-        return (
-            f"step {self.step}, stamp {self.stamp_ns} ns, {self.topic}: {self.field}: "
-            f"recorded {self.recorded}, computed {self.computed}"
-        )
-
-
-@dataclass
-class ReplayReport:
-    """What a replay found. `compared` and `not_compared` count messages by base name of their topic.
-
-    `inputs` counts what came, by input, used and not used.
-    """
-
-    path: Path
-    entries: int = 0
-    samples: int = 0
-    steps: int = 0
-    refused: int = 0
-    digests_compared: int = 0
-    snapshots_compared: int = 0
-    compared: Counter[str] = field(default_factory=Counter)
-    not_compared: Counter[str] = field(default_factory=Counter)
-    divergences: int = 0
-    first_divergence: Divergence | None = None
-    status: FileStatus = FileStatus.UNREAD
-    stop_reason: str | None = None
-    damaged_chunks: int = 0
-    lost: dict[str, int] = field(default_factory=dict)
-    inputs: dict[str, dict[str, int]] = field(default_factory=dict)
-    build_differences: dict[str, tuple[str, str]] = field(default_factory=dict)
-    span_s: float = 0.0
-    wall_s: float = 0.0
-
-    @property
-    def messages_compared(self) -> int:
-        """Number of messages compared on all topics."""
-        return self.compared.total()
-
-    @property
-    def loss(self) -> bool:
-        """Something of the run is missing in the file, or nothing in it could be compared."""
-        nothing = self.steps > 0 and self.messages_compared + self.digests_compared == 0
-        return bool(self.lost) or self.status is not FileStatus.COMPLETE or nothing
-
-    @property
-    def exit_code(self) -> int:
-        """0: the same, bit for bit; 1: diverged; 3: the same as far as the file goes, with loss."""
-        return 1 if self.first_divergence is not None else 3 if self.loss else 0
 
 
 def replay(
@@ -224,7 +163,7 @@ class _Replay:
             self.alarms.give_up()
         entries = batch.entries
         self.inputs.add(entries)
-        sent = _Sent.of(batch.outputs, self.topics)
+        sent = SentMessages.of(batch.outputs, self.topics)
         count = len(entries)
         breaks = np.ones(count, bool)  # entries that no run goes on into
         breaks[1:] = np.diff(entries.sequence) != 1
@@ -274,12 +213,12 @@ class _Replay:
         for difference in self.alarms.differences():
             self._note(Divergence(*difference))
 
-    def _messages(self, sent: _Sent, begin: int, end: int) -> None:
+    def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
         chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # what is written is formed anew
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
-    def _run(self, entries: Entries, sent: _Sent, begin: int, end: int) -> bool:
+    def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
         """Apply a run of samples and digests at once and compare what was sent; False: nothing was done."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = sorted(index for index, entry in entries.others.items() if isinstance(entry, Digest))
@@ -355,7 +294,7 @@ class _Replay:
     def _compare_sent(
         self,
         entries: Entries,
-        sent: _Sent,
+        sent: SentMessages,
         begin: int,
         end: int,
         stamps: Indexes,
@@ -400,7 +339,7 @@ class _Replay:
         return found
 
     def _differing(
-        self, sent: _Sent, begin: int, kind: Indexes, row: Indexes, publications: Publications
+        self, sent: SentMessages, begin: int, kind: Indexes, row: Indexes, publications: Publications
     ) -> NDArray[np.bool_]:
         """Tell which messages from `begin` on are not those of their kind and row."""
         wrong = np.zeros(len(kind), bool)
@@ -552,65 +491,6 @@ class _Replay:
         if self.first_ns is not None and self.session.stamp_ns is not None:
             report.span_s = (self.session.stamp_ns - self.first_ns) * 1e-9
         return report
-
-
-@dataclass(frozen=True)
-class _Sent:
-    """Messages that were sent, of many chunks, in order of sequence: indexes go over all of them.
-
-    `kind` is the place of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics; part k begins at `begins[k]`.
-    """
-
-    parts: list[Outputs]
-    begins: Indexes
-    sequence: Indexes
-    kind: Indexes
-
-    @classmethod
-    def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
-        """Take messages; `topics` has the base names of those that follow from the motion."""
-        sequence, kind = _joined(part.sequence for part in outputs), _joined(_kinds(part, topics) for part in outputs)
-        begins = np.cumsum([0, *map(len, outputs)])
-        if (sequence[1:] < sequence[:-1]).any():  # not as our recorder writes: each message is a part
-            order = np.argsort(sequence, kind="stable")
-            owner = np.searchsorted(begins, order, side="right") - 1
-            places = zip(owner.tolist(), (order - begins[owner]).tolist(), strict=True)
-            outputs = [outputs[part][place : place + 1] for part, place in places]
-            begins, sequence, kind = np.arange(len(order) + 1), sequence[order], kind[order]
-        return cls(outputs, begins, sequence, kind)
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def before(self, sequence: int) -> int:
-        """Return the number of messages sent before the entry with this number."""
-        return int(np.searchsorted(self.sequence, sequence))
-
-    def record(self, index: int) -> OutputRecord:
-        """Return one message."""
-        part = int(np.searchsorted(self.begins, index, side="right")) - 1
-        return self.parts[part].record(index - int(self.begins[part]))
-
-    def pieces(self, begin: int, end: int) -> Iterator[tuple[Messages, int, int]]:
-        """Yield the messages from `begin` to before `end`, chunk by chunk, with the indexes of each chunk's."""
-        first = int(np.searchsorted(self.begins, begin, side="right")) - 1
-        while begin < end:
-            origin, stop = int(self.begins[first]), min(end, int(self.begins[first + 1]))
-            yield self.parts[first].messages[begin - origin : stop - origin], begin, stop
-            begin, first = stop, first + 1
-
-
-def _joined(arrays: Iterable[Indexes]) -> Indexes:
-    return np.concatenate([np.zeros(0, np.int64), *arrays])
-
-
-def _kinds(part: Outputs, topics: Mapping[str, str]) -> Indexes:
-    lookup = np.full(int(part.messages.channel.max(initial=0)) + 1, -1)
-    for channel, (topic, _) in part.topics.items():
-        if topic in topics and channel < len(lookup):
-            lookup[channel] = PUBLICATION_TOPICS.index(topics[topic])
-    kinds: Indexes = lookup[part.messages.channel]
-    return kinds
 
 
 def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> None:

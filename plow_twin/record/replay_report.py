@@ -1,0 +1,71 @@
+"""What a replay found."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from plow_twin.record.reader import FileStatus
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """A difference: at advance number `step` (from 0), on `topic`, in `field`, recorded against computed."""
+
+    step: int
+    stamp_ns: int
+    topic: str
+    field: str
+    recorded: str
+    computed: str
+
+    def __str__(self) -> str:
+        return (
+            f"step {self.step}, stamp {self.stamp_ns} ns, {self.topic}: {self.field}: "
+            f"recorded {self.recorded}, computed {self.computed}"
+        )
+
+
+@dataclass
+class ReplayReport:
+    """What a replay found. `compared` and `not_compared` count messages by base name of their topic.
+
+    `inputs` counts what came, by input, used and not used.
+    """
+
+    path: Path
+    entries: int = 0
+    samples: int = 0
+    steps: int = 0
+    refused: int = 0
+    digests_compared: int = 0
+    snapshots_compared: int = 0
+    compared: Counter[str] = field(default_factory=Counter)
+    not_compared: Counter[str] = field(default_factory=Counter)
+    divergences: int = 0
+    first_divergence: Divergence | None = None
+    status: FileStatus = FileStatus.UNREAD
+    stop_reason: str | None = None
+    damaged_chunks: int = 0
+    lost: dict[str, int] = field(default_factory=dict)
+    inputs: dict[str, dict[str, int]] = field(default_factory=dict)
+    build_differences: dict[str, tuple[str, str]] = field(default_factory=dict)
+    span_s: float = 0.0
+    wall_s: float = 0.0
+
+    @property
+    def messages_compared(self) -> int:
+        """Number of messages compared on all topics."""
+        return self.compared.total()
+
+    @property
+    def loss(self) -> bool:
+        """Something of the run is missing in the file, or nothing in it could be compared."""
+        nothing = self.steps > 0 and self.messages_compared + self.digests_compared == 0
+        return bool(self.lost) or self.status is not FileStatus.COMPLETE or nothing
+
+    @property
+    def exit_code(self) -> int:
+        """0: the same, bit for bit; 1: diverged; 3: the same as far as the file goes, with loss."""
+        return 1 if self.first_divergence is not None else 3 if self.loss else 0

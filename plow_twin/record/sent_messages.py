@@ -1,0 +1,73 @@
+"""The messages that a run has sent, chunk by chunk, as one row in the order of the journal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from plow_twin.record.chunks import Messages
+from plow_twin.record.outputs import PUBLICATION_TOPICS
+from plow_twin.record.reader import OutputRecord, Outputs
+from plow_twin.record.template import Indexes
+
+
+@dataclass(frozen=True)
+class SentMessages:
+    """Messages that were sent, of many chunks, in order of sequence: indexes go over all of them.
+
+    `kind` is the place of a message's topic in `PUBLICATION_TOPICS`, -1 for other topics; part k begins at `begins[k]`.
+    """
+
+    parts: list[Outputs]
+    begins: Indexes
+    sequence: Indexes
+    kind: Indexes
+
+    @classmethod
+    def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
+        """Take messages; `topics` has the base names of those that follow from the motion."""
+        sequence, kind = _joined(part.sequence for part in outputs), _joined(_kinds(part, topics) for part in outputs)
+        begins = np.cumsum([0, *map(len, outputs)])
+        if (sequence[1:] < sequence[:-1]).any():  # not as our recorder writes: each message is a part
+            order = np.argsort(sequence, kind="stable")
+            owner = np.searchsorted(begins, order, side="right") - 1
+            places = zip(owner.tolist(), (order - begins[owner]).tolist(), strict=True)
+            outputs = [outputs[part][place : place + 1] for part, place in places]
+            begins, sequence, kind = np.arange(len(order) + 1), sequence[order], kind[order]
+        return cls(outputs, begins, sequence, kind)
+
+    def __len__(self) -> int:
+        return len(self.sequence)
+
+    def before(self, sequence: int) -> int:
+        """Return the number of messages sent before the entry with this number."""
+        return int(np.searchsorted(self.sequence, sequence))
+
+    def record(self, index: int) -> OutputRecord:
+        """Return one message."""
+        part = int(np.searchsorted(self.begins, index, side="right")) - 1
+        return self.parts[part].record(index - int(self.begins[part]))
+
+    def pieces(self, begin: int, end: int) -> Iterator[tuple[Messages, int, int]]:
+        """Yield the messages from `begin` to before `end`, chunk by chunk, with the indexes of each chunk's."""
+        first = int(np.searchsorted(self.begins, begin, side="right")) - 1
+        while begin < end:
+            origin, stop = int(self.begins[first]), min(end, int(self.begins[first + 1]))
+            yield self.parts[first].messages[begin - origin : stop - origin], begin, stop
+            begin, first = stop, first + 1
+
+
+def _joined(arrays: Iterable[Indexes]) -> Indexes:
+    return np.concatenate([np.zeros(0, np.int64), *arrays])
+
+
+def _kinds(part: Outputs, topics: Mapping[str, str]) -> Indexes:
+    lookup = np.full(int(part.messages.channel.max(initial=0)) + 1, -1)
+    for channel, (topic, _) in part.topics.items():
+        if topic in topics and channel < len(lookup):
+            lookup[channel] = PUBLICATION_TOPICS.index(topics[topic])
+    kinds: Indexes = lookup[part.messages.channel]
+    return kinds
