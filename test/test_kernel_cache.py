@@ -8,6 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.model import contact
+
 ROOT = Path(__file__).resolve().parent.parent
 #: How many functions of machine code a kernel has that `settle_modes` alone calls.
 LINKED = (
@@ -38,3 +43,15 @@ def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
 def test_a_kernel_that_only_kernels_call_has_no_machine_code(tmp_path: Path) -> None:
     """It would be compiled again in each caller: that took a third of the time."""
     assert run(tmp_path, LINKED) == "0"
+
+
+def test_a_call_from_python_of_what_has_no_machine_code_says_so() -> None:
+    assert normal_force(1e-3, 0.0, 1e7, 1.0, 0.0, 0.0, 0.0) == 1e4  # compiles it for its caller
+    with pytest.raises(TypeError, match="normal_force is for kernels to call"):
+        contact.normal_force(1e-3, 0.0, 1e7, 1.0, 0.0, 0.0, 0.0)
+
+
+@kernel(entry=True)
+def normal_force(*numbers: float) -> float:
+    """Call the kernel of this name."""
+    return contact.normal_force(*numbers)

@@ -12,8 +12,21 @@ from hypothesis import strategies as st
 from plow_twin import Clearance, Contact, Frame, Head, Scene, SceneError
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
-from plow_twin.model.contact import free_force, normal_force, power_term, power_terms, root_terms
+from plow_twin.model import contact
+from plow_twin.model.contact import power_term, power_terms, root_terms
 from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, exact_damping_number
+
+
+@kernel(entry=True)
+def normal_force(*numbers: float) -> float:
+    """Call the kernel of this name."""
+    return contact.normal_force(*numbers)
+
+
+@kernel(entry=True)
+def free_force(*numbers: float) -> float:
+    """Call the kernel of this name."""
+    return contact.free_force(*numbers)
 
 
 @pytest.mark.parametrize(

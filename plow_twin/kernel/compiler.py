@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numba
 
-from plow_twin.kernel.linked import LinkedCompiler
+from plow_twin.kernel.linked import LinkedCompiler, keep_from_python
 
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
@@ -67,6 +67,8 @@ def kernel(
             cache_file._source_stamp = SOURCE_DIGEST
             # read before the rest of an index, which cannot be read once a type that it names is gone
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
+            if "pipeline_class" in options:
+                keep_from_python(dispatcher)
         compiled: Callable[..., Any] = dispatcher
         return compiled
 

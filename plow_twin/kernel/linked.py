@@ -67,3 +67,12 @@ class LinkedCompiler(CompilerBase):
         passes.add_pass_after(_LowerForLinking, AnnotateTypes)
         passes.finalize()
         return [passes]
+
+
+def keep_from_python(dispatcher: Any) -> None:
+    """Make a call from Python an error: there is no machine code to go to."""
+
+    def refuse(*arguments: Any, **named: Any) -> None:
+        raise TypeError(f"{dispatcher.py_func.__qualname__} is for kernels to call: it would have to be an entry")
+
+    dispatcher._insert, dispatcher._compile_for_args = lambda *overload, **options: None, refuse
