@@ -69,8 +69,8 @@ def _contact_facts(scene: Scene) -> Iterator[Fact]:
         frequency = math.sqrt(contact.stiffness / scene.head.mass_kg) / (2.0 * math.pi)
         yield _fact("frequency of the head on one pair, undamped", frequency, "Hz")
     if contact.restitution is not None:
-        factor = LAWS[contact.law].damping_number(contact.restitution)
-        yield _fact("damping factor D = lambda v0 of the restitution", factor, "1")
+        number = LAWS[contact.law].damping_number(contact.restitution)
+        yield _fact("damping number D = lambda v0 of the restitution", number, "1")
 
 
 def _load_facts(scene: Scene) -> Iterator[Fact]:

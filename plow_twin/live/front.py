@@ -78,6 +78,7 @@ class BridgeFront:
 
     def now_ns(self) -> int:
         """Return the system's time, or that of the samples where they bring their own [ns]."""
+        # 0 would say that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
     def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:

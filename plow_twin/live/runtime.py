@@ -141,6 +141,7 @@ class Runtime:
         self.alarms = alarms_of(asdict(settings))
         if settings.estimate and settings.excitation_source == "scene":
             raise ParameterError([Problem("estimate", True, "false where excitation_source is scene: no load comes")])
+        # refuses, here and not while samples come, what the settings would change
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
             self.recording = self._record()

@@ -2,8 +2,8 @@
 
 Most laws have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive inward. They differ
 in the damping number  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch. The others
-add C d' to K d^n, at once (Kelvin-Voigt) or ramped in. A law is added by one entry in `LAWS`, by `add_law` from
-outside: every solver reads nothing but these numbers.
+add C d' to K d^n, at once (Kelvin-Voigt) or ramped in. A law is added by one entry in `_LAWS`, by `add_law` from
+outside; what it takes and the number it makes are all that solvers read of it.
 """
 
 from __future__ import annotations
@@ -173,7 +173,9 @@ LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
 
 
 def add_law(name: str, law: ContactLaw) -> None:
-    """Add a law of your own: from now on scenes can name it, and every solver and study takes it at full speed.
+    """Add a law of your own: from now on scenes of this process can name it, and every solver takes it at full speed.
+
+    Other processes (the node, workers of a sweep) do not know it.
 
     Parameters
     ----------

@@ -1,7 +1,8 @@
 """The queue of one input, emptied in one go, each message with the publisher it came from and its number there.
 
 rclpy hands messages over one by one and without the publisher's identity; the C interface below it (rcl, a public and
-stable one) tells it. The reader is an rclpy `Waitable`, which any executor takes.
+stable one) tells it. The reader is an rclpy `Waitable`, which any executor takes. Of rclpy's own it touches
+`Node._subscriptions`, so that no executor takes from the queue as well.
 """
 
 from __future__ import annotations

@@ -139,17 +139,17 @@ class Subscriptions:
             wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
                 # those before were another publisher's
-                arrived, followed = self._hand_over(arrived), inputs.senders.followed
+                self._hand_over(arrived)
+                arrived, followed = [], inputs.senders.followed
             if wanted:
                 self._intake.out_of_plane += out_of_plane
                 fx, fy, moment = values
                 arrived.append((stamp, (fx, fy, moment)))
         self._hand_over(arrived)
 
-    def _hand_over(self, arrived: list[Arrival]) -> list[Arrival]:
+    def _hand_over(self, arrived: list[Arrival]) -> None:
         if arrived:
             self._on_samples(arrived)
-        return []
 
     def _not_selected(self, topic: str, read: Callable[[bytes], _Read], batch: list[Taken]) -> None:
         for message in batch:

@@ -128,7 +128,7 @@ _STATUS: Final = {int(status): status for status in Status}
 
 
 def check_times(now: float, times: NDArray[np.float64]) -> None:
-    """Raise `ValueError` for times that are not finite or go back."""
+    """Raise `ArgumentError` for times that are not finite or go back."""
     if times.shape == (1,) and now <= times[0] < math.inf:
         return  # one after the other, as a live twin asks
     if times.ndim != 1 or not np.isfinite(times).all():

@@ -33,8 +33,9 @@ class TwinBatch:
     Parameters
     ----------
     scenes : sequence of Scene
-        One for each twin; their own loads are not used. The contact laws must have the same terms: all additive or all
-        not, and exponents that are all 1, all integers of at least 2, or all fractions.
+        One for each twin; their own loads are not used. The contact laws must have the same terms: all without
+        damping, all with C d', all ramped or all with lambda, and exponents that are all 1, all integers of at least 2,
+        or all fractions.
     tol : float
         As for `Twin`.
     start : float
@@ -238,7 +239,7 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
 
     Raises
     ------
-    ValueError
+    ArgumentError
         Where the members' laws do not have the same terms.
     """
     first = compiled[0].parts.terms

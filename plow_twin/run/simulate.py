@@ -206,7 +206,7 @@ def _check_limits(max_steps: int, max_wall_s: float) -> None:
 
 
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
-    """Raise `ValueError` for times that no run can have."""
+    """Raise `ArgumentError` for times that no run can have."""
     if not (np.isfinite(t_end) and t_end >= 0.0):
         raise ArgumentError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
     if output_dt is not None and not (np.isfinite(output_dt) and output_dt > 0.0):

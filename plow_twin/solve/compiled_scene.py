@@ -86,7 +86,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
 
     Raises
     ------
-    ValueError
+    ArgumentError
         For a tolerance out of range.
     """
     low, high = TOLERANCE_RANGE

@@ -6,6 +6,12 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.contact import free_force, normal_force
 
 
+@kernel(inline="source")
+def law_terms(terms):
+    """Return the terms of the law as a plain tuple, to be passed on with a star."""
+    return terms.viscous, terms.hysteretic, terms.integer, terms.fraction, terms.ramp
+
+
 @kernel(inline="code")
 def law_force(p, state, pair, penetration, rate):
     """Return the law's force of a pair in N, negative where it would pull."""

@@ -1,7 +1,7 @@
 """Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
 
-They evaluate the equations of motion (paper, eq. 5) as they stand, in world axes about the centre of mass,
-independently of the series: a check on them as much as a method.
+They evaluate the equations of motion (paper, eq. 5) as they stand, in world axes about the centre of mass: a check of
+steps and events as much as a method. Geometry and the value of the force are shared.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _switch(p, state, penetration, rate, time, totals, log) -> None:
 
 
 @kernel()
-def _add_to_totals(state, force_before, force, dt, totals) -> None:
+def _add_to_totals(force_before, force, dt, totals) -> None:
     """Add one step to the totals by the trapezoidal rule."""
     carrying = 0
     for pair in range(PAIR_COUNT):
@@ -105,7 +105,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
             if (before[pair] > 0.0) != (now[pair] > 0.0):
                 doubt = 0.5 * dt * (before[pair] + now[pair]) * p.inverse_mass
                 bound.error += doubt * p.position_tolerance / p.velocity_tolerance
-        _add_to_totals(state, before, now, dt, totals)
+        _add_to_totals(before, now, dt, totals)
         if not within_range(p, state, y):
             return _RANGE
     state.step_start = state.time = target
@@ -165,7 +165,7 @@ def integrate_fixed(
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
         _switch(p, state, pen, rate, t + dt, totals, log)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
-        _add_to_totals(state, before, now, dt, totals)
+        _add_to_totals(before, now, dt, totals)
         if balance is not None:
             balance_fixed_step(p, parts, state, y, t + dt, dt, balance)
         done[0] = n + 1

@@ -196,7 +196,7 @@ WORK: Final = np.dtype(
         ("penetration", "f8", _WIDE),  # penetration
         ("rate", "f8", _WIDE),  # its rate in time
         ("arm", "f8", _WIDE),
-        ("damped", "f8", _WIDE),  # elastic part times rate
+        ("damped", "f8", _WIDE),  # ramped damping: the ramp times the rate; other laws: not written
         ("force", "f8", _WIDE),
         ("wear", "f8", _WIDE),  # growth of the wear depth
         ("guard", "f8", _WIDE),

@@ -12,6 +12,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.dense_output import evaluate, time_along, wear_depth_at
 from plow_twin.solve.events import first_event, note_switches
 from plow_twin.solve.method import flight, implicit, rest, taylor
@@ -66,10 +67,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
     elif implicit.lay_out(
         p, parts, parts.implicit, terms.ramp, terms.wear, terms.slip, state, w, span, penetrating
     ) or taylor.lay_out(p, parts, terms.slip, parts.implicit, state, w, span, penetrating):
-        _end_at_event(
-            p, state, w, span, penetrating,
-            terms.viscous, terms.hysteretic, terms.integer, terms.fraction, terms.ramp,
-        )  # fmt: skip
+        _end_at_event(p, state, w, span, penetrating, law_terms(terms))
         implicit.note_step(parts.implicit, state, w, state.step_size, state.event_pair >= 0)
     else:
         return False
@@ -79,18 +77,16 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
 
 
 @kernel()
-def _end_at_event(p, state, w, span, penetrating, viscous, hysteretic, integer, fraction, ramp) -> None:
+def _end_at_event(p, state, w, span, penetrating, law) -> None:
     """Let the step that has been laid out end at its first event, if there is one; find its size in time."""
     sigma, order = state.sigma_end, state.order
-    end, pair, target = first_event(
-        p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp
-    )
+    end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law)
     if pair >= 0 and state.events_at_once > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.recoveries += 1
         end, pair = max(end, min(sigma, _PAST_AN_INSTANT)), -1
     if pair >= 0:
-        note_switches(p, state, w, order, end, pair, target, penetrating, viscous, hysteretic, integer, fraction, ramp)
+        note_switches(p, state, w, order, end, pair, target, penetrating, *law)
     if pair >= 0 or end != sigma:
         state.ends_at_stop = 0
     state.sigma_end, state.event_pair = end, pair

@@ -124,7 +124,7 @@ class Driver:
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
             late = bool(run) and self._is_late(run[0])
-            # what comes before the last of the run is judged by what the model knows then
+            # a stamp not after the last one's may be late or a jump back: that can be told once the run is applied
             if run and not late and stamp_ns <= run[-1].stamp_ns:
                 yield from self._use(run, now_ns)
                 run, late = [], False
@@ -316,7 +316,7 @@ class Driver:
             return
         for series in self.session.apply_samples(samples):
             self._advanced(now_ns)
-            # an end that is good ends a row of failures, whatever came before it
+            # failures count in a row: where the last advance went well none counts
             for status in series.status[-1:] if not series.status.any() else series.status:
                 self._judge_advance(Status(int(status)), StreamState.RUNNING)
             self._give_up_after_failures(now_ns)

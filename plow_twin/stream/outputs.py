@@ -77,7 +77,10 @@ class Publication:
 
 @dataclass(frozen=True)
 class Publications:
-    """Many publications: the fields of `Publication` with an axis (n,) in front; `slow_index` (m,) have slow parts."""
+    """Many publications: the numbers of `Publication` with an axis (n,) in front; `slow_index` (m,) have slow parts.
+
+    What is said of a publication beside its numbers (held, corrected) is not here.
+    """
 
     stamp_ns: NDArray[np.int64]
     penetration: Array
@@ -366,7 +369,7 @@ class Outputs:
         return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
-        """Return what the next publication depends on beside the next advance, exactly."""
+        """Return what the numbers of the next publication depend on beside the next advance, exactly."""
         slow_ns = -1 if self._slow_ns is None else self._slow_ns
         numbers = (self._makes, self._impulse, self._peak, self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)

@@ -38,8 +38,6 @@ from plow_twin.stream.model_changes import changed_scene, changed_twin, read_cha
 from plow_twin.stream.outputs import Outputs
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from plow_twin.run.advance import Advance, AdvanceSeries
     from plow_twin.run.twin import MarkedAdvance, Twin
 
@@ -76,8 +74,9 @@ class Session:
     origin_ns
         Stamp of model time 0, or None: the first stamp.
     on_entry
-        Receives each entry in order of time just before it is applied, and each digest after the advance that it
-        covers. An entry that the twin then refuses (a number is not finite) has been emitted: a replay refuses it too.
+        Receives the entries in order of use, those of one call before it applies them, and each digest after the
+        advance that it covers. An entry that the twin then refuses (a number is not finite) has been emitted: a replay
+        refuses it too.
     rollback_span_s
         How much older than the newest sample a late one may be [s]; 0: late samples are refused.
     wear_depth

@@ -94,7 +94,7 @@ class Mqtt:
         return [Arrived(topic, "json", time_ns, read_json(payload)) for topic, payload, time_ns in taken]
 
     def close(self) -> None:
-        """Leave the broker, which forgets nothing."""
+        """Leave the broker; it keeps what comes until the session is resumed."""
         self._client.disconnect()
         self._client.loop_stop()
 

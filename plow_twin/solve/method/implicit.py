@@ -101,7 +101,7 @@ def new_implicit() -> Implicit:
 
 
 @kernel()
-def decay_rate(p, state, w, slip) -> float:
+def decay_rate(p, state, slip) -> float:
     """Return the sum of the rates in 1/s at which the pairs' dampers stop the head; 0 where their springs matter.
 
     Friction that sticks is a damper too: its slope at the present slip.
@@ -401,7 +401,7 @@ def lay_out(p, parts, implicit, ramp, wear, slip, state, w, span, penetrating) -
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    w.decay[0] = decay_rate(p, state, w, slip) if penetrating else 0.0
+    w.decay[0] = decay_rate(p, state, slip) if penetrating else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
         return False
     size = _collocate(p, parts, state, w, span, w.decay[0], implicit, ramp, wear)

@@ -19,6 +19,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import lane, magnitude, pack, permutation, row, set_row, splat, spread_total, total
 from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.kinematics import row_values
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
 
@@ -264,8 +265,7 @@ def _wear(p, w, k, alpha, beta) -> None:
 def one_by_one(terms):
     """Return the terms as plain tuples, to be passed on with a star: of the load, of the law, and the others."""
     load = terms.harmonics, terms.second, terms.segments
-    law = terms.viscous, terms.hysteretic, terms.integer, terms.fraction, terms.ramp
-    return load, law, terms.wear, terms.offset, terms.free, terms.slip
+    return load, law_terms(terms), terms.wear, terms.offset, terms.free, terms.slip
 
 
 @kernel(fast=True)

@@ -166,7 +166,7 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
                 problems.append(f"{key}: got {raw.get(key)!r}, expected a number > 0")
         for index, item in enumerate(raw["targets"]):
             try:
-                targets.append(_target(item, index, scene))
+                targets.append(_target(item, scene))
             except StudyError as error:
                 problems.append(f"targets[{index}]: {error}")
     if problems:
@@ -177,7 +177,7 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
     )
 
 
-def _target(item: Any, index: int, scene: Scene) -> Target:
+def _target(item: Any, scene: Scene) -> Target:
     if not isinstance(item, dict) or not set(item) <= _KEYS:
         got = sorted(set(item) - _KEYS) if isinstance(item, dict) else item
         raise StudyError(f"got {got!r}, expected keys of {', '.join(sorted(_KEYS))}")
