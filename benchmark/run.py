@@ -33,6 +33,7 @@ PEERS: dict[str, Callable[[str], Iterator[Case]]] = {
     "lean": work_precision.lean_cases,
     "cvode": work_precision.cvode_cases,
     "python": work_precision.python_cases,
+    "heyoka": work_precision.heyoka_cases,
     "multibody": work_precision.multibody_cases,
 }
 SECTIONS = (
@@ -127,7 +128,7 @@ def _publish(rows: list[Row], measured: str) -> None:
 
 def _versions() -> dict[str, str]:
     versions = {"Python": platform.python_version()}
-    for name in ("numpy", "numba", "scipy", "scikit-sundae", "mujoco", "exudyn"):
+    for name in ("numpy", "numba", "scipy", "scikit-sundae", "mujoco", "exudyn", "heyoka"):
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:

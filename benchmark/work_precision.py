@@ -178,14 +178,18 @@ def python_cases(scene_name: str) -> Iterator[Case]:
                     scene_name, f"CVODE {method} (scikit-sundae)", setting, output_dt,
                     partial(python_peers.prepare_sundae, p, method, rtol, output_dt),
                 )  # fmt: skip
-    if scene_name == "kv":
-        for output_dt, tol in product((SPARSE, DENSE), _LADDER):
-            yield _case(
-                scene_name, HEYOKA, f"tol={tol:.3g}", output_dt, partial(heyoka_peer.prepare, p, tol, output_dt)
-            )
     for method, rtol in ((method, rtol) for method, ladder in _SOLVE_IVP.items() for rtol in ladder):
         prepare = partial(python_peers.prepare_solve_ivp, p, method, rtol, SPARSE)
         yield _case(scene_name, f"{method} (SciPy solve_ivp)", f"rtol={rtol:.3g}", SPARSE, prepare)
+
+
+def heyoka_cases(scene_name: str) -> Iterator[Case]:
+    """Yield heyoka, for the scene that it can run."""
+    if scene_name == "kv":
+        p = constants(bench_scene(scene_name))
+        for output_dt, tol in product((SPARSE, DENSE), _LADDER):
+            prepare = partial(heyoka_peer.prepare, p, tol, output_dt)
+            yield _case(scene_name, HEYOKA, f"tol={tol:.3g}", output_dt, prepare)
 
 
 def multibody_cases(scene_name: str) -> Iterator[Case]:
