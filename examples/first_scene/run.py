@@ -20,7 +20,7 @@ result = simulate(scene, t_end=10.0, output_dt=2e-3)
 
 for name in PAIR_NAMES:
     pair = result.statistics[name]
-    print(f"{name:20}  largest {pair['max'] / 1e3:6.1f} kN, {pair['makes']:3d} touches")
+    print(f"{name:20}  largest {pair['max'] / 1e3:6.1f} kN, {pair['makes']:3d} makes")
 print(f"{len(result.events)} changes of contact in {result.solver['steps']} steps, {1e3 * result.wall_s:.1f} ms")
 
 figure, (motion, force) = pyplot.subplots(2, sharex=True, figsize=(9, 5), layout="constrained")

@@ -1,4 +1,4 @@
-"""A live twin in Python: samples at 1 kHz in; force, impulse and touches out; saved, restored, compared."""
+"""A live twin in Python: samples at 1 kHz in; force, impulse and makes out; saved, restored, compared."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ def measured(t: float) -> tuple[float, float, float]:
     return 40e3 * np.sin(2.0 * t), 11e3 * np.sin(2.0 * t), 30e3 * np.sin(2.0 * t)
 
 
-saved, peak, touches = b"", np.zeros(8), np.zeros(8, dtype=int)
+saved, peak, makes = b"", np.zeros(8), np.zeros(8, dtype=int)
 for index in range(1, 5001):
     t = index * 1e-3
     now = twin.advance(t, measured(t))
     assert now.status is Status.OK, now.status
     # exact between samples too: no impact falls between two of them
-    peak, touches = np.maximum(peak, now.peak), touches + now.makes
+    peak, makes = np.maximum(peak, now.peak), makes + now.makes
     if index == 4000:
         saved = twin.snapshot()
 
-for name, largest, count in zip(PAIR_NAMES, peak, touches, strict=True):
-    print(f"{name:20}  largest {largest / 1e3:6.1f} kN, {count:3d} touches")
+for name, largest, count in zip(PAIR_NAMES, peak, makes, strict=True):
+    print(f"{name:20}  largest {largest / 1e3:6.1f} kN, {count:3d} makes")
 
 # another process would go on from here: the same samples give the same bits
 other = Twin(load_scene("bench_kv"), excitation="sampled", tol=1e-6)

@@ -334,11 +334,11 @@ def _print_clearances(console: Console, summary: RunSummary) -> None:
 
 
 def _force_table(summary: RunSummary) -> Table:
-    table = Table(title="Contact forces in kN: largest, mean in contact, touches")
+    table = Table(title="Contact forces in kN: largest, mean in contact, makes")
     letters = corner_letters(summary.scene)
     table.add_column("corner", no_wrap=True)
     for sense in SENSES:
-        for column in ("max", "mean", "touches"):
+        for column in ("max", "mean", "makes"):
             table.add_column(f"{sense}\n{column}", justify="right", no_wrap=True)
     for corner in CORNER_NAMES:
         pairs = [pair for pair in range(PAIR_COUNT) if corner_of(pair) == corner]

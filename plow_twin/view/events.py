@@ -22,7 +22,7 @@ class Events:
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
         self.count = 0
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
-        self._touches: NDArray[np.float64] | None = None
+        self._makes_before: NDArray[np.float64] | None = None
         self._status: dict[str, tuple[int, str]] = {}
         #: whether the load is held for want of samples
         self.silent = False
@@ -70,11 +70,11 @@ class Events:
         """Write the touches in rows of `contact_peaks`: all makes so far, (n, 8), largest forces [N], (n, 8)."""
         if not len(stamps):
             return
-        before = makes[:1] if self._touches is None else self._touches[None]
-        touches = np.diff(np.concatenate((before, makes)), axis=0)
-        self._touches = makes[-1].copy()
-        for row, pair in zip(*np.nonzero(touches > 0.0), strict=True):
-            count = touches[row, pair]
+        before = makes[:1] if self._makes_before is None else self._makes_before[None]
+        new = np.diff(np.concatenate((before, makes)), axis=0)
+        self._makes_before = makes[-1].copy()
+        for row, pair in zip(*np.nonzero(new > 0.0), strict=True):
+            count = new[row, pair]
             times = "" if count == 1 else f", {count:.0f} times"
             text = f"{PAIR_NAMES[pair]} touches{times}, up to {peak[row, pair] / 1e3:.1f} kN"
             self.add(int(stamps[row]), int(steps[row]), text)

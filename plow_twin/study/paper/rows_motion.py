@@ -64,16 +64,16 @@ def _motion(result: Result) -> Iterator[Row]:
 def _intermittent(scene: Scene, result: Result) -> Row:
     table = force_table(scene, result)
     duration = float(result.t[-1])
-    touches = {
+    makes = {
         letter: (sum(int(table[sense, letter]["makes"]) for sense in SENSE_NAMES)) / (duration / PERIOD_S)
         for letter in CORNERS
     }
     shares = [table[sense, letter]["time_in_contact"] / duration for sense in SENSE_NAMES for letter in CORNERS]
     return Row(
         _FORCES, FORCES_SOURCE, "every point meets the head intermittently", "all of a, b, c, d",
-        ", ".join(f"{letter} {value:.1f}" for letter, value in touches.items())
-        + f" touches a period; a sense carries {min(shares):.0%} to {max(shares):.0%} of the time",
-        Verdict.of(min(touches.values()) >= 1.0 and max(shares) < 1.0),
+        ", ".join(f"{letter} {value:.1f}" for letter, value in makes.items())
+        + f" makes a period; a sense carries {min(shares):.0%} to {max(shares):.0%} of the time",
+        Verdict.of(min(makes.values()) >= 1.0 and max(shares) < 1.0),
         "each point is touched at least once a period, none is held all the time", CHECK,
     )  # fmt: skip
 
