@@ -188,7 +188,7 @@ def test_what_is_estimated_stays_until_it_is_withdrawn_or_the_pads_are_changed()
 
 
 def test_a_worker_that_died_is_told_and_stops_nothing() -> None:
-    worker = Worker(preset("paper"), 10.0, 4.0, 1.0)
+    worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
     worker._process.kill()
     give_up = time.monotonic() + 20.0
     while not worker.error and time.monotonic() < give_up:

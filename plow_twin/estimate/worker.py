@@ -22,7 +22,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from plow_twin.estimate.estimate import Guess, estimate_window, warm_up
-from plow_twin.estimate.measurements import UNSTATED, Deviation
+from plow_twin.estimate.measurements import Deviation
 from plow_twin.estimate.result import Estimate
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.model.scene import Scene
@@ -69,19 +69,11 @@ class Worker:
     ----------
     scene : Scene
         The nominal scene.
-    length_s, interval_s, wait_s, poses, load
-        As of `Windows`.
+    windows : Windows
+        What forms the windows, nothing in it yet; the process has a copy.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        length_s: float,
-        interval_s: float,
-        wait_s: float,
-        poses: Deviation = UNSTATED,
-        load: Deviation = UNSTATED,
-    ) -> None:
+    def __init__(self, scene: Scene, windows: Windows) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno())]
         # one thread of linear algebra: it is to take no more than one core
@@ -91,7 +83,7 @@ class Worker:
         )
         far.close()
         self._connection = near
-        self._connection.send((scene, length_s, interval_s, wait_s, poses, load))
+        self._connection.send((scene, windows))
         self._waiting: deque[tuple[Any, ...]] = deque()
         self._restarts = 0
         self._closed = threading.Event()
@@ -158,8 +150,7 @@ class Worker:
 
 def serve(connection: Connection) -> None:
     """Estimate what comes until the other side is gone."""
-    scene, *given = connection.recv()
-    windows = Windows(*given)
+    scene, windows = connection.recv()
     warm_up(scene)
     guess: Guess = ()
     skipped = restarts = 0

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from plow_twin.estimate.result import Interval, State
+from plow_twin.estimate.window import Windows
 from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.parameters import Settings
 from plow_twin.model.scene import Scene
@@ -30,7 +31,8 @@ class Estimation:
     def __init__(self, settings: Settings, scene: Scene) -> None:
         self._frame_id = settings.frame_id
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
-        self._worker = Worker(scene, *span, settings.head_pose_deviation, settings.excitation_deviation)
+        windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation)
+        self._worker = Worker(scene, windows)
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
