@@ -2,7 +2,7 @@
 
 `python benchmark/live_load.py [--seconds N] [--repeats N]` prints a line of JSON for each case, medians of the repeats,
 in each of which every case runs once, and then the targets with what was reached. `--minutes N` runs the node with its
-recorder at 1 kHz for so long instead, prints a line each ten seconds, and what has grown.
+recorder at 1 kHz (or `--rate`) for so long instead, prints a line each ten seconds, and what has grown.
 The machine is shared by publisher, node and subscriber: what is compared is the node and the echo in the same run.
 """
 
@@ -226,11 +226,11 @@ def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, f
         yield f"share of a core, 100 Hz out{how}", rows[case]["core"], 1.0 / 3.0
 
 
-def soak(minutes: float) -> None:
-    """Run the node at 1 kHz with its recorder; print its size and figures, and what has grown in the last half."""
+def soak(minutes: float, rate_hz: float) -> None:
+    """Run the node with its recorder; print its size and figures, and what has grown in the last half."""
     rows: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as folder, running(_twin("on_sample", f"{folder}/soak")) as (probe, process_id):
-        sender, begin = source(1000, 60.0 * minutes), time.monotonic()
+        sender, begin = source(rate_hz, 60.0 * minutes), time.monotonic()
         while sender.poll() is None:
             count, busy = len(probe.ages), _cpu_s(process_id)
             probe.spin(lambda: sender.poll() is not None, PERIOD_S)
@@ -269,6 +269,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--minutes", type=float, default=0.0)
+    parser.add_argument("--rate", type=float, default=1000.0, help="samples a second of --minutes")
     parser.add_argument("--role", nargs="+", default=[])
     options = parser.parse_args()
     if options.role:
@@ -278,7 +279,7 @@ def main() -> None:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", "91")
     if options.minutes:
-        soak(options.minutes)
+        soak(options.minutes, options.rate)
     else:
         compare(options.seconds, options.repeats)
 

@@ -6,6 +6,7 @@ import gc
 import math
 import os
 import threading
+import time
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import ros_processes  # noqa: F401  (imports ROS without the warnings of its own modules)
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -24,10 +25,27 @@ from rclpy.serialization import serialize_message
 
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
+from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import Taken
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
+
+
+class _Flood:
+    """A queue that is never empty."""
+
+    def __init__(self) -> None:
+        self.fd = os.eventfd(1)
+        self.taken = 0
+
+    def take(self, most: int) -> bool:
+        self.taken += most
+        return True
+
+    def close(self) -> None:
+        os.close(self.fd)
+
 
 PAPER = load_scene(scene_path("paper"))
 
@@ -111,3 +129,44 @@ def test_loads_without_a_direction_may_be_named_and_count_nothing() -> None:
     for wrong in (every[1:], [*every, "cut"], [*every, "drum"], []):
         assert tools.wrench(wrong, [1.0] * len(wrong)) is None
     assert tools.wrench(every, [1.0]) is None
+
+
+def test_under_a_flood_of_samples_what_is_due_is_done_and_others_have_their_turn() -> None:
+    flood, turns, errors = _Flood(), Turns(), list[Exception]()
+    done, at = threading.Semaphore(0), list[int]()
+    loop = InputLoop(turns, errors.append)
+    loop.add(flood)  # type: ignore[arg-type]
+
+    def due() -> None:
+        at.append(flood.taken)
+        done.release()
+
+    loop.every(1e-3, due)
+    loop.start()
+    loop.run_timers(True)
+    for _ in range(20):
+        assert done.acquire(timeout=30.0)
+        with turns, turns:
+            inside = flood.taken
+            time.sleep(1e-3)
+            assert flood.taken == inside
+    loop.close()
+    assert not errors and len(set(at)) == len(at) and at[-1] > 20
+
+
+def test_an_error_in_the_thread_of_the_inputs_ends_the_program_and_is_said() -> None:
+    with _node() as node:
+        assert node.start()
+        assert node.runtime is not None and node._front is not None
+
+        def fail(*arguments: object) -> None:
+            raise RuntimeError("not foreseen")
+
+        node.runtime.inputs.take_travel = fail  # type: ignore[method-assign,assignment]
+        publisher = node.create_publisher(TwistStamped, "travel", 10)
+        give_up = time.monotonic() + 60.0
+        while node._front.error is None and time.monotonic() < give_up:
+            publisher.publish(TwistStamped())
+            time.sleep(0.05)
+        with pytest.raises(RuntimeError, match="not foreseen"):
+            node._publish_diagnostics()

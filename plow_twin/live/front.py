@@ -15,9 +15,11 @@ from plow_twin.live.parameters import Settings
 from plow_twin.live.part import Part
 from plow_twin.live.runtime import ESTIMATE, QUALITY, Runtime
 from plow_twin.live.solver_start import Prepared
+from plow_twin.live.timer import Timer
 from plow_twin.record.mapping import Role, read_map
-from plow_twin.record.messages import DiagnosticStatus, JointState, Message
+from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.record.outputs import PUBLICATION_TOPICS
+from plow_twin.stream.outputs import Publication
 
 NAME: Final = "/plow_twin"
 #: Longest wait for a message [s]: a request to stop is seen within it.
@@ -81,9 +83,12 @@ class BridgeFront:
         # 0 would say that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
-    def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
         """Send nothing: the recording holds the messages."""
         forces_sent()
+
+    def publish_quality(self, marks: JointState) -> None:
+        """Send nothing, as `publish`."""
 
     def publish_alarms(self, status: DiagnosticStatus) -> None:
         """Say the alarms."""
@@ -124,7 +129,7 @@ class BridgeFront:
 
     def _loop(self, stop_asked: Callable[[], bool], give_up: float) -> None:
         inputs, bridge = self.runtime.inputs, self._bridge
-        periodic = [_Timer(1.0 / rate, do) for rate, do in self.runtime.periodic()] + [_Timer(_REPORT_S, self._report)]
+        periodic = [Timer(1.0 / rate, do) for rate, do in self.runtime.periodic()] + [Timer(_REPORT_S, self._report)]
         while not (stop_asked() or bridge.finished) and time.monotonic() < give_up:
             next_due = min(timer.due for timer in periodic)
             messages = bridge.poll(max(0.0, min(_POLL_S, next_due - time.monotonic())))
@@ -144,20 +149,6 @@ class BridgeFront:
         self.changed()
         for name, part in self.parts().items():
             self._say(name, part)
-
-
-class _Timer:
-    """Something done at intervals of a steady clock; what is missed is left out."""
-
-    def __init__(self, period_s: float, do: Callable[[], None]) -> None:
-        self._period_s, self._do = period_s, do
-        self.due = time.monotonic() + period_s
-
-    def look(self) -> None:
-        now = time.monotonic()
-        if now >= self.due:
-            self.due += self._period_s * (1 + (now - self.due) // self._period_s)
-            self._do()
 
 
 def _roles(bridge: Bridge, mapping: Path | None, source: str, modelled: bool) -> dict[str, Role]:

@@ -23,8 +23,8 @@ from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import WearKeeper
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ACKNOWLEDGED, ALARMS, alarms_message, alarms_of
-from plow_twin.record.messages import DiagnosticStatus, JointState, Message
-from plow_twin.record.outputs import publication_messages, quality
+from plow_twin.record.messages import DiagnosticStatus, JointState
+from plow_twin.record.outputs import quality
 from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
@@ -69,8 +69,11 @@ class Front(Protocol):
     def now_ns(self) -> int:
         """Return the time on the clock of the stamps [ns]."""
 
-    def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:
-        """Send the messages of a publication by base name; call `forces_sent` right after the forces."""
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
+        """Send the messages of a publication; call `forces_sent` right after the forces."""
+
+    def publish_quality(self, marks: JointState) -> None:
+        """Send the marks of a publication that has some, or follows one that had."""
 
     def publish_alarms(self, status: DiagnosticStatus) -> None:
         """Send the alarms."""
@@ -506,18 +509,18 @@ class Runtime:
         self._q = publication.q
         self.held_frames += publication.held
         self.corrected_frames += publication.corrected
-        messages = publication_messages(publication, self._settings.frame_id, self._settings.child_frame_id)
-        if publication.marked:
-            messages[QUALITY] = quality(publication, self._settings.frame_id)
-        self._front.publish(messages, self._forces_sent)
+        self._front.publish(publication, self._forces_sent)
+        marks = quality(publication, self._settings.frame_id) if publication.marked else None
+        if marks is not None:
+            self._front.publish_quality(marks)
         self.published += 1
         changed = self.alarms.take(publication)
         if self._received_ns and not self._front.follows_samples:
             self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
         if self.recording:
             self.recording.publication(publication)
-            if publication.marked:
-                self.recording.message(QUALITY, publication.stamp_ns, messages[QUALITY])
+            if marks is not None:
+                self.recording.message(QUALITY, publication.stamp_ns, marks)
         if changed:
             self._alarms_changed(publication.stamp_ns)
 

@@ -35,12 +35,15 @@ class Prepared:
 
 
 class Preparation:
-    """A twin being made ready in a thread of its own."""
+    """A twin being made ready in a thread of its own.
 
-    def __init__(self, settings: Settings) -> None:
+    `warm_up` compiles, in the same thread, what else is needed.
+    """
+
+    def __init__(self, settings: Settings, warm_up: Callable[[], None] = lambda: None) -> None:
         self.key = key(settings)
         compiler = ThreadPoolExecutor(1, thread_name_prefix="compiler")
-        self._future = compiler.submit(_prepare, settings)
+        self._future = compiler.submit(_prepare, settings, warm_up)
         compiler.shutdown(wait=False)
         _started[:] = [future for future in _started if not future.done()]
         _started.append(self._future)
@@ -76,7 +79,7 @@ def key(settings: Settings) -> tuple[object, ...]:
     return settings.scene, settings.tolerance, settings.excitation_source, bound, found.st_mtime_ns, found.st_size
 
 
-def _prepare(settings: Settings) -> Prepared:
+def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
     scene = load_scene(scene_path(settings.scene))
     own = settings.excitation_source == "scene"
     twin = Twin(
@@ -85,7 +88,9 @@ def _prepare(settings: Settings) -> Prepared:
         excitation="scene" if own else "sampled",
         max_evaluations=settings.max_evaluations or None,
     )
-    return Prepared(scene, twin, twin.warm_up())
+    compile_s = twin.warm_up()
+    warm_up()
+    return Prepared(scene, twin, compile_s)
 
 
 def leave(code: int) -> int:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import MappingProxyType
 from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticStatus as RosDiagnosticStatus
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState as RosJointState
 from std_srvs.srv import Trigger
@@ -17,11 +16,13 @@ from std_srvs.srv import Trigger
 from plow_twin.live.parameters import Settings
 from plow_twin.live.runtime import ESTIMATE, Runtime
 from plow_twin.live.solver_start import Prepared
-from plow_twin.record.messages import DiagnosticStatus, JointState, Message
+from plow_twin.record.messages import DiagnosticStatus, JointState
+from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.messages import ros_joint_state, ros_status
 from plow_twin.ros.publishers import TOPICS, OutputPublishers
 from plow_twin.ros.qos import LATCHED
 from plow_twin.ros.subscriptions import Subscriptions
+from plow_twin.stream.outputs import Publication
 
 #: Services by name, each a method of the runtime.
 SERVICES: Final = ("reset", "switch_publisher", "set_wear", "acknowledge_alarms", "snapshot", "restore", "mark")
@@ -62,7 +63,8 @@ class RosFront:
         }
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.changed = changed
-        self._timers: list[Any] = []
+        #: one thread at a time has to do with the twin
+        self.turns = Turns()
         self._lost: list[str] = []
         with ExitStack() as made:
             self._make(settings, prepared, kept_wear, made)
@@ -83,27 +85,28 @@ class RosFront:
         if settings.estimate:
             self._estimates = node.create_publisher(RosJointState, ESTIMATE, LATCHED)
             made.callback(node.destroy_publisher, self._estimates)
-        self.subscriptions = Subscriptions(node, runtime, self.changed)
-        made.callback(self.subscriptions.close)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        for rate_hz, callback in runtime.periodic():
-            # steady: steps of the system's clock and a paused /clock do not touch it
-            timer = node.create_timer(1.0 / rate_hz, callback, clock=steady)
-            timer.cancel()
-            self._timers.append(timer)
-            made.callback(node.destroy_timer, timer)
+        self._loop = loop = InputLoop(self.turns, self._failed)
+        made.callback(loop.close)
+        self.subscriptions = Subscriptions(node, runtime, loop, self.turns, self.changed)
+        for rate_hz, do in runtime.periodic():
+            loop.every(1.0 / rate_hz, do)
         for name in SERVICES:
-            service = node.create_service(Trigger, f"~/{name}", _answer(runtime, getattr(runtime, name)))
+            service = node.create_service(Trigger, f"~/{name}", self._answer(getattr(runtime, name)))
             made.callback(node.destroy_service, service)
         runtime.start()
+        loop.start()
 
     def now_ns(self) -> int:
         """Return the node's time [ns]."""
         return int(self._node.get_clock().now().nanoseconds)
 
-    def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
         """Publish the messages of a publication."""
-        self._publishers.publish(messages, forces_sent)
+        self._publishers.publish(publication, forces_sent)
+
+    def publish_quality(self, marks: JointState) -> None:
+        """Publish the marks of a publication."""
+        self._publishers.publish_quality(marks)
 
     def publish_alarms(self, status: DiagnosticStatus) -> None:
         """Publish the alarms."""
@@ -117,17 +120,22 @@ class RosFront:
         """Log an error."""
         self._node.get_logger().error(text)
 
+    @property
+    def error(self) -> Exception | None:
+        """What ended the thread of the inputs, None while it runs."""
+        return self._loop.error
+
     def activate(self) -> None:
         """Start taking samples."""
-        self.runtime.activate()
-        for timer in self._timers:
-            timer.reset()
+        with self.turns:
+            self.runtime.activate()
+        self._loop.run_timers(True)
 
     def deactivate(self) -> None:
         """Stop taking samples."""
-        self.runtime.deactivate()
-        for timer in self._timers:
-            timer.cancel()
+        with self.turns:
+            self.runtime.deactivate()
+        self._loop.run_timers(False)
 
     def close(self) -> list[str]:
         """Release everything, last things first; return what was lost, in words."""
@@ -135,16 +143,18 @@ class RosFront:
         self._made.close()
         return self._lost
 
+    def _answer(
+        self, do: Callable[[], tuple[bool, str]]
+    ) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+        def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            with self.turns:
+                if self.runtime.waits_for_clock:
+                    response.success, response.message = False, "use_sim_time is set and nothing has come on /clock yet"
+                else:
+                    response.success, response.message = do()
+            return response
 
-def _answer(
-    runtime: Runtime,
-    do: Callable[[], tuple[bool, str]],
-) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
-    def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if runtime.waits_for_clock:
-            response.success, response.message = False, "use_sim_time is set and nothing has come on /clock yet"
-        else:
-            response.success, response.message = do()
-        return response
+        return answer
 
-    return answer
+    def _failed(self, error: Exception) -> None:
+        self.say_error(f"the inputs are read no more: {''.join(traceback.format_exception(error))}")

@@ -1,20 +1,21 @@
 """The queue of one input, emptied in one go, each message with the publisher it came from and its number there.
 
 rclpy hands messages over one by one and without the publisher's identity; the C interface below it (rcl, a public and
-stable one) tells it. The reader is an rclpy `Waitable`, which any executor takes. Of rclpy's own it touches
-`Node._subscriptions`, so that no executor takes from the queue as well.
+stable one) tells it, and writes to an eventfd when something has come: that needs neither executor nor interpreter. Of
+rclpy's own it touches `Node._subscriptions`, so that no executor takes from the queue as well.
 """
 
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from rclpy.node import Node
 from rclpy.subscription import Subscription
-from rclpy.waitable import NumberOfEntities, Waitable
 
 _FIRST_CAPACITY: Final = 1024
 
@@ -78,7 +79,18 @@ def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
         ctypes.POINTER(_Info),
         ctypes.c_void_p,
     ]
+    rcl.rcl_subscription_set_on_new_message_callback.argtypes = [ctypes.c_void_p] * 3
     return rcl, rcutils
+
+
+@cache
+def _count_up() -> ctypes.c_void_p:
+    """Return `eventfd_write(fd, count)` as a callback of rcl.
+
+    rcl calls it with what it was given, here the number of the eventfd, and the number of new messages: each in the
+    register where the function expects it.
+    """
+    return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 
 def _new_buffer() -> _Bytes:
@@ -90,65 +102,59 @@ def _new_buffer() -> _Bytes:
     return buffer
 
 
-class InputQueue(Waitable):
-    """Take a subscription out of the executor's hands and empty its queue whenever something has arrived.
+class InputQueue:
+    """Take a subscription out of the executor's hands, and tell by a file descriptor that something has arrived.
 
     Parameters
     ----------
     node
-        The node that the subscription was made on.
+        The node that the subscription was made on; made in the thread of its executor, as the subscription.
     subscription
         The subscription; its own callback is never called.
-    depth
-        Most messages taken at once.
     on_batch
-        Receives the messages in order of arrival.
+        Receives messages in order of arrival.
+
+    Attributes
+    ----------
+    fd : int
+        Can be read once something has arrived.
     """
 
-    def __init__(
-        self, node: Node, subscription: Subscription, depth: int, on_batch: Callable[[list[Taken]], None]
-    ) -> None:
-        super().__init__(node.default_callback_group)
-        self._node, self._subscription, self._depth, self._on_batch = node, subscription, depth, on_batch
-        self._take = _libraries()[0].rcl_take_serialized_message
+    def __init__(self, node: Node, subscription: Subscription, on_batch: Callable[[list[Taken]], None]) -> None:
+        self._node, self._subscription, self._on_batch = node, subscription, on_batch
+        rcl, _ = _libraries()
+        self._take, self._listen = rcl.rcl_take_serialized_message, rcl.rcl_subscription_set_on_new_message_callback
         self._buffer, self._info = _new_buffer(), _Info()
-        self._index: int | None = None
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         # no executor shall take from it as well
         node._subscriptions.remove(subscription)
-        node.add_waitable(self)
+        with subscription.handle:
+            self._listen(subscription.handle.pointer, _count_up(), self.fd)
 
-    def flush(self) -> None:
-        """Hand over what waits now."""
-        while taken := self.take_data():
+    def take(self, most: int) -> bool:
+        """Hand over what waits now, up to `most` messages; True when there may be more."""
+        with suppress(BlockingIOError):  # asked without a sign
+            os.eventfd_read(self.fd)
+        taken = self._taken(most)
+        if taken:
             self._on_batch(taken)
+        return len(taken) == most
 
     def close(self) -> None:
         """Take the subscription off the node."""
-        self._node.remove_waitable(self)
+        with self._subscription.handle:
+            self._listen(self._subscription.handle.pointer, None, None)
+        os.close(self.fd)
         self._node._subscriptions.append(self._subscription)
         self._node.destroy_subscription(self._subscription)
         _libraries()[1].rcutils_uint8_array_fini(ctypes.byref(self._buffer))
 
-    def get_num_entities(self) -> NumberOfEntities:
-        """Return what the wait set must have room for."""
-        return NumberOfEntities(num_subs=1)
-
-    def add_to_wait_set(self, wait_set: Any) -> None:
-        """Add the subscription to a wait set."""
-        with self._subscription.handle:
-            self._index = wait_set.add_subscription(self._subscription.handle)
-
-    def is_ready(self, wait_set: Any) -> bool:
-        """Tell whether something has arrived."""
-        return self._index is not None and bool(wait_set.is_ready("subscription", self._index))
-
-    def take_data(self) -> list[Taken]:
-        """Empty the queue."""
+    def _taken(self, most: int) -> list[Taken]:
         taken: list[Taken] = []
         info, buffer, take = self._info, self._buffer, self._take
         with self._subscription.handle:
             pointer = self._subscription.handle.pointer
-            while len(taken) < self._depth:
+            while len(taken) < most:
                 answer = take(pointer, buffer, info, None)
                 if answer:
                     break
@@ -159,14 +165,3 @@ class InputQueue(Waitable):
         if answer not in (0, _NOTHING_TAKEN):
             raise RuntimeError(f"{self._subscription.topic_name}: rcl_take_serialized_message returned {answer}")
         return taken
-
-    async def execute(self, taken: list[Taken]) -> None:
-        """Hand over what was taken."""
-        if taken:
-            self._on_batch(taken)
-
-    def __enter__(self) -> None:
-        self._subscription.handle.__enter__()
-
-    def __exit__(self, *error: object) -> None:
-        self._subscription.handle.__exit__(*error)

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import Final
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 from plow_twin.record import messages as plain
-from plow_twin.record.template import STAMP_AT, Template
 from plow_twin.stream.intake import NS_PER_S
 
 Wrench = tuple[float, float, float]
@@ -72,30 +67,3 @@ def ros_joint_state(message: plain.JointState) -> JointState:
     for quantity in _QUANTITIES:
         setattr(found, quantity, array("d", getattr(message, quantity).tobytes()))
     return found
-
-
-class Serializer:
-    """The CDR bytes of messages of one template: rclpy sends them as they are, in a third of the time of an object."""
-
-    def __init__(self, template: Template) -> None:
-        self._bytes = bytearray(template.data.tobytes())
-        # numbers that stand side by side are written at once
-        begins = [0, *(1 + np.flatnonzero(np.diff(template.places) != 8)), template.count]
-        self._views = [
-            np.frombuffer(self._bytes, np.float64, end - begin, int(template.places[begin]))
-            for begin, end in pairwise(begins)
-        ]
-
-    def write(self, message: plain.JointState | plain.Odometry) -> bytes:
-        """Return the bytes of a message that has the template's names."""
-        _STAMP.pack_into(self._bytes, STAMP_AT, *divmod(message.stamp_ns, NS_PER_S))
-        for view, numbers in zip(self._views, _numbers(message), strict=True):
-            view[:] = numbers
-        return bytes(self._bytes)
-
-
-def _numbers(message: plain.JointState | plain.Odometry) -> list[Sequence[float] | NDArray[np.float64]]:
-    """Return the numbers of a message in the order of its template, those side by side together."""
-    if isinstance(message, plain.JointState):
-        return [part for part in (message.position, message.velocity, message.effort) if len(part)]
-    return [message.position[:2], message.orientation[2:], message.linear[:2], message.angular[2:]]

@@ -6,6 +6,7 @@ import gc
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -21,6 +22,7 @@ from plow_twin.live.realtime import apply_realtime
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Preparation, key
 from plow_twin.record import messages as plain
+from plow_twin.record import sending
 from plow_twin.ros.front import RosFront
 from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
@@ -83,7 +85,7 @@ class TwinNode(LifecycleNode):
         settings = self._table.settings
         if self.runtime is None and (self._preparation is None or self._preparation.key != key(settings)):
             self.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
-            self._preparation = Preparation(settings)
+            self._preparation = Preparation(settings, sending.warm_up)
 
     @property
     def prepared(self) -> bool:
@@ -172,12 +174,18 @@ class TwinNode(LifecycleNode):
         self._publish_status()
         return TransitionCallbackReturn.SUCCESS
 
+    def _turn(self) -> AbstractContextManager[None]:
+        """Return what keeps the thread of the inputs away from the runtime meanwhile."""
+        return nullcontext() if self._front is None else self._front.turns
+
     def _refusals(self, settings: Settings) -> list[str]:
-        return [] if self.runtime is None else self.runtime.refusals(settings)
+        with self._turn():
+            return [] if self.runtime is None else self.runtime.refusals(settings)
 
     def _parameter_changed(self, name: str, value: Any) -> None:
-        if self.runtime is not None:
-            self.runtime.parameter(name, value, self._table.settings)
+        with self._turn():
+            if self.runtime is not None:
+                self.runtime.parameter(name, value, self._table.settings)
 
     def _refuse_invalid_transitions(self) -> None:
         """Answer an impossible transition instead of ending the process, as rclpy's own callback would."""
@@ -196,21 +204,25 @@ class TwinNode(LifecycleNode):
         service.callback = answer
 
     def _publish_status(self) -> None:
-        preparing = self.runtime is None and not self.prepared
-        report = diagnostics.summary(self.lifecycle, self.reason, self.runtime, preparing)
-        if report == self._published_status:
-            return
-        self._published_status = report
-        level, message, values = report
-        name, head = self.get_fully_qualified_name(), self._table.settings.hardware_id
-        status = plain.DiagnosticStatus(level, name, message, head, tuple(values.items()))
-        self._status.publish(ros_status(status))
-        if self.runtime is not None:
-            self.runtime.record_status(status)
+        with self._turn():
+            preparing = self.runtime is None and not self.prepared
+            report = diagnostics.summary(self.lifecycle, self.reason, self.runtime, preparing)
+            if report == self._published_status:
+                return
+            self._published_status = report
+            level, message, values = report
+            name, head = self.get_fully_qualified_name(), self._table.settings.hardware_id
+            status = plain.DiagnosticStatus(level, name, message, head, tuple(values.items()))
+            self._status.publish(ros_status(status))
+            if self.runtime is not None:
+                self.runtime.record_status(status)
 
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
-            self._front.subscriptions.look_for_senders()
+            if self._front.error is not None:
+                raise self._front.error  # as from any callback: the program ends, and says why
+            with self._turn():
+                self._front.subscriptions.look_for_senders()
         elif self.lifecycle == "unconfigured" and not self.reason:
             # a manager that configures later, perhaps another scene, need not wait for the compiler then
             self.prepare()
@@ -220,7 +232,8 @@ class TwinNode(LifecycleNode):
                 "use_sim_time is set and nothing has come on /clock: waiting, nothing is recorded"
             )
         self._reports += 1
-        parts = self._health.parts(self.lifecycle, self.reason, self.runtime, time.monotonic_ns())
+        with self._turn():
+            parts = self._health.parts(self.lifecycle, self.reason, self.runtime, time.monotonic_ns())
         array = DiagnosticArray()
         array.header.stamp = self.get_clock().now().to_msg()
         name, head = self.get_fully_qualified_name(), self._table.settings.hardware_id

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Final
 
 from nav_msgs.msg import Odometry as RosOdometry
@@ -10,10 +10,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState as RosJointState
 
 from plow_twin.live.runtime import QUALITY
-from plow_twin.record.messages import JointState, Message, Odometry
-from plow_twin.record.outputs import PUBLICATION_TOPICS, publication_templates, quality_template
-from plow_twin.ros.messages import Serializer
+from plow_twin.record.messages import JointState
+from plow_twin.record.outputs import PUBLICATION_TOPICS
+from plow_twin.record.sending import PublicationBytes
+from plow_twin.ros.messages import ros_joint_state
 from plow_twin.ros.qos import KEPT_OUTPUT, OUTPUT
+from plow_twin.stream.outputs import Publication
 
 #: Output topics that follow from the motion, with their types.
 TOPICS: Final[dict[str, type]] = {
@@ -31,16 +33,19 @@ class OutputPublishers:
             topic: node.create_publisher(kind, topic, KEPT_OUTPUT if topic == QUALITY else OUTPUT)
             for topic, kind in TOPICS.items()
         }
-        templates = publication_templates(frame_id, child_frame_id) | {QUALITY: quality_template(frame_id)}
-        self._serializers = {topic: Serializer(template) for topic, template in templates.items()}
+        self._bytes = PublicationBytes(frame_id, child_frame_id)
 
-    def publish(self, messages: Mapping[str, Message], forces_sent: Callable[[], None]) -> None:
-        """Publish the messages of a publication in their order; `forces_sent` is called right after the forces."""
-        for topic, message in messages.items():
-            assert isinstance(message, JointState | Odometry)
-            self._publishers[topic].publish(self._serializers[topic].write(message))
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
+        """Publish the messages of a publication, forces first; `forces_sent` is called right after them."""
+        publishers = self._publishers
+        for topic, data in self._bytes.write(publication).items():
+            publishers[topic].publish(data)
             if topic == "contact_forces":
                 forces_sent()
+
+    def publish_quality(self, marks: JointState) -> None:
+        """Publish the marks of a publication."""
+        self._publishers[QUALITY].publish(ros_joint_state(marks))
 
     def close(self) -> None:
         """Take the publishers off the node."""

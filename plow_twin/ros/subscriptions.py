@@ -17,6 +17,7 @@ from sensor_msgs.msg import JointState
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.messages import read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
@@ -41,42 +42,36 @@ class Subscriptions:
         The node.
     runtime
         Where samples go.
+    loop, turns
+        The thread that takes the messages, and what keeps it apart from the executor's.
     on_matched
         Called when the number of publishers of an input has changed.
     """
 
-    def __init__(self, node: Node, runtime: Runtime, on_matched: Callable[[], None]) -> None:
-        self._node = node
+    def __init__(
+        self, node: Node, runtime: Runtime, loop: InputLoop, turns: Turns, on_matched: Callable[[], None]
+    ) -> None:
+        self._node, self._loop, self._turns = node, loop, turns
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
         self._inputs.look_for_senders = self.look_for_senders
         self._on_samples = runtime.samples
         self._on_matched = on_matched
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.source, self._inputs.depth
-        self._queues: list[InputQueue] = []
         self._names: dict[tuple[str, bytes], str] = {}
         self._inputs.unused.name_of = self._name_of
         read_sample = {"excitation": self._read_wrench, "tool_forces": self._read_tool_forces}
-        try:
-            for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
-                take = self._samples if topic == self._source else self._not_selected
-                self._subscribe(kind, topic, depth, partial(take, topic, read_sample[topic]))
-            self._subscribe(TwistStamped, "travel", _SLOW_DEPTH, self._travel_speeds)
-            self._subscribe(PoseStamped, "head_pose", _SLOW_DEPTH, self._measured_poses)
-            self._subscribe(JointState, "gaps", _SLOW_DEPTH, self._measured_gaps)
-        except BaseException:  # an override of the quality of service may be wrong for any of them
-            self.close()
-            raise
+        for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
+            take = self._samples if topic == self._source else self._not_selected
+            self._subscribe(kind, topic, depth, partial(take, topic, read_sample[topic]))
+        self._subscribe(TwistStamped, "travel", _SLOW_DEPTH, self._travel_speeds)
+        self._subscribe(PoseStamped, "head_pose", _SLOW_DEPTH, self._measured_poses)
+        self._subscribe(JointState, "gaps", _SLOW_DEPTH, self._measured_gaps)
 
     def look_for_senders(self) -> None:
         """Find out whether the followed publisher is still there."""
         if self._source != "scene":
             self._inputs.senders.alive(self._present(self._source))
-
-    def close(self) -> None:
-        """Take the subscriptions off the node."""
-        for queue in self._queues:
-            queue.close()
 
     def _present(self, topic: str) -> list[bytes]:
         """Return the publishers of an input that there are."""
@@ -110,7 +105,7 @@ class Subscriptions:
         )
         if topic == self._source:
             self._inputs.senders.start(self._present(topic))
-        self._queues.append(InputQueue(self._node, subscription, depth, take))
+        self._loop.add(InputQueue(self._node, subscription, take))
 
     def _message_lost(self, event: Any) -> None:
         self._inputs.lost += event.total_count_change
@@ -123,10 +118,11 @@ class Subscriptions:
         )
 
     def _matched(self, topic: str, event: Any) -> None:
-        self._inputs.publishers[topic] = event.current_count
-        if topic == self._source:
-            self.look_for_senders()
-        self._on_matched()
+        with self._turns:
+            self._inputs.publishers[topic] = event.current_count
+            if topic == self._source:
+                self.look_for_senders()
+            self._on_matched()
 
     def _samples(self, topic: str, read: Callable[[bytes], _Read], batch: list[Taken]) -> None:
         """Take in what has been in the queue of the selected source."""

@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.cdr import schema_text
 from plow_twin.record.metadata_yaml import dump_yaml, offered
+from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.main import make_executor
 
@@ -44,26 +45,31 @@ class TopicRecorder:
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
-        self._queues: dict[str, InputQueue] = {}
+        self._topics: set[str] = set()
+        self._turns = Turns()
+        self._loop = InputLoop(self._turns, lambda error: None)
         #: why a topic is not recorded
         self.skipped: dict[str, str] = {}
         #: messages that publishers sent and that never came, by their own numbering
         self.missed: dict[str, int] = {}
         self._newest: dict[tuple[str, bytes], int] = {}
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        node.create_timer(_LOOK_S, self.look, clock=steady)
-        node.create_timer(_FLUSH_S, writer.flush, clock=steady)
+        self._loop.every(_FLUSH_S, writer.flush)
+        node.create_timer(_LOOK_S, self.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._loop.run_timers(True)
+        self._loop.start()
 
     @property
     def topics(self) -> list[str]:
         """What is recorded."""
-        return sorted(self._queues)
+        return sorted(self._topics)
 
     def look(self) -> None:
         """Subscribe to what has appeared."""
+        if self._loop.error is not None:
+            raise self._loop.error
         for name, types in self._node.get_topic_names_and_types():
             publishers = self._node.get_publishers_info_by_topic(name)
-            if publishers and name not in self._queues and name not in self.skipped and self._wanted(name):
+            if publishers and name not in self._topics and name not in self.skipped and self._wanted(name):
                 try:
                     self._subscribe(name, types, publishers)
                 except (LookupError, ImportError, AttributeError, OSError) as error:
@@ -95,8 +101,10 @@ class TopicRecorder:
             ),
             raw=True,
         )
-        take = partial(self._take, name, self._writer.topic(topic))
-        self._queues[name] = InputQueue(self._node, subscription, _DEPTH, take)
+        with self._turns:
+            take = partial(self._take, name, self._writer.topic(topic))
+        self._topics.add(name)
+        self._loop.add(InputQueue(self._node, subscription, take))
 
     def _take(self, name: str, number: int, taken: list[Taken]) -> None:
         for message in taken:
@@ -109,9 +117,8 @@ class TopicRecorder:
 
     def close(self) -> None:
         """Take what still waits, and end the subscriptions."""
-        for queue in self._queues.values():
-            queue.flush()
-            queue.close()
+        self._loop.flush()
+        self._loop.close()
 
 
 def record_topics(

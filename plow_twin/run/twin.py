@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time as _time
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -38,6 +39,8 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Steps one advance may take before it gives up.
 DEFAULT_BUDGET = 50_000_000
+#: Rows made at once for advances one by one.
+_STOCK = 256
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
@@ -93,6 +96,7 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
+        self._stock, self._rows_left = np.zeros(0, ROW), 0
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
@@ -185,13 +189,14 @@ class Twin:
             raise ArgumentError("advance_samples: got excitation='scene', expected excitation='sampled'")
         times, samples = np.asarray(t, dtype=np.float64), np.ascontiguousarray(wrench, dtype=np.float64)
         check_times(self.time, times)
-        if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
+        if samples.shape != (len(times), 3) or not _finite(samples):
             raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
-        rows = np.zeros(len(times), ROW)
-        ends = np.concatenate([self._wrench[None], samples])
+        rows = self._new_rows(len(times))
+        ends = np.empty((1, len(times) + 1, 3))
+        ends[0, 0], ends[0, 1:] = self._wrench, samples
         loop.advance_batch(
             self._params, self._parts, self._states, self._works, self._all_totals, 0, 1, times,
-            (ends / self._inertias)[None], self._budget, rows[None], self._bound,
+            ends / self._inertias, self._budget, rows[None], self._bound,
         )  # fmt: skip
         self._wrench = samples[-1].copy() if len(samples) else self._wrench
         return AdvanceSeries.of(times, rows)
@@ -363,6 +368,15 @@ class Twin:
         )  # fmt: skip
         return AdvanceSeries.of(times, rows)
 
+    def _new_rows(self, count: int) -> NDArray[np.void]:
+        """Return rows of zeros. One by one they are cut from a stock: numpy takes as long for one as for hundreds."""
+        if count != 1:
+            return np.zeros(count, ROW)
+        if self._rows_left == 0:
+            self._stock, self._rows_left = np.zeros(_STOCK, ROW), _STOCK
+        self._rows_left -= 1
+        return self._stock[self._rows_left : self._rows_left + 1]
+
     def _end_step(self) -> None:
         loop.interrupt_step(self._compiled.params, self._parts, self._state, self._work, self._totals)
 
@@ -380,6 +394,13 @@ class MarkedAdvance:
     rows: AdvanceSeries | None
     status: NDArray[np.int64]
     digests: list[str]
+
+
+def _finite(samples: NDArray[np.float64]) -> bool:
+    """Tell whether all numbers of samples (n, 3) are finite."""
+    if len(samples) == 1:
+        return all(map(math.isfinite, samples[0].tolist()))
+    return bool(np.isfinite(samples).all())
 
 
 def _digest(snapshot: bytes) -> str:

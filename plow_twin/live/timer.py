@@ -1,0 +1,25 @@
+"""Something done at intervals of a steady clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+
+class Timer:
+    """Call `do` each `period_s`; what is missed is left out, and the phase is kept."""
+
+    def __init__(self, period_s: float, do: Callable[[], None]) -> None:
+        self._period_s, self._do = period_s, do
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin anew: it is due in a period."""
+        self.due = time.monotonic() + self._period_s
+
+    def look(self) -> None:
+        """Do it when it is due."""
+        now = time.monotonic()
+        if now >= self.due:
+            self.due += self._period_s * (1 + (now - self.due) // self._period_s)
+            self._do()

@@ -1,0 +1,143 @@
+"""A thread that empties the queues of inputs as messages come, and does what is due by a steady clock.
+
+An executor of rclpy makes a task of each message, and rclpy's events executor looks at its timers only when nothing
+waits: at 10 kHz, 95 % of its tasks found a queue that the one before had emptied, and nothing was published.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from plow_twin.live.timer import Timer
+from plow_twin.ros.input_queue import InputQueue
+
+#: Most messages taken at once: what is due, and who waits for a turn, comes in between.
+_MOST: Final = 200
+#: All queues are looked at this often [s], even without a sign that something has come.
+_LOOK_S: Final = 0.1
+
+
+class Turns:
+    """A lock whose users take turns: who waits is let in before the one that has just left; a user may enter again."""
+
+    def __init__(self) -> None:
+        self._inside, self._next = threading.Lock(), threading.Lock()
+        self._user, self._depth = 0, 0
+
+    def __enter__(self) -> None:
+        me = threading.get_ident()
+        if self._user != me:
+            with self._next:
+                self._inside.acquire()
+            self._user = me
+        self._depth += 1
+
+    def __exit__(self, *error: object) -> None:
+        self._depth -= 1
+        if not self._depth:
+            self._user = 0
+            self._inside.release()
+
+
+class InputLoop:
+    """The thread of a node's inputs. All that it does it does in its turn.
+
+    Parameters
+    ----------
+    turns
+        What keeps it apart from the executor's thread.
+    on_error
+        Called with what ended the thread, which is kept in `error` too.
+    """
+
+    def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
+        self._turns, self._on_error = turns, on_error
+        self._queues: dict[int, InputQueue] = {}
+        self._timers: list[Timer] = []
+        self._look = Timer(_LOOK_S, self._look_at_all)
+        self._active = self._stopped = False
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._thread = threading.Thread(target=self._run, name="plow_twin_inputs", daemon=True)
+        #: what ended the thread; None: it runs, or has been stopped
+        self.error: Exception | None = None
+
+    def add(self, queue: InputQueue) -> None:
+        """Empty a queue from now on, and close it at the end."""
+        with self._turns:
+            self._queues[queue.fd] = queue
+        self._look_again()
+
+    def every(self, period_s: float, do: Callable[[], None]) -> None:
+        """Do something each `period_s` while the timers run; before the start."""
+        self._timers.append(Timer(period_s, do))
+
+    def start(self) -> None:
+        """Start the thread; the timers stand still."""
+        self._thread.start()
+
+    def run_timers(self, active: bool) -> None:
+        """Let the timers run, beginning anew, or stand still."""
+        with self._turns:
+            for timer in self._timers:
+                timer.restart()
+            self._active = active
+        self._look_again()
+
+    def close(self) -> None:
+        """End the thread and close the queues; not in a turn."""
+        self._stopped = True
+        self._look_again()
+        if self._thread.is_alive():
+            self._thread.join()
+        for queue in self._queues.values():
+            queue.close()
+        self._queues.clear()
+        os.close(self._wake)
+
+    def flush(self) -> None:
+        """Hand over what waits in the queues now."""
+        with self._turns:
+            for queue in self._queues.values():
+                while queue.take(_MOST):
+                    pass
+
+    def _look_again(self) -> None:
+        os.eventfd_write(self._wake, 1)
+
+    def _run(self) -> None:
+        try:
+            left: set[int] = set()
+            while not self._stopped:
+                left = self._go(left.union(self._ready(0.0 if left else self._pause_s())))
+        except Exception as error:  # a thread that ended unseen would be a twin that stands still
+            self.error = error
+            self._on_error(error)
+
+    def _pause_s(self) -> float:
+        dues = [timer.due for timer in self._timers] if self._active else []
+        return max(0.0, min(self._look.due, *dues) - time.monotonic()) if dues else _LOOK_S
+
+    def _ready(self, pause_s: float) -> list[int]:
+        """Wait until something has come, a timer is due, or somebody wakes the loop; return the queues that have."""
+        ready = select.select([self._wake, *self._queues], (), (), pause_s)[0]
+        if self._wake in ready:
+            os.eventfd_read(self._wake)
+            ready.remove(self._wake)
+        return ready
+
+    def _go(self, ready: set[int]) -> set[int]:
+        """Empty queues and do what is due, in a turn; return the queues that may not be empty."""
+        with self._turns:
+            left = {fd for fd in ready if self._queues[fd].take(_MOST)}
+            for timer in (self._look, *(self._timers if self._active else ())):
+                timer.look()
+        return left
+
+    def _look_at_all(self) -> None:
+        for queue in self._queues.values():
+            queue.take(_MOST)
