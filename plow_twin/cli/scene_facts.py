@@ -8,6 +8,7 @@ from dataclasses import fields
 from typing import Any
 
 from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.friction import painleve_coefficients
 from plow_twin.model.scene import OPTIONAL_PARTS, Harmonic, Scene, Table
 from plow_twin.scene_file.schema import SECTIONS
 
@@ -56,6 +57,10 @@ def derived(scene: Scene) -> list[Fact]:
         _fact("weight", weight, "N"),
         _fact("constant moment of gravity", -weight * gravity.arm_m, "N m"),
     ]
+    if scene.friction is not None:
+        least = float(painleve_coefficients(scene).min())
+        if math.isfinite(least):
+            facts.append(_fact("friction coefficient above which a sliding corner is Painleve's case", least, "1"))
     return [*facts, *_contact_facts(scene), *_load_facts(scene)]
 
 

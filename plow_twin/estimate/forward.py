@@ -13,7 +13,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import compile_scene, inertias
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.restarts import run_restarts
-from plow_twin.solve.state import EVENT, SEGMENT, STATE, TOTALS, Parts, Status, new_records, new_work
+from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_records, new_work, state_type
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class Forward:
         segments["knot"] = self._knots
         segments["start"], segments["slope"] = self._start * gain, self._slope * gain
         compiled = compile_scene(scene, TOLERANCE, sampled=True)
-        records = new_records(STATE, len(starts))
+        records = new_records(state_type(self._terms), len(starts))
         records["y"] = _bodies(states, scene.head.com_offset_m)
         if self._terms.hysteretic is not None:
             records["damping_factor"] = scene.contact.damping or 0.0

@@ -141,15 +141,23 @@ class Contact:
 
 @dataclass(frozen=True)
 class Friction:
-    """Tangential friction of every pair, regularised Coulomb: T = mu N tanh(slip rate / regularisation speed).
+    """Tangential friction of every pair, by one of two laws.
+
+    Without `stick_stiffness_n_m` regularised Coulomb, T = mu N tanh(slip rate / regularisation speed), which creeps.
+    With it Coulomb's law with stick: a corner holds the wall by a spring and a damper until they reach static mu N,
+    then it slips with T = mu N.
 
     References
     ----------
-    Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5.
+    Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5 (regularised); Cundall and Strack,
+    Geotechnique 29 (1979) 47, and Luding, Granul. Matter 10 (2008) 235, sec. 3.2 (with stick).
     """
 
     coefficient: float = _quantity("1", "mu", ge=0.0)
-    regularisation_speed_m_s: float = _quantity("m/s", "below it friction is viscous", 0.01, gt=0.0)
+    regularisation_speed_m_s: float = _quantity("m/s", "below it friction is viscous; not with stick", 0.01, gt=0.0)
+    stick_stiffness_n_m: float | None = _quantity("N/m", "tangential stiffness of a corner that sticks", None, gt=0.0)
+    stick_damping_n_s_m: float | None = _quantity("N s/m", "its damping, 0 unless given", None, ge=0.0)
+    static_coefficient: float | None = _quantity("1", "mu up to which a corner sticks, mu unless given", None, ge=0.0)
 
 
 @dataclass(frozen=True)
@@ -321,6 +329,8 @@ def check(scene: Scene) -> Iterator[Problem]:
         yield from _check_contact(scene.contact)
         yield from _check_rotation(scene)
         yield from _check_loads(scene.loads)
+        if scene.friction is not None:
+            yield from _check_friction(scene.friction)
         corners = list(scene.frame.labels.values())
         if len(set(corners)) != len(corners):
             yield Problem("frame.labels", dict(scene.frame.labels), "each corner once")
@@ -433,6 +443,16 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
     if law.ramped != (contact.ramp_m is not None):
         expected = "a penetration > 0 [m]" if law.ramped else "nothing"
         yield Problem("contact.ramp_m", contact.ramp_m, f"{expected} for {contact.law}")
+
+
+def _check_friction(friction: Friction) -> Iterator[Problem]:
+    static = friction.static_coefficient
+    if friction.stick_stiffness_n_m is None:
+        for name in ("stick_damping_n_s_m", "static_coefficient"):
+            if getattr(friction, name) is not None:
+                yield Problem(f"friction.{name}", getattr(friction, name), "nothing without stick_stiffness_n_m")
+    elif static is not None and static < friction.coefficient:
+        yield Problem("friction.static_coefficient", static, f"at least the coefficient {friction.coefficient:g} [1]")
 
 
 def _check_rotation(scene: Scene) -> Iterator[Problem]:

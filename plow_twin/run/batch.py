@@ -18,7 +18,7 @@ from plow_twin.run.twin import DEFAULT_BUDGET
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.implicit import new_implicit
-from plow_twin.solve.state import PARAMS, ROW, SEGMENT, STATE, TOTALS, WORK, Parts, Terms, new_records, new_work
+from plow_twin.solve.state import PARAMS, ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_records, new_work, state_type
 
 __all__ = ["TwinBatch"]
 
@@ -62,10 +62,10 @@ class TwinBatch:
         self._params = new_records(PARAMS, len(scenes))
         for index, compiled in enumerate(self._compiled):
             self._params[index] = compiled.params
-        self._states = new_records(STATE, len(scenes))
+        terms = _merge(self._compiled)
+        self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
         self._wrench = np.zeros((len(scenes), 3))
         self._masses = np.array([inertias(scene) for scene in scenes])[:, None]
-        terms = _merge(self._compiled)
         self._workers = [_Worker.of(terms, self._compiled) for _ in range(max(1, min(workers, os.cpu_count() or 1)))]
         self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
         self._pool = ThreadPoolExecutor(len(self._workers)) if len(self._workers) > 1 else None
@@ -196,7 +196,7 @@ class TwinBatch:
         ends = np.cumsum([self._states.nbytes, self._wrench.nbytes, wear.nbytes])
         if len(data) != ends[-1]:
             raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {ends[-1]}")
-        self._states[...] = np.frombuffer(data[: ends[0]], STATE)
+        self._states[...] = np.frombuffer(data[: ends[0]], self._states.dtype)
         self._wrench = np.frombuffer(data[ends[0] : ends[1]]).reshape(-1, 3).copy()
         wear[...] = np.frombuffer(data[ends[1] :]).reshape(wear.shape)
 
@@ -253,6 +253,11 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
                     f"{one.scene.contact.exponent:g}, expected the terms of scenes[0]: {compiled[0].scene.contact.law} "
                     f"with exponent {compiled[0].scene.contact.exponent:g}"
                 )
+        if terms.stick != first.stick:
+            raise ArgumentError(
+                f"scenes[{index}].friction: got {one.scene.friction}, expected friction with stick in all or in none: "
+                f"scenes[0] has {compiled[0].scene.friction}"
+            )
         merged = merged._replace(**{name: 1 for name in _OPTIONAL if getattr(terms, name) is not None})
     if merged.wear is not None or merged.slip is not None:
         merged = merged._replace(rest=None)

@@ -19,7 +19,7 @@ from plow_twin.model import geometry
 from plow_twin.model.scene import DOF_NAMES, Scene
 from plow_twin.run.motion import Motion, run_events
 from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene
-from plow_twin.solve.state import STATE, Status, Work, first_of, new_records, new_work
+from plow_twin.solve.state import Status, Work, first_of, new_records, new_work, state_type
 
 Array = NDArray[np.float64]
 
@@ -177,7 +177,7 @@ def _follow(
 
     Return it with its pose and rate, shape (6,), and how near the nearest pair is to its wall in m, inside or outside.
     """
-    records = new_records(STATE, 1)
+    records = new_records(state_type(compiled.parts.terms), 1)
     records[0] = state
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.state = first_of(records)

@@ -23,7 +23,6 @@ from plow_twin.solve.state import (
     BOUND,
     PARAMS,
     ROW,
-    STATE,
     TOTALS,
     WORK,
     Bound,
@@ -33,6 +32,7 @@ from plow_twin.solve.state import (
     new_record,
     new_records,
     new_work,
+    state_type,
 )
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
@@ -85,7 +85,8 @@ class Twin:
         self.excitation: Literal["scene", "sampled"] = excitation
         self.max_evaluations = max_evaluations
         compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
-        self._params, self._states = new_records(PARAMS, 1), new_records(STATE, 1)
+        self._params = new_records(PARAMS, 1)
+        self._states = new_records(state_type(compiled.parts.terms), 1)
         self._params[0] = compiled.params
         self._state: State = first_of(self._states)
         self._compiled: CompiledScene = replace(compiled, params=first_of(self._params))
@@ -234,7 +235,7 @@ class Twin:
             raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
         out = np.zeros(len(t), ROW) if rows else None
         status = np.zeros(len(t), np.int64)
-        snapshots = np.zeros(len(marks), STATE)
+        snapshots = np.zeros(len(marks), self._states.dtype)
         per = np.concatenate([self._wrench[None], wrench]) / self._inertias
         loop.advance_marked(
             self._params, self._parts, self._states, self._works, self._all_totals, t, per, self._budget, marks,
@@ -329,12 +330,11 @@ class Twin:
         ArgumentError
             When the data has not the size of a snapshot.
         """
-        if len(data) != STATE.itemsize + 32:
-            raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {STATE.itemsize + 32}")
-        saved = np.frombuffer(data[: STATE.itemsize], STATE)[0]
-        for name in STATE.names or ():
-            self._state[name] = saved[name]
-        wrench_and_speed = np.frombuffer(data[STATE.itemsize :])
+        size = self._states.itemsize
+        if len(data) != size + 32:
+            raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {size + 32}")
+        self._states[0] = np.frombuffer(data[:size], self._states.dtype)[0]
+        wrench_and_speed = np.frombuffer(data[size:])
         self._wrench = wrench_and_speed[:3].copy()
         self._set_wear_rate(float(wrench_and_speed[3]))
         if self._state.step_size >= 0.0:

@@ -23,7 +23,6 @@ from plow_twin.solve.state import (
     PARAMS,
     SEGMENT,
     SIN,
-    STATE,
     Array,
     Harmonics,
     Implicit,
@@ -35,6 +34,7 @@ from plow_twin.solve.state import (
     X,
     Y,
     new_record,
+    state_type,
 )
 
 #: Tightest and loosest tolerance.
@@ -60,7 +60,7 @@ class CompiledScene:
 
     def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
         """Return the scene's initial state, its pads worn by `wear_depth` [m] instead of the scene's initial depth."""
-        state = new_record(STATE)
+        state = new_record(state_type(self.parts.terms))
         state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
         if self.parts.terms.hysteretic is not None:
             state.damping_factor[:] = self.scene.contact.damping or 0.0
@@ -69,7 +69,7 @@ class CompiledScene:
         elif self.scene.wear is not None:
             state.wear_depth[:] = self.scene.wear.initial_depth_m
         state.step_start = state.time = time
-        settle_modes(self.params, state)
+        settle_modes(self.params, state, self.parts.terms.stick)
         return state
 
 
@@ -154,11 +154,12 @@ def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments
         wear=scene.wear is not None and scene.wear.coefficient_m2_n != 0.0,
         offset=any(scene.head.com_offset_m),
         free=bool(scene.locked),
-        slip=scene.friction is not None and scene.friction.coefficient != 0.0,
     )
+    if scene.friction is not None and scene.friction.coefficient != 0.0:
+        present["slip" if scene.friction.stick_stiffness_n_m is None else "stick"] = True
     # with the loads' moment about another point than the centre of mass the flight has no elementary integral
     present["flight"] = present["harmonics"] and not present["offset"]
-    present["rest"] = not (present["harmonics"] or present["wear"] or present["slip"])
+    present["rest"] = not (present["harmonics"] or present["wear"] or {"slip", "stick"} & present.keys())
     return law._replace(**_flags(present))
 
 
@@ -272,11 +273,11 @@ def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     depth = max((largest_force / contact.stiffness) ** (1.0 / contact.exponent), inside)
     largest_force = contact.stiffness * depth**contact.exponent
     spring = contact.exponent * largest_force / depth
-    damping = 0.0
+    damping = params.stick_damping
     if terms.viscous is not None:
-        damping = params.viscous
+        damping += params.viscous
     elif terms.hysteretic is not None:
-        damping = largest_force * (contact.damping or params.damping_number / params.speed_floor)
+        damping += largest_force * (contact.damping or params.damping_number / params.speed_floor)
     if terms.slip is not None:
         damping += params.friction * largest_force / params.slip_speed
     return new_implicit() if damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility) else None
@@ -292,6 +293,9 @@ def _slip(scene: Scene) -> dict[str, Any]:
         slip_arm_rows=geometry.slip_arm_rows(scene),
         friction=friction.coefficient,
         slip_speed=friction.regularisation_speed_m_s,
+        static_friction=friction.coefficient if friction.static_coefficient is None else friction.static_coefficient,
+        stick_stiffness=friction.stick_stiffness_n_m or 0.0,
+        stick_damping=friction.stick_damping_n_s_m or 0.0,
     )
 
 

@@ -9,6 +9,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.friction import friction_force
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
+from plow_twin.solve.grip import tangential_force
 from plow_twin.solve.kinematics import penetration_at, rate_at, row_rate, row_value, to_body_axes, to_world_axes
 from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import ON, Harmonics, Segments
@@ -22,26 +23,31 @@ class Acting(NamedTuple):
     offset: int | None
     free: int | None
     slip: int | None
+    stick: int | None
 
 
 @kernel(inline="source")
 def acting(parts):
     """Return what acts in a scene beside its law."""
     terms = parts.terms
-    return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip)
+    return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip, terms.stick)
 
 
 @kernel()
-def push(p, slip, pair, force, c, s, omega, x, y, vx, vy):
+def push(p, slip, stick, state, frozen, pair, force, c, s, omega, x, y, vx, vy):
     """Return what a pair that pushes with `force` does in body axes: its force, its moment, the power of its friction.
 
     The wall's tangent is its normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal.
     """
     fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
     torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
-    if slip is not None:
+    if slip is not None or stick is not None:
         rate = row_rate(p.slip_rows, pair, c, s, omega, x, y, vx, vy)
-        drag = friction_force(force, rate, p.friction, p.slip_speed)
+        if stick is not None:
+            place = row_value(p.slip_rows, pair, c, s, x, y)
+            drag = tangential_force(p, state, frozen, pair, force, place, rate)
+        else:
+            drag = friction_force(force, rate, p.friction, p.slip_speed)
         fx += p.penetration_rows[3, pair] * drag
         fy -= p.penetration_rows[2, pair] * drag
         torque += row_value(p.slip_arm_rows, pair, c, s, x, y) * drag
@@ -67,11 +73,11 @@ def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
     penetrate push.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)
-    _accelerate(p, acts.offset, acts.free, acts.slip, frozen, state, z, load, out)
+    _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, frozen, state, z, load, out)
 
 
 @kernel()
-def _accelerate(p, offset, free, slip, frozen, state, z, load, out) -> None:
+def _accelerate(p, offset, free, slip, stick, frozen, state, z, load, out) -> None:
     c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
     x, y = to_body_axes(c, s, z[0], z[1])
     vx, vy = to_body_axes(c, s, z[3], z[4])
@@ -85,7 +91,7 @@ def _accelerate(p, offset, free, slip, frozen, state, z, load, out) -> None:
             f = law_force(p, state, pair, d, r)
             if not frozen:
                 f = max(f, 0.0)
-            push_x, push_y, moment, _ = push(p, slip, pair, f, c, s, om, x, y, vx, vy)
+            push_x, push_y, moment, _ = push(p, slip, stick, state, frozen, pair, f, c, s, om, x, y, vx, vy)
             fx += push_x
             fy += push_y
             torque += moment

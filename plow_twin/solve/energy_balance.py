@@ -71,11 +71,11 @@ def _powers(p, parts, state, wear_depth, y, t, balance, out) -> None:
     """Write powers and forces at time t in body coordinates y."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
-    _powers_under(p, terms.offset, terms.free, terms.slip, state, wear_depth, y, load, balance.pairs, out)
+    _powers_under(p, terms.offset, terms.free, terms.slip, terms.stick, state, wear_depth, y, load, balance.pairs, out)
 
 
 @kernel()
-def _powers_under(p, offset, free, slip, state, wear_depth, y, load, pairs, out) -> None:
+def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, load, pairs, out) -> None:
     c, s, om = math.cos(y[THETA]), math.sin(y[THETA]), y[OMEGA]
     y[COS], y[SIN] = c, s
     out[LOADS] = out[NORMAL] = out[FRICTION] = 0.0
@@ -87,7 +87,9 @@ def _powers_under(p, offset, free, slip, state, wear_depth, y, load, pairs, out)
     fx = fy = torque = 0.0
     for pair in range(PAIR_COUNT):
         force = pairs[2, pair]
-        push_x, push_y, moment, power = push(p, slip, pair, force, c, s, om, y[0], y[1], y[VX], y[VY])
+        push_x, push_y, moment, power = push(
+            p, slip, stick, state, True, pair, force, c, s, om, y[0], y[1], y[VX], y[VY]
+        )
         fx += push_x
         fy += push_y
         torque += moment

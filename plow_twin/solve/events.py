@@ -9,6 +9,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import first_root, first_root_within
 from plow_twin.kernel.simd import below, magnitude, row, set_row, splat
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.grip import grip_guard
 from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, SIGN
 
 #: Events are one instant when they are closer than this share of the step before them.
@@ -182,7 +183,7 @@ def _guards_end_with(w, order, at, within):
 
 @kernel()
 def note_switches(
-    p, state, w, order, at, event, target, penetrating, viscous, hysteretic, integer, fraction, ramp
+    p, state, w, order, at, event, target, penetrating, viscous, hysteretic, integer, fraction, ramp, stick
 ) -> None:
     """Write the mode of each pair that switches at the event to `w.switch`, -1 for the others.
 
@@ -204,10 +205,15 @@ def note_switches(
                 _ramp_guard(p, state, w, order, pair)
                 if _ends_with(column, order, at, within):
                     w.switch[pair] = CROSSING
+        if stick is not None and penetrating and w.switch[pair] < 0:
+            for side in range(2):
+                following = grip_guard(p, state, w, order, pair, side)
+                if following != 0 and (column[0] < 0.0 or _ends_with(column, order, at, within)):
+                    w.switch[pair] = following
 
 
 @kernel()
-def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp):
+def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, integer, fraction, ramp, stick):
     """Return (sigma, pair, mode) of the first event in [0, sigma), or (sigma, -1, 0)."""
     _guards(p, state, w, order, penetrating, viscous, ramp)
     best, event, target = sigma, -1, 0
@@ -237,4 +243,11 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
                 root = _sooner(state, w, order, best)
                 if root < best:
                     best, event, target = root, pair, CROSSING
+            if stick is not None:
+                for side in range(2):
+                    following = grip_guard(p, state, w, order, pair, side)
+                    if following != 0:
+                        root = _sooner(state, w, order, best)
+                        if root < best:
+                            best, event, target = root, pair, following
     return best, event, target

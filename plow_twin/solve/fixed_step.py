@@ -13,6 +13,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import pair_outputs
 from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.energy_balance import balance_fixed_step, start_balance
+from plow_twin.solve.grip import settle_grips
 from plow_twin.solve.kinematics import pose_of, to_body, to_world
 from plow_twin.solve.modes import mode_inside, touch, within_range
 from plow_twin.solve.state import OFF, ON, Status
@@ -101,6 +102,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
         _switch(p, state, pen, rate, start + (n + 1) * dt, totals, None)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+        _settle_grips(p, parts.terms.stick, state, now)
         for pair in range(PAIR_COUNT):
             if (before[pair] > 0.0) != (now[pair] > 0.0):
                 doubt = 0.5 * dt * (before[pair] + now[pair]) * p.inverse_mass
@@ -165,10 +167,17 @@ def integrate_fixed(
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
         _switch(p, state, pen, rate, t + dt, totals, log)
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
+        _settle_grips(p, parts.terms.stick, state, now)
         _add_to_totals(before, now, dt, totals)
         if balance is not None:
             balance_fixed_step(p, parts, state, y, t + dt, dt, balance)
         done[0] = n + 1
+
+
+@kernel()
+def _settle_grips(p, stick, state, force) -> None:
+    if stick is not None:
+        settle_grips(p, state, force)
 
 
 @kernel()

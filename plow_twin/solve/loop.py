@@ -15,7 +15,7 @@ from plow_twin.solve.kinematics import pose_of
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.method.rest import write_rest
 from plow_twin.solve.modes import within_range
-from plow_twin.solve.state import STATE, Parts, Status
+from plow_twin.solve.state import Parts, Status
 from plow_twin.solve.step import complete_step, lay_out_step
 from plow_twin.solve.totals import add_to_totals
 
@@ -32,7 +32,7 @@ def _unowned_loads(parts):
 @kernel(inline="source")
 def _end(p, parts, state, w, totals, log) -> None:
     terms = parts.terms
-    complete_step(p, parts.harmonics, terms.flight, state, w, totals, log, terms.wear, terms.fraction)
+    complete_step(p, parts.harmonics, terms.flight, state, w, totals, log, terms.wear, terms.fraction, terms.stick)
 
 
 @kernel(inline="source")
@@ -176,7 +176,7 @@ def _follow_line(piece, start, time, before, sample) -> None:
 @kernel(entry=True)
 def advance_times(p, parts, states, w, totals, times, budget, rows, bound) -> None:
     """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
-    saved = np.empty(1, STATE)
+    saved = np.empty(1, states.dtype)
     parts, states = _unowned_loads(parts), unowned(states)
     for i in range(times.size):
         _advance_row(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound, rows[i])
@@ -190,7 +190,7 @@ def advance_batch(params, parts, states, work, totals, first, last, times, wrenc
     bits alone. `work` and `totals` are arrays of one.
     """
     parts, states = _unowned_loads(parts), unowned(states)
-    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, STATE)
+    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, states.dtype)
     for m in range(first, last):
         p, state = params[m], states[m]
         state.piece = 0
@@ -207,7 +207,7 @@ def advance_marked(params, parts, states, work, totals, times, wrench, budget, m
     is read out.
     """
     parts, states = _unowned_loads(parts), unowned(states)
-    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, STATE)
+    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, states.dtype)
     p, state = params[0], states[0]
     state.piece = 0
     mark = 0

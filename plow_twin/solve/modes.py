@@ -9,6 +9,7 @@ import numpy as np
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
+from plow_twin.solve.grip import grasp, weigh_grips
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_value
 from plow_twin.solve.state import (
     ACTS,
@@ -98,7 +99,7 @@ def mode_inside(p, state, pair):
 
 
 @kernel(entry=True)
-def settle_modes(p, state) -> None:
+def settle_modes(p, state, stick) -> None:
     """Choose each pair's mode from its penetration, where a motion starts."""
     energy = 0.0
     for pair in range(PAIR_COUNT):
@@ -111,6 +112,8 @@ def settle_modes(p, state) -> None:
         if p.enabled[pair] == 1 and penetration_and_rate(p, state, pair)[0] > 0.0:
             _start_inside(p, state, pair, energy)
             state.mode[pair] = mode_inside(p, state, pair)
+            if stick is not None:
+                grasp(p, state, pair)
     state.elapsed = 0.0
     state.step_size = -1.0
     state.last_step_size = 0.0
@@ -129,7 +132,7 @@ def any_penetrates(state) -> bool:
 
 
 @kernel()
-def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
+def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
     """Write what each pair that acts contributes per order to `w.per_pair`; return whether any pair penetrates."""
     mode, per_pair = state.mode, w.per_pair
     for pair in range(PAIR_COUNT):
@@ -148,6 +151,8 @@ def weigh_pairs(p, state, w, viscous, fraction, ramp) -> bool:
         per_pair[DAMPS, pair] = 0.0
         if acts:
             per_pair[DAMPS, pair] = p.viscous if viscous is not None else p.stiffness * state.damping_factor[pair]
+    if stick is not None:
+        weigh_grips(p, state, w)
     return any_penetrates(state)
 
 

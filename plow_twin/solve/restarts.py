@@ -24,7 +24,7 @@ def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> i
         low, high = edges[m], edges[m + 1]
         if low == high:
             continue
-        settle_modes(p, states[m])
+        settle_modes(p, states[m], parts.terms.stick)
         first[0] = 0
         code = _LOG_FULL
         while code == _LOG_FULL:

@@ -35,6 +35,10 @@ CLIPPED: Final = 2
 RELEASED: Final = 3
 #: Not a mode, but what an event can lead to: a pair crosses the end of its damping's ramp.
 CROSSING: Final = 4
+#: Likewise: its corner slips along the wall, forward or backward, or sticks.
+SLIPS_FORWARD: Final = 5
+SLIPS_BACKWARD: Final = 6
+STICKS: Final = 7
 
 # indices into State.y
 X, Y, VX, VY, OMEGA, COS, SIN, THETA = range(STATE_SIZE)
@@ -127,6 +131,9 @@ PARAMS: Final = _in_lines(
         ("free", "f8", (3,)),  # 1 free, 0 locked
         ("friction", "f8"),  # mu
         ("slip_speed", "f8"),  # regularisation speed in m/s
+        ("static_friction", "f8"),  # mu up to which a corner sticks
+        ("stick_stiffness", "f8"),
+        ("stick_damping", "f8"),
         ("order", "i8"),
         ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
         ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
@@ -143,46 +150,54 @@ PARAMS: Final = _in_lines(
 )
 
 #: Everything that the future depends on, and the step under way. Times in s.
-STATE: Final = _in_lines(
+_STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
+    ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
+    ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
+    ("wear_depth", "f8", (PAIR_COUNT,)),  # of each pad in m
+    ("mode", "i8", (PAIR_COUNT,)),
+    ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
+    ("step_start", "f8"),
+    ("elapsed", "f8"),  # time into the step under way
+    ("step_size", "f8"),  # of the step under way, negative without one
+    ("sigma_end", "f8"),  # the series' variable at the step's end
+    ("alpha", "f8"),  # time runs as t = alpha sigma + beta sigma^2 / 2
+    ("beta", "f8"),
+    ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
+    ("last_step_size", "f8"),
+    ("touch_time", "f8"),  # of the last touch
+    ("time", "f8"),  # the present, bit for bit as it was asked for
+    ("implicit_size", "f8"),  # of the next implicit step
+    ("decay_times", "f8"),  # that have passed in overdamped contact since a contact changed
+    ("implicit_size_before", "f8"),  # both as they were before the step under way was laid out
+    ("decay_times_before", "f8"),
+    ("order", "i8"),  # of the series of the step under way
+    ("event_pair", "i8"),  # the pair whose event ends the step, or -1
+    ("event_mode", "i8"),  # the mode that follows
+    ("touching", "i8"),  # a bit for each pair that touches at the step's start and needs the root of time
+    ("events_at_once", "i8"),  # events so far at one instant
+    ("piece", "i8"),  # of the sampled load
+    ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
+    ("refused", "i8"),  # implicit steps that were not worth it since a contact changed
+    ("refused_before", "i8"),  # the same before the step under way was laid out
+    ("in_flight", "i8"),  # 1 during a step of free flight
+    ("at_rest", "i8"),  # 1 during a step of rest
+    # counted since the start
+    ("steps", "i8"),
+    ("evaluations", "i8"),  # of the equations of motion; an order of a series counts as one
+    ("events", "i8"),
+    ("guard_roots", "i8"),  # guards whose roots were searched for
+    ("recoveries", "i8"),  # times that modes flipped at one instant
+    ("bounded", "i8"),  # advances whose end was coarse
+    ("implicit_steps", "i8"),
+]
+STATE: Final = _in_lines(_STATE_FIELDS)
+#: The same for friction with stick, and what the corners' grip remembers. That comes first: numba takes a record with
+#: more at its end for one of the shorter type.
+GRIPPING_STATE: Final = _in_lines(
     [
-        ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
-        ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
-        ("wear_depth", "f8", (PAIR_COUNT,)),  # of each pad in m
-        ("mode", "i8", (PAIR_COUNT,)),
-        ("beyond_ramp", "i8", (PAIR_COUNT,)),  # 1 where the penetration is beyond the ramp
-        ("step_start", "f8"),
-        ("elapsed", "f8"),  # time into the step under way
-        ("step_size", "f8"),  # of the step under way, negative without one
-        ("sigma_end", "f8"),  # the series' variable at the step's end
-        ("alpha", "f8"),  # time runs as t = alpha sigma + beta sigma^2 / 2
-        ("beta", "f8"),
-        ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
-        ("last_step_size", "f8"),
-        ("touch_time", "f8"),  # of the last touch
-        ("time", "f8"),  # the present, bit for bit as it was asked for
-        ("implicit_size", "f8"),  # of the next implicit step
-        ("decay_times", "f8"),  # that have passed in overdamped contact since a contact changed
-        ("implicit_size_before", "f8"),  # both as they were before the step under way was laid out
-        ("decay_times_before", "f8"),
-        ("order", "i8"),  # of the series of the step under way
-        ("event_pair", "i8"),  # the pair whose event ends the step, or -1
-        ("event_mode", "i8"),  # the mode that follows
-        ("touching", "i8"),  # a bit for each pair that touches at the step's start and needs the root of time
-        ("events_at_once", "i8"),  # events so far at one instant
-        ("piece", "i8"),  # of the sampled load
-        ("ends_at_stop", "i8"),  # 1 where the step ends at `stop_time`
-        ("refused", "i8"),  # implicit steps that were not worth it since a contact changed
-        ("refused_before", "i8"),  # the same before the step under way was laid out
-        ("in_flight", "i8"),  # 1 during a step of free flight
-        ("at_rest", "i8"),  # 1 during a step of rest
-        # counted since the start
-        ("steps", "i8"),
-        ("evaluations", "i8"),  # of the equations of motion; an order of a series counts as one
-        ("events", "i8"),
-        ("guard_roots", "i8"),  # guards whose roots were searched for
-        ("recoveries", "i8"),  # times that modes flipped at one instant
-        ("bounded", "i8"),  # advances whose end was coarse
-        ("implicit_steps", "i8"),
+        ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
+        ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
+        *_STATE_FIELDS,
     ]
 )
 
@@ -204,6 +219,7 @@ WORK: Final = np.dtype(
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
         ("ramp", "f8", (3, *_WIDE)),  # square and cube of the penetration, share of C
         ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
+        ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: force per normal force, place and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
         ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
@@ -285,7 +301,8 @@ class Terms(NamedTuple):
     wear: int | None
     offset: int | None  #: the centre of mass is not the cavity's
     free: int | None  #: some degree of freedom is locked
-    slip: int | None  #: friction
+    slip: int | None  #: regularised friction
+    stick: int | None  #: friction with stick
     flight: int | None  #: free flight in closed form (`solve.method.flight`)
     rest: int | None  #: rest can be recognised (`solve.method.rest`)
 
@@ -315,6 +332,11 @@ EVENT: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("
 
 Bound: TypeAlias = np.record
 Log: TypeAlias = NDArray[np.void]
+
+
+def state_type(terms: Terms) -> np.dtype[np.void]:
+    """Return the record type of a scene's state."""
+    return STATE if terms.stick is None else GRIPPING_STATE
 
 
 def new_record(dtype: np.dtype[np.void]) -> np.record:

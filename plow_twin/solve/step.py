@@ -15,9 +15,10 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.dense_output import evaluate, time_along, wear_depth_at
 from plow_twin.solve.events import first_event, note_switches
+from plow_twin.solve.grip import grasp, switch_grip
 from plow_twin.solve.method import flight, implicit, rest, taylor
 from plow_twin.solve.modes import penetration_and_rate, slow_touch, touch, weigh_pairs
-from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, THETA
+from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, SLIPS_FORWARD, THETA
 from plow_twin.solve.totals import log_event
 
 #: Longest step in s; keeps every power of it finite.
@@ -54,7 +55,7 @@ def _set_load(p, segments, state, w):
 def lay_out_step(p, parts, state, w, stop_time) -> bool:
     """Lay out the next step, at most to `stop_time`; return False when it is not finite."""
     terms = parts.terms
-    penetrating = weigh_pairs(p, state, w, terms.viscous, terms.fraction, terms.ramp)
+    penetrating = weigh_pairs(p, state, w, terms.viscous, terms.fraction, terms.ramp, terms.stick)
     state.stop_time = min(stop_time, _set_load(p, parts.segments, state, w))
     span = min(state.stop_time - state.step_start, LONGEST_STEP)
     state.alpha, state.beta, state.elapsed, state.event_pair = 1.0, 0.0, 0.0, -1
@@ -65,9 +66,9 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
         # no wall can be reached, or none is left
         state.step_size = state.sigma_end
     elif implicit.lay_out(
-        p, parts, parts.implicit, terms.ramp, terms.wear, terms.slip, state, w, span, penetrating
+        p, parts, parts.implicit, terms.ramp, terms.wear, terms.slip, terms.stick, state, w, span, penetrating
     ) or taylor.lay_out(p, parts, terms.slip, parts.implicit, state, w, span, penetrating):
-        _end_at_event(p, state, w, span, penetrating, law_terms(terms))
+        _end_at_event(p, state, w, span, penetrating, law_terms(terms), terms.stick)
         implicit.note_step(parts.implicit, state, w, state.step_size, state.event_pair >= 0)
     else:
         return False
@@ -77,16 +78,16 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
 
 
 @kernel()
-def _end_at_event(p, state, w, span, penetrating, law) -> None:
+def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
     """Let the step that has been laid out end at its first event, if there is one; find its size in time."""
     sigma, order = state.sigma_end, state.order
-    end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law)
+    end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law, stick)
     if pair >= 0 and state.events_at_once > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.recoveries += 1
         end, pair = max(end, min(sigma, _PAST_AN_INSTANT)), -1
     if pair >= 0:
-        note_switches(p, state, w, order, end, pair, target, penetrating, *law)
+        note_switches(p, state, w, order, end, pair, target, penetrating, *law, stick)
     if pair >= 0 or end != sigma:
         state.ends_at_stop = 0
     state.sigma_end, state.event_pair = end, pair
@@ -95,7 +96,7 @@ def _end_at_event(p, state, w, span, penetrating, law) -> None:
 
 
 @kernel()
-def complete_step(p, harmonics, flight, state, w, totals, log, wear, fraction) -> None:
+def complete_step(p, harmonics, flight, state, w, totals, log, wear, fraction, stick) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
     y = state.y
     sigma = state.sigma_end
@@ -123,13 +124,17 @@ def complete_step(p, harmonics, flight, state, w, totals, log, wear, fraction) -
         state.touching = touching
     for pair in range(PAIR_COUNT):
         if w.switch[pair] >= 0:
-            _switch(p, state, pair, w.switch[pair], totals, log, fraction)
+            _switch(p, state, pair, w.switch[pair], totals, log, fraction, stick)
 
 
 @kernel()
-def _switch(p, state, pair, new, totals, log, fraction) -> None:
+def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
     """Let a pair change its mode; note it."""
     old = state.mode[pair]
+    if stick is not None and new >= SLIPS_FORWARD:
+        switch_grip(p, state, pair, new)
+        state.events += 1
+        return
     if new == CROSSING:
         state.beyond_ramp[pair] = 1 - state.beyond_ramp[pair]
         new = old
@@ -148,6 +153,8 @@ def _switch(p, state, pair, new, totals, log, fraction) -> None:
                 state.touch_time = state.step_start
             else:
                 state.mode[pair] = RELEASED
+    if stick is not None and state.mode[pair] == ON and old != ON:
+        grasp(p, state, pair)
     # to the outside a released pair is on
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:

@@ -22,6 +22,7 @@ from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate, acting
+from plow_twin.solve.grip import grip_terms
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
 from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y, new_record
 
@@ -101,7 +102,7 @@ def new_implicit() -> Implicit:
 
 
 @kernel()
-def decay_rate(p, state, slip) -> float:
+def decay_rate(p, state, slip, stick) -> float:
     """Return the sum of the rates in 1/s at which the pairs' dampers stop the head; 0 where their springs matter.
 
     Friction that sticks is a damper too: its slope at the present slip.
@@ -124,6 +125,11 @@ def decay_rate(p, state, slip) -> float:
             arm = row_value(p.slip_arm_rows, pair, c, s, x, yy)
             mobility = p.inverse_mass + arm * arm * p.inverse_inertia
             decay += p.friction * max(force, 0.0) / p.slip_speed * sticking * mobility
+        if stick is not None and state.grip[pair] == 0:
+            arm = row_value(p.slip_arm_rows, pair, c, s, x, yy)
+            mobility = p.inverse_mass + arm * arm * p.inverse_inertia
+            decay += p.stick_damping * mobility
+            spring += p.stick_stiffness * mobility
     return decay if decay > OVERDAMPED_RATIO * math.sqrt(spring) else 0.0
 
 
@@ -330,7 +336,7 @@ def _interpolate(values, coefficients, h, out) -> None:
 
 
 @kernel()
-def _write_series(p, state, h, w, implicit, ramp, wear) -> float:
+def _write_series(p, state, h, w, implicit, ramp, wear, stick) -> float:
     """Write the collocation polynomial of state, penetration, rate and force as series; return its last term's size.
 
     Velocities and forces are those at the nodes, not at the start: what a damper has not yet stopped there, and stops
@@ -357,6 +363,8 @@ def _write_series(p, state, h, w, implicit, ramp, wear) -> float:
             set_row(w.wear, k, worn)
             penetration = penetration - worn
         set_row(w.penetration, k, penetration)
+    if stick is not None:
+        _write_grip(p, state, h, w, implicit)
     size = 0.0
     if ramp is not None:
         size = _write_ramp(p, h, w, implicit)
@@ -370,6 +378,21 @@ def _write_series(p, state, h, w, implicit, ramp, wear) -> float:
     size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA]))
     # its share on [0, h] that polynomials of lower degree cannot take over
     return size * h ** (s - 1) * 2.0 ** (1 - 2 * s)
+
+
+@kernel()
+def _write_grip(p, state, h, w, implicit) -> None:
+    """Write the series of the slip rates and of the tangential forces (`solve.grip`)."""
+    s, rates = implicit.nodes.size, w.right
+    for i in range(s):
+        y = implicit.body[i + 1]
+        for pair in range(PAIR_COUNT):
+            rates[i, pair] = row_rate(p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+    _interpolate(rates, implicit.from_stages, h, w.slip[0])
+    for k in range(s):
+        y = w.series[k]
+        place = row_values(p.slip_rows, y[COS], y[SIN], y[X], y[Y])
+        set_row(w.slip[4], k, grip_terms(p, state, w, k, place, row(w.slip[0], k)))
 
 
 @kernel()
@@ -395,16 +418,16 @@ def _write_ramp(p, h, w, implicit) -> float:
 
 
 @kernel()
-def lay_out(p, parts, implicit, ramp, wear, slip, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, implicit, ramp, wear, slip, stick, state, w, span, penetrating) -> bool:
     """Lay out an implicit step, where damping is what bounds explicit ones; `w.decay[0]` keeps its rate of decay."""
     if implicit is None:
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    w.decay[0] = decay_rate(p, state, slip) if penetrating else 0.0
+    w.decay[0] = decay_rate(p, state, slip, stick) if penetrating else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
         return False
-    size = _collocate(p, parts, state, w, span, w.decay[0], implicit, ramp, wear)
+    size = _collocate(p, parts, state, w, span, w.decay[0], implicit, ramp, wear, stick)
     state.sigma_end, state.order = size, STAGES
     state.ends_at_stop = 1 if size == span else 0
     return size > 0.0
@@ -429,7 +452,7 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
 
 
 @kernel()
-def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear) -> float:
+def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear, stick) -> float:
     """Lay out an implicit step as series of order `STAGES`; return its size, or 0 when explicit ones are better.
 
     `decay` is the `decay_rate`.
@@ -444,7 +467,7 @@ def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear) -> float:
         for i in range(implicit.nodes.size + 1):
             set_row(implicit.wear_depth, i, row(state.wear_depth, 0))
         if _solve(p, acting(parts), state, state.step_start, h, implicit, wear):
-            size = _write_series(p, state, h, w, implicit, ramp, wear)
+            size = _write_series(p, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
                 # a step cut short by a sample says nothing against a longer one

@@ -20,6 +20,7 @@ from plow_twin.kernel.simd import lane, magnitude, pack, permutation, row, set_r
 from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_terms
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
+from plow_twin.solve.grip import grip_terms
 from plow_twin.solve.kinematics import row_values
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
 
@@ -253,6 +254,20 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
 
 
 @kernel(fast=True)
+def _hold_on(p, state, w, k, c, s, x, y, dc, ds, dx, dy):
+    """Return order k of what friction with stick gives (`_applied`, `solve.grip`)."""
+    drag, arm = w.slip[4], w.slip[5]
+    rate = row_values(p.slip_rows, dc, ds, dx, dy)
+    set_row(w.slip[0], k, rate)
+    set_row(arm, k, row_values(p.slip_arm_rows, c, s, x, y))
+    force = grip_terms(p, state, w, k, row_values(p.slip_rows, c, s, x, y), rate)
+    set_row(drag, k, force)
+    return _applied(
+        p, row(p.penetration_rows, 3) * force, row(p.penetration_rows, 2) * force * -1.0, _multiply(arm, drag, k)
+    )
+
+
+@kernel(fast=True)
 def _wear(p, w, k, alpha, beta) -> None:
     """Write order k + 1 of the growth of each pad's penetration:  dh/dt = k_s F v / A (Archard)."""
     growth = row(w.force, k) * alpha
@@ -265,11 +280,11 @@ def _wear(p, w, k, alpha, beta) -> None:
 def one_by_one(terms):
     """Return the terms as plain tuples, to be passed on with a star: of the load, of the law, and the others."""
     load = terms.harmonics, terms.second, terms.segments
-    return load, law_terms(terms), terms.wear, terms.offset, terms.free, terms.slip
+    return load, law_terms(terms), terms.wear, terms.offset, terms.free, terms.slip, terms.stick
 
 
 @kernel(fast=True)
-def expand(p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, wear, offset, free, slip):
+def expand(p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, wear, offset, free, slip, stick):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
     Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. Orders whose terms vanish
@@ -332,6 +347,8 @@ def expand(p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, 
             )
             if slip is not None:
                 applied = applied + _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
+            if stick is not None:
+                applied = applied + _hold_on(p, state, w, k, c, s, x, yy, dc, ds, dx, dy)
             if wear is not None:
                 _wear(p, w, k, alpha, beta)
             # the penetration of the next order needs this order's rates alone: no forces to wait for

@@ -1,0 +1,152 @@
+"""Friction with stick: how the corners hold the walls, when they let go, and when they hold again.
+
+A corner that sticks holds its wall by a spring and a damper from an anchor a along the wall; one that slips drags it:
+
+    sticks    T = k (s - a) + c s'      while |T| <= mu_s N
+    slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
+
+s is the corner's place along the wall, N the normal force. The second condition says that the spring and the damper,
+taken along with the slip so that they carry mu N, would not carry less if they held now. T has no jump where mu_s = mu:
+the accelerations are the same on both sides, so pairs decide one by one. Sources: Cundall and Strack, Geotechnique 29
+(1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
+"""
+
+from __future__ import annotations
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import row
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import pair_force
+from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value
+from plow_twin.solve.state import COS, OMEGA, ON, SIN, SLIPS_BACKWARD, SLIPS_FORWARD, STICKS, VX, VY, X, Y
+
+#: Below this share of its terms a guard is zero but for rounding.
+_ROUNDING = 1e-10
+
+
+@kernel(inline="code")
+def _along(p, pair, y):
+    """Return the place of a corner along its wall and the rate at which it slips, in body coordinates y."""
+    place = row_value(p.slip_rows, pair, y[COS], y[SIN], y[X], y[Y])
+    return place, row_rate(p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+
+
+@kernel(inline="code")
+def held_force(p, state, pair, place, rate):
+    """Return the force T in N of a corner's spring and damper."""
+    return p.stick_stiffness * (place - state.anchor[pair]) + p.stick_damping * rate
+
+
+@kernel(inline="code")
+def tangential_force(p, state, frozen, pair, normal, place, rate):
+    """Return T in N for the normal force N. Without `frozen` a corner whose spring carries too much slips."""
+    grip = state.grip[pair]
+    if state.mode[pair] != ON:
+        return 0.0
+    if frozen and grip != 0:
+        return grip * p.friction * normal
+    held = held_force(p, state, pair, place, rate)
+    limit = (p.static_friction if grip == 0 else p.friction) * normal
+    if frozen or abs(held) <= limit:
+        return held
+    return p.friction * normal if held > 0.0 else -p.friction * normal
+
+
+@kernel(inline="code")
+def _anchor(p, state, pair, force, place, rate) -> None:
+    """Put the anchor where spring and damper carry `force`."""
+    state.anchor[pair] = place - (force - p.stick_damping * rate) / p.stick_stiffness
+
+
+@kernel()
+def grasp(p, state, pair) -> None:
+    """Let the corner of a pair that begins to push hold its wall by a slack spring, or slip where that is too much."""
+    place, rate = _along(p, pair, state.y)
+    normal = pair_force(p, state, pair, penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y))
+    state.anchor[pair], state.grip[pair] = place, 0
+    held = p.stick_damping * rate
+    # without a force yet it is their rates that decide: the guard of a slip looks at them
+    if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
+        state.grip[pair] = 1 if rate > 0.0 else -1
+
+
+@kernel()
+def switch_grip(p, state, pair, new) -> None:
+    """Let a corner slip or stick."""
+    if new == STICKS:
+        place, rate = _along(p, pair, state.y)
+        normal = pair_force(p, state, pair, penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y))
+        _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
+        state.grip[pair] = 0
+    else:
+        state.grip[pair] = 1 if new == SLIPS_FORWARD else -1
+
+
+@kernel()
+def settle_grips(p, state, force) -> None:
+    """Note after a fixed step which corners slip; `force` holds the normal forces, shape (8,)."""
+    for pair in range(PAIR_COUNT):
+        place, rate = _along(p, pair, state.y)
+        if state.mode[pair] != ON or force[pair] <= 0.0:
+            state.grip[pair] = 0
+            _anchor(p, state, pair, 0.0, place, rate)
+            continue
+        held = held_force(p, state, pair, place, rate)
+        limit = (p.static_friction if state.grip[pair] == 0 else p.friction) * force[pair]
+        state.grip[pair] = 0
+        if abs(held) > limit:
+            state.grip[pair] = 1 if held > 0.0 else -1
+            _anchor(p, state, pair, state.grip[pair] * p.friction * force[pair], place, rate)
+
+
+@kernel()
+def weigh_grips(p, state, w) -> None:
+    """Write what a corner's T is made of to `w.grip`: shares of its normal force, of its place and of its slip rate."""
+    for pair in range(PAIR_COUNT):
+        acts = state.mode[pair] == ON
+        sticks = acts and state.grip[pair] == 0
+        w.grip[0, pair] = p.friction * state.grip[pair] if acts else 0.0
+        w.grip[1, pair] = p.stick_stiffness if sticks else 0.0
+        w.grip[2, pair] = p.stick_damping if sticks else 0.0
+
+
+@kernel(fast=True, inline="code")
+def grip_terms(p, state, w, k, place, rate):
+    """Return order k of T of the eight pairs from those of place and slip rate; the normal force's is in `w.force`."""
+    if k == 0:
+        place = place - row(state.anchor, 0)
+    return row(w.grip, 0) * row(w.force, k) + row(w.grip, 1) * place + row(w.grip, 2) * rate
+
+
+@kernel()
+def grip_guard(p, state, w, order, pair, side) -> int:
+    """Write a guard of a corner's grip to `w.column[0]`; return what follows when it turns negative, 0 without one.
+
+    Sticks: mu_s N -+ T for the two sides; slips: the condition of the module's text times the time per sigma, first
+    side only.
+    """
+    g, rate, force, drag = w.column[0], w.slip[0], w.force, w.slip[4]
+    grip = state.grip[pair]
+    if state.mode[pair] != ON or (grip != 0 and side != 0):
+        return 0
+    for k in range(order + 1):
+        g[k] = 0.0
+    if grip == 0:
+        sign = 1.0 if side == 0 else -1.0
+        for k in range(order):
+            g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
+        size = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair])
+    else:
+        for k in range(order - 1):
+            spring = state.alpha * rate[k, pair]
+            if k > 0:
+                spring += state.beta * rate[k - 1, pair]
+            damper = p.stick_damping * (k + 1) * rate[k + 1, pair]
+            g[k] = grip * (p.stick_stiffness * spring + damper) - p.friction * (k + 1) * force[k + 1, pair]
+        size = p.stick_stiffness * abs(state.alpha * rate[0, pair])
+        size += p.stick_damping * abs(rate[1, pair]) + p.friction * abs(force[1, pair])
+    if abs(g[0]) <= _ROUNDING * size:
+        g[0] = max(g[0], 0.0)
+    if grip != 0:
+        return STICKS
+    return SLIPS_FORWARD if side == 0 else SLIPS_BACKWARD

@@ -1,0 +1,245 @@
+"""Friction with stick: closed forms of slip-stick, a hold without creep, Painleve's case, and no code without it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import pytest
+from scenes import pose_error, preset
+from scipy.optimize import brentq
+from test_solve_friction import MASS, MU, G, block
+
+from plow_twin import (
+    Clearance,
+    Contact,
+    Frame,
+    Friction,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Scene,
+    SceneError,
+    Table,
+    Twin,
+    TwinBatch,
+    simulate,
+)
+from plow_twin.model.friction import painleve_coefficients
+from plow_twin.solve import compiled_scene
+from plow_twin.solve.state import STATE
+
+GRIP = 1e9
+#: Both corners that the block hangs on.
+HELD_DAMPING = 2e5
+HELD = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=HELD_DAMPING)
+
+
+@dataclass
+class Slider:
+    """m x'' + spring x = F(t) - T in closed form, one phase after the other; T holds by `grip` from an anchor."""
+
+    mass: float
+    spring: float
+    grip: float
+    static: float
+    kinetic: float
+    load: tuple[float, float, float]  # F = rate t + amplitude sin(omega t)
+
+    def phase(
+        self, t0: float, x0: float, v0: float, stiffness: float, constant: float
+    ) -> Callable[[float], np.ndarray]:
+        """Return x, v of m x'' + stiffness x = F(t) + constant from a state on."""
+        rate, amplitude, omega = self.load
+        m, w = self.mass, math.sqrt(stiffness / self.mass)
+
+        def forced(t: float) -> np.ndarray:
+            if stiffness == 0.0:
+                swing = -amplitude / (m * omega**2) if omega else 0.0
+                x = rate * t**3 / (6.0 * m) + constant * t**2 / (2.0 * m) + swing * math.sin(omega * t)
+                return np.array([x, rate * t**2 / (2.0 * m) + constant * t / m + swing * omega * math.cos(omega * t)])
+            swing = amplitude / (stiffness - m * omega**2)
+            x = (rate * t + constant) / stiffness + swing * math.sin(omega * t)
+            return np.array([x, rate / stiffness + swing * omega * math.cos(omega * t)])
+
+        x, v = np.array([x0, v0]) - forced(t0)
+
+        def motion(t: float) -> np.ndarray:
+            turn = w * (t - t0)
+            if stiffness == 0.0:
+                free = np.array([x + v * (t - t0), v])
+            else:
+                free = np.array(
+                    [x * math.cos(turn) + v / w * math.sin(turn), v * math.cos(turn) - x * w * math.sin(turn)]
+                )
+            return forced(t) + free
+
+        return motion
+
+    def left(self, motion: Callable[[float], np.ndarray], slip: int, anchor: float, t: float) -> float:
+        """Return what is left until the block lets go or holds again."""
+        x, v = motion(t)
+        return slip * v if slip else self.static - abs(self.grip * (x - anchor))
+
+    def run(self, times: np.ndarray) -> tuple[np.ndarray, list[float]]:
+        """Return x, v at the times, shape (n, 2), and when the block let go or held again."""
+        rows, switches = [], []
+        t, state, anchor, slip = 0.0, np.zeros(2), 0.0, 0
+        while len(rows) < len(times):
+            if slip == 0:
+                motion = self.phase(t, *state, self.spring + self.grip, self.grip * anchor)
+            else:
+                motion = self.phase(t, *state, self.spring, -slip * self.kinetic)
+            left = partial(self.left, motion, slip, anchor)
+            step, at = 2e-5, t + 1e-9
+            while left(at + step) > 0.0 and at < times[-1]:
+                at += step
+            end = brentq(left, at, at + step, xtol=1e-15) if at < times[-1] else math.inf
+            while len(rows) < len(times) and times[len(rows)] <= end:
+                rows.append(motion(times[len(rows)]))
+            if end == math.inf:
+                break
+            t, state = end, motion(end)
+            switches.append(end)
+            if slip == 0:
+                slip = 1 if state[0] > anchor else -1
+            else:
+                anchor, slip = state[0] - slip * self.kinetic / self.grip, 0
+        return np.array(rows), switches
+
+
+def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> None:
+    """A load that swings beyond mu N: slips while it is above, holds elastically in between."""
+    normal, amplitude, omega = MASS * G, 1.6 * MU * MASS * G, 12.0
+    friction = Friction(MU, stick_stiffness_n_m=GRIP)
+    scene = replace(block(0.0, 0.0), friction=friction, loads=(Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega),))
+    result = simulate(scene, 1.5, output_dt=0.01, tol=1e-11)
+    slider = Slider(MASS, 0.0, 2.0 * GRIP, MU * normal, MU * normal, (0.0, amplitude, omega))
+    expected, switches = slider.run(result.t)
+    assert len(switches) > 8
+    assert np.abs(result.q[:, 0] - expected[:, 0]).max() < 1e-9 * np.abs(expected[:, 0]).max()
+
+
+def belt(speed: float, seconds: float) -> tuple[Scene, Slider]:
+    """A block on a moving belt, seen from the belt: clamped between four corners, held by springs that run away."""
+    stiffness, deep, wide, static, kinetic = 1e6, 1e-3, 0.02, 0.5, 0.3
+    friction = Friction(kinetic, stick_stiffness_n_m=1e7, static_coefficient=static)
+    # the four side pairs are the spring: both walls stay penetrated, 4 K x in all; their friction acts along locked y
+    pull = 4.0 * stiffness * speed
+    scene = Scene(
+        Head(MASS, 100.0), Frame(0.3, 0.3), Clearance(-2.0 * wide, -2.0 * deep), Contact("hertz", stiffness),
+        Gravity(0.0), (Table("belt", np.array([0.0, seconds]), np.array([[0.0] * 3, [pull * seconds, 0.0, 0.0]])),),
+        locked=("y", "theta"), friction=friction,
+    )  # fmt: skip
+    normal = 4.0 * stiffness * deep
+    return scene, Slider(MASS, 4.0 * stiffness, 4e7, static * normal, kinetic * normal, (pull, 0.0, 0.0))
+
+
+def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
+    speed, seconds = 2e-3, 2.0
+    scene, slider = belt(speed, seconds)
+    result = simulate(scene, seconds, output_dt=0.01, tol=1e-11)
+    expected, switches = slider.run(result.t)
+    assert len(switches) >= 10
+    assert np.abs(result.q[:, 0] - expected[:, 0]).max() < 1e-9
+
+
+def test_a_load_below_the_limit_is_held_without_creep() -> None:
+    """Pressed by up to 0.9 mu N back and forth: the way is the spring's, F / k, and 20 periods leave nothing behind."""
+    amplitude, omega = 0.9 * MU * MASS * G, 2.0 * math.pi
+    load = Harmonic("pull", (amplitude, 0.0), omega_rad_s=omega)
+    scene = replace(block(0.0, 0.0), friction=HELD, loads=(load,))
+    result = simulate(scene, 20.0, output_dt=0.05, tol=1e-10)
+    settled = result.t > 1.0
+    # a forced swing far below the grip's own frequency
+    stiffness, lag = 2.0 * GRIP - MASS * omega**2, 2.0 * HELD_DAMPING * omega
+    swing = amplitude / math.hypot(stiffness, lag)
+    expected = swing * np.sin(omega * result.t - math.atan2(lag, stiffness))
+    assert result.q[settled, 0] == pytest.approx(expected[settled], abs=1e-9 * swing)
+    creeping = simulate(replace(scene, friction=Friction(MU, 0.02)), 0.5, output_dt=0.5)
+    assert creeping.q[-1, 0] > 1000.0 * swing
+
+
+@pytest.mark.parametrize("name", ["paper", pytest.param("bench_hc", marks=pytest.mark.stress)])
+def test_fixed_steps_come_to_the_same_motion_and_the_books_balance(name: str) -> None:
+    friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5, static_coefficient=0.3)
+    scene = replace(preset(name), friction=friction)
+    events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
+    steps = simulate(scene, 1.0, output_dt=0.1, method="rk4", dt=2e-6)
+    assert pose_error(scene, steps.q, events.q) < 1e-6
+    assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-11
+    loose = simulate(scene, 1.0, output_dt=0.1, tol=1e-5)
+    assert pose_error(scene, loose.q, events.q) < 1e-4
+
+
+@pytest.mark.parametrize("damping", [1e10, pytest.param(1e7, marks=pytest.mark.stress)])
+def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
+    """A grip whose damper is far stronger than its spring takes implicit steps."""
+    friction = Friction(MU, stick_stiffness_n_m=GRIP, stick_damping_n_s_m=damping)
+    push, omega = 1.3 * MU * MASS * G, 9.0
+    scene = replace(block(0.0, 0.0), friction=friction, loads=(Harmonic("pull", (push, 0.0), omega_rad_s=omega),))
+    tight = simulate(scene, 1.0, output_dt=0.05, tol=1e-12)
+    loose = simulate(scene, 1.0, output_dt=0.05, tol=1e-5)
+    assert pose_error(scene, loose.q, tight.q) < 1e-4 and loose.solver["steps"] < 3000
+
+
+def test_painleves_case_is_an_impact_without_collision() -> None:
+    """A corner that its own friction presses into the wall: the force grows as cosh, stops the slip, and throws."""
+    mass, inertia, stiffness, mu = 1.0, 0.002, 1e8, 0.5
+    scene = Scene(
+        Head(mass, inertia), Frame(0.1, 0.6), Clearance(0.1, 0.1), Contact("hertz", stiffness), Gravity(0.0),
+        initial=Initial((0.0, -0.05, 0.0)), pairs=("top_right_top",),
+        friction=Friction(mu, stick_stiffness_n_m=stiffness),
+    )  # fmt: skip
+    pair = 2
+    assert painleve_coefficients(scene)[pair] == pytest.approx((inertia / mass + 0.05**2) / (0.05 * 0.3))
+    for speed, jams in ((-1.0, True), (1.0, False)):
+        moving = replace(scene, initial=Initial((0.0, -0.05, 0.0), (speed, -1e-3, 0.0)))
+        result = simulate(moving, 0.01, output_dt=1e-6, tol=1e-10, energy_balance=True)
+        assert result.energy_balance is not None and result.energy_balance.relative_imbalance < 1e-8
+        p = 1.0 / mass + 0.05**2 / inertia - (1.0 if jams else -1.0) * mu * 0.05 * 0.3 / inertia
+        assert (p < 0.0) == jams
+        # d'' = -p N while the corner slips
+        rate, t = math.sqrt(abs(p) * stiffness), result.t[1:40]
+        expected = stiffness * 1e-3 / rate * (np.sinh(rate * t) if jams else np.sin(rate * t))
+        assert result.force[1:40, pair] == pytest.approx(expected, rel=0.02)
+        # thrown far faster than it came, or just turned back
+        assert (result.v[-1, 1] > 0.1) == jams and (result.statistics["top_right_top"]["max"] > 1e3) == jams
+        assert result.force[-1, pair] == 0.0
+
+
+def test_a_restored_twin_a_batch_and_a_bounded_twin_go_on_alike() -> None:
+    scene = replace(preset("paper"), friction=Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5))
+    times = np.linspace(0.01, 0.4, 23)
+    loads = np.stack([4e4 * np.sin(20.0 * times), -1e4 * np.cos(9.0 * times), 2e4 * np.sin(7.0 * times)], axis=1)
+    twin, other, bounded = (Twin(scene, excitation="sampled", max_evaluations=most) for most in (None, None, 2000))
+    batch = TwinBatch([scene, scene])
+    for t, load in zip(times, loads, strict=True):
+        row = twin.advance(t, load)
+        assert row.status.name == "OK"
+        assert np.array_equal(batch.advance(t, load).q[1, 0], row.q)
+        assert np.array_equal(other.advance(t, load).q, row.q)
+        other.restore(twin.snapshot())
+        assert bounded.advance(t, load).q == pytest.approx(row.q, abs=1e-6)
+    with pytest.raises(ValueError, match="friction with stick in all or in none"):
+        TwinBatch([scene, preset("paper")])
+
+
+def test_without_stick_none_of_its_code_is_compiled() -> None:
+    for friction in (None, Friction(0.2), Friction(0.0, stick_stiffness_n_m=1e8)):
+        compiled = compiled_scene.compile_scene(replace(preset("paper"), friction=friction), 1e-9)
+        assert compiled.parts.terms.stick is None and compiled.initial_state().dtype == STATE
+
+
+def test_what_makes_no_friction_is_refused() -> None:
+    for friction, problem in (
+        (Friction(0.3, stick_damping_n_s_m=1.0), "stick_damping_n_s_m: got 1.0, expected nothing without"),
+        (Friction(0.3, stick_stiffness_n_m=1e8, static_coefficient=0.2), "at least the coefficient 0.3"),
+        (Friction(0.3, stick_stiffness_n_m=0.0), "stick_stiffness_n_m: got 0.0, expected a finite number > 0"),
+    ):
+        with pytest.raises(SceneError, match=problem):
+            replace(preset("paper"), friction=friction)
