@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import ros_processes  # noqa: F401  (imports ROS without the warnings of its own modules)
-from geometry_msgs.msg import PoseStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -25,11 +25,16 @@ from rclpy.serialization import serialize_message
 
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
+from plow_twin.record.measured import read_recording
+from plow_twin.record.reader import EntryRecord, RunReader
+from plow_twin.record.replay import replay
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import Taken
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.intake import Verdict
+from plow_twin.stream.journal import Pose
 
 
 class _Flood:
@@ -110,11 +115,39 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             message.pose.orientation.z, message.pose.orientation.w = sign * math.sin(5e-3), sign * math.cos(5e-3)
             front = node._front
             assert front is not None
-            front.subscriptions._measured_poses([Taken(b"", number, 0, serialize_message(message))])
+            taken = [Taken(b"", number, 0, serialize_message(message))]
+            front.subscriptions._measured_poses(PoseStamped, taken)
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
             found.append(residual[2])
     assert found == pytest.approx([-0.008, -0.008], abs=1e-12)
+
+
+def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_path: Path) -> None:
+    said = [(1e-8, 4e-8, 9e-6), (0.0, 0.0, 0.0), (9e-8, 4e-8, 9e-6), (-1.0, 0.0, 0.0), (math.nan, 0.0, 0.0)]
+    run = tmp_path / "run"
+    with _node(head_pose_type="pose_with_covariance", record_path=str(run)) as node:
+        assert node.start()
+        front = node._front
+        assert front is not None
+        for number, variances in enumerate(said, 1):
+            message = PoseWithCovarianceStamped()
+            message.header.stamp.sec = number
+            message.pose.pose.orientation.w = 1.0
+            for axis, variance in zip((0, 1, 5), variances, strict=True):
+                message.pose.covariance[7 * axis] = variance
+            taken = [Taken(b"", number, 0, serialize_message(message))]
+            front.subscriptions._measured_poses(PoseWithCovarianceStamped, taken)
+        assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
+        front.runtime.samples([(stamp * 1_000_000_000, (0.0, 0.0, 0.0)) for stamp in (1, 2, 3)])
+        assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+        assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+    poses = [entry for entry in entries if isinstance(entry, Pose)]
+    assert [pose.deviation for pose in poses] == [(1e-4, 2e-4, 3e-3), (), (3e-4, 2e-4, 3e-3)]
+    mean = math.sqrt((1e-8 + 9e-8) / 2)
+    assert read_recording(run).pose_deviation == pytest.approx((mean, 2e-4, 3e-3))
+    assert replay(run).exit_code == 0
 
 
 def test_loads_without_a_direction_may_be_named_and_count_nothing() -> None:

@@ -7,6 +7,7 @@ changes nothing, and the journal gives the same windows as the live node.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +49,8 @@ class Windows:
     length_s, interval_s, wait_s : float
         Full length of a window, distance of their ends, and how long late data are waited for, in s.
     poses, load : tuple of 3 float
-        Stated deviations of what is measured; that of the load until another one is stated.
+        Stated deviations of what is measured; that of the load until another one is stated, that of the poses where
+        they bring no larger one.
     """
 
     def __init__(
@@ -68,6 +70,7 @@ class Windows:
         """Forget everything: stamps or machine are other ones from now on."""
         self._loads: list[Row] = []
         self._poses: list[Row] = []
+        self._deviations: list[Row] = []
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
 
@@ -75,9 +78,11 @@ class Windows:
         """Take in how well the load is known from here on: Fx, Fy [N], M [N m]."""
         self._load_deviation = deviation
 
-    def take_pose(self, stamp_ns: int, q: tuple[float, ...]) -> None:
-        """Take in a measured pose x, y [m], theta [rad]."""
+    def take_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
+        """Take in a measured pose x, y [m], theta [rad], with its own deviations where they are known."""
         self._poses.append((stamp_ns, *q))  # type: ignore[arg-type]
+        if deviation:
+            self._deviations.append((stamp_ns, *deviation))  # type: ignore[arg-type]
 
     def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
         """Take in a sample of the load Fx, Fy [N], M [N m]; return the window that is due now, if one is."""
@@ -98,6 +103,7 @@ class Windows:
         # what is older than this window is in none of those to come
         self._loads = [row for row in self._loads if row[0] >= start_ns]
         self._poses = [row for row in self._poses if row[0] >= start_ns]
+        self._deviations = [row for row in self._deviations if row[0] >= start_ns]
         stamps = np.sort(np.array([row[0] for row in self._loads if row[0] < end_ns], dtype=np.int64))
         gaps = np.flatnonzero(np.diff(stamps) > LONGEST_GAP_S * 1e9)
         if len(gaps):
@@ -109,8 +115,17 @@ class Windows:
             return None
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
         load, lost_load = Load.of(*_table(rows, start_ns), self._load_deviation)
-        pose, lost_poses = Poses.of(*_table(poses, start_ns), self._pose_deviation)
+        own = [row[1:] for row in self._deviations if start_ns <= row[0] < end_ns]
+        pose, lost_poses = Poses.of(*_table(poses, start_ns), at_least(self._pose_deviation, own))
         return Window(start_ns, end_ns, load, pose, len(rows), len(poses), lost_load + lost_poses)
+
+
+def at_least(stated: Deviation, own: Sequence[tuple[float, ...]]) -> Deviation:
+    """Return for each component the root mean square of the poses' own deviations (n, 3); at least the stated one."""
+    if not own:
+        return stated
+    x, y, theta = np.maximum(stated, np.sqrt(np.mean(np.square(own), axis=0))).tolist()
+    return x, y, theta
 
 
 def _table(rows: list[Row], start_ns: int) -> tuple[Array, Array]:

@@ -96,9 +96,9 @@ class Worker:
         """Take in a sample of the load."""
         self._waiting.append((stamp_ns, wrench, True))
 
-    def take_pose(self, stamp_ns: int, q: tuple[float, ...]) -> None:
-        """Take in a measured pose."""
-        self._waiting.append((stamp_ns, q, False))
+    def take_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
+        """Take in a measured pose, with its deviations where they are known."""
+        self._waiting.append((stamp_ns, (q, deviation), False))
 
     def take_spread(self, deviation: Deviation) -> None:
         """Take in how well the load is known from here on."""
@@ -182,7 +182,7 @@ def take(windows: Windows, item: tuple[Any, ...]) -> Window | None:
     stamp_ns, values, is_load = item
     if is_load:
         return windows.take_load(stamp_ns, values)
-    windows.take_pose(stamp_ns, values)
+    windows.take_pose(stamp_ns, *values)
     return None
 
 

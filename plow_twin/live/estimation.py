@@ -54,8 +54,8 @@ class Estimation:
         match entry:
             case Sample(stamp_ns, wrench):
                 self._worker.take_load(stamp_ns, wrench)
-            case Pose(stamp_ns, pose):
-                self._worker.take_pose(stamp_ns, pose)
+            case Pose(stamp_ns, pose, deviation):
+                self._worker.take_pose(stamp_ns, pose, deviation)
             case Spread(_, deviation):
                 self._worker.take_spread(deviation)
             case SetWear():

@@ -83,9 +83,12 @@ class BridgeFront:
         # 0 would say that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
-        """Send nothing: the recording holds the messages."""
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> bool:
+        """Send nothing: the recording holds the messages. False when a number is not finite."""
+        if not publication.finite:
+            return False
         forces_sent()
+        return True
 
     def publish_quality(self, marks: JointState) -> None:
         """Send nothing, as `publish`."""

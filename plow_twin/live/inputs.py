@@ -37,8 +37,8 @@ class Inputs:
     depth
         Length of the queue of the excitation.
     on_pose
-        Receives stamp [ns] and x, y [m], theta [rad] of measured poses, late ones up to `pose_span_s` too; None: only
-        the newest is kept.
+        Receives stamp [ns], x, y [m], theta [rad] and the standard deviations, if any, of measured poses, late ones up
+        to `pose_span_s` too; None: only the newest is kept.
     on_gaps
         Receives stamp [ns] and measured gaps [m] by number of their pairs, in order and late ones as poses.
     """
@@ -49,7 +49,7 @@ class Inputs:
         intake: Intake,
         on_travel: Callable[[int, float], None],
         depth: int,
-        on_pose: Callable[[int, tuple[float, float, float]], None] | None = None,
+        on_pose: Callable[[int, tuple[float, float, float], tuple[float, ...]], None] | None = None,
         pose_span_s: float = 0.0,
         on_gaps: Callable[[int, Mapping[int, float]], None] = lambda stamp_ns, gaps: None,
     ) -> None:
@@ -134,9 +134,9 @@ class Inputs:
         if self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used:
             self._on_travel(stamp_ns, speed_m_s)
 
-    def take_pose(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
-        """Take in a measured pose: x, y [m], theta [rad]."""
-        verdict = self._judged("head_pose", self.head_pose, stamp_ns, pose, self._poses)
+    def take_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
+        """Take in a measured pose: x, y [m], theta [rad], and their standard deviations where they are known."""
+        verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*pose, *deviation), self._poses)
         if not verdict.used:
             return
         if verdict is not Verdict.WORKED_IN:
@@ -145,7 +145,7 @@ class Inputs:
             if verdict.resets:
                 self._poses.clear()
             self._poses.add(stamp_ns)
-            self._on_pose(stamp_ns, pose)
+            self._on_pose(stamp_ns, pose, deviation)
 
     def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
         """Take in measured gaps [m] by number of their pairs."""

@@ -219,6 +219,12 @@ class Settings:
         "most evaluations of the equations of motion in an advance, at least 16; the rest of it is coarse then, and "
         "its error is estimated; 0: as many as it takes",
     )
+    head_pose_type: str = _choice(
+        "pose",
+        ("pose", "pose_with_covariance"),
+        Effect.CONFIGURE,
+        "message of head_pose: PoseStamped, or PoseWithCovarianceStamped, whose variances of x, y and theta go on",
+    )
     head_pose_deviation: tuple[float, ...] = _list(
         (0.0, 0.0, 0.0),
         "m, m, rad",

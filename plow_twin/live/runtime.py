@@ -69,8 +69,11 @@ class Front(Protocol):
     def now_ns(self) -> int:
         """Return the time on the clock of the stamps [ns]."""
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
-        """Send the messages of a publication; call `forces_sent` right after the forces."""
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> bool:
+        """Send the messages of a publication; call `forces_sent` right after the forces.
+
+        False, and nothing is sent, when a number is not finite.
+        """
 
     def publish_quality(self, marks: JointState) -> None:
         """Send the marks of a publication that has some, or follows one that had."""
@@ -226,6 +229,11 @@ class Runtime:
     def source(self) -> str:
         """Excitation source in use."""
         return self._settings.excitation_source
+
+    @property
+    def poses_have_covariance(self) -> bool:
+        """Whether measured poses bring their covariance."""
+        return self._settings.head_pose_type == "pose_with_covariance"
 
     def residual(self) -> tuple[float, float, float] | None:
         """Return model minus newest measured pose: x, y [m], theta [rad], or None without a measurement."""
@@ -447,8 +455,8 @@ class Runtime:
 
         return both
 
-    def _pose(self, stamp_ns: int, pose: tuple[float, float, float]) -> None:
-        self.driver.session.apply(Pose(stamp_ns, pose))
+    def _pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...]) -> None:
+        self.driver.session.apply(Pose(stamp_ns, pose, deviation))
         if self.alarms.take_pose(stamp_ns, pose):
             self._alarms_changed(stamp_ns)
 
@@ -503,13 +511,12 @@ class Runtime:
     def _publish(self, publication: Publication | None) -> None:
         if publication is None:
             return
-        if not publication.finite:
+        if not self._front.publish(publication, self._forces_sent):
             self.withheld += 1
             return
         self._q = publication.q
         self.held_frames += publication.held
         self.corrected_frames += publication.corrected
-        self._front.publish(publication, self._forces_sent)
         marks = quality(publication, self._settings.frame_id) if publication.marked else None
         if marks is not None:
             self._front.publish_quality(marks)

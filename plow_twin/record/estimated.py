@@ -42,8 +42,8 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
                     formed[window.end_ns] = window
                 continue
             match entries.others[index]:
-                case Pose(stamp_ns, pose):
-                    windows.take_pose(stamp_ns, pose)
+                case Pose(stamp_ns, pose, deviation):
+                    windows.take_pose(stamp_ns, pose, deviation)
                 case Spread(_, deviation):
                     windows.take_spread(deviation)
                 case Reset() | SetWear():

@@ -65,6 +65,8 @@ _KINDS: Final[dict[str, type[Any]]] = {
 }
 #: A digest as it is written: it is what most entries of a journal are.
 _DIGEST: Final = re.compile(r'\{"kind": "digest", "stamp_ns": (-?[0-9]{1,19}), "digest": "([0-9a-f]*)"\}')
+#: Fields that a line may lack.
+_OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
 
@@ -74,6 +76,8 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
         fx, fy, m = entry.wrench
         return WrenchStamped(entry.stamp_ns, frame_id, (fx, fy, 0.0), (0.0, 0.0, m))
     values = {spec.name: getattr(entry, spec.name) for spec in fields(entry)}
+    if isinstance(entry, Pose) and not entry.deviation:
+        del values["deviation"]
     if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
     elif isinstance(entry, Unused):
@@ -109,7 +113,8 @@ def _from_json(text: str, source: str) -> Entry | Dropped:
     try:
         values = json.loads(text)
         kind = values["kind"]
-        entry: Entry | Dropped = _KINDS[kind](*[read(values[name]) for name, read in _FIELDS[kind]])
+        given = [read(values[name]) for name, read in _FIELDS[kind] if name in values or name not in _OPTIONAL]
+        entry: Entry | Dropped = _KINDS[kind](*given)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise RecordingError(f"{source}: got {text[:120]!r}, expected an entry of the journal ({error!r})") from error
     return entry

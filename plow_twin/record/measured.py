@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import UNSTATED, Deviation
+from plow_twin.estimate.window import at_least
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.estimated import stated
@@ -91,9 +92,9 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     else:
         given = scene is not None
         model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
-        loads, journalled, spread = _journal(own)
+        loads, journalled, spread, own_deviations = _journal(own)
         of_poses, of_load = stated(own.header.parameters)
-        deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
+        deviations = at_least(of_poses, own_deviations), tuple(np.maximum(of_load, spread).tolist())
         rows, unfit = {"head_pose": journalled}, 0
         if mapping is not None or not len(journalled):
             folder = path if path.is_dir() else path.parent
@@ -109,18 +110,22 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     return Measured(model, loads, poses, unfit, *deviations)
 
 
-def _journal(reader: RunReader) -> tuple[Array, Array, Array]:
-    """Return samples and poses of a journal, (n, 4) each, stamps in ns, and the largest deviation of the load, (3,)."""
-    loads, poses, spread = [np.zeros((0, 4))], [], np.zeros(3)
+def _journal(reader: RunReader) -> tuple[Array, Array, Array, list[tuple[float, ...]]]:
+    """Return samples and poses of a journal, (n, 4) each, stamps in ns, and what it says of deviations.
+
+    Those are the largest of the load, (3,), and those that came with poses.
+    """
+    loads, poses, spread, deviations = [np.zeros((0, 4))], [], np.zeros(3), []
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         loads.append(np.column_stack([entries.stamp_ns, entries.wrench])[entries.sample])
         for entry in entries.others.values():
             if isinstance(entry, Pose):
                 poses.append((entry.stamp_ns, *entry.pose))
+                deviations += [entry.deviation] if entry.deviation else []
             elif isinstance(entry, Spread):
                 spread = np.maximum(spread, entry.deviation)
-    return np.concatenate(loads), np.array(poses, dtype=np.float64).reshape(-1, 4), spread
+    return np.concatenate(loads), np.array(poses, dtype=np.float64).reshape(-1, 4), spread, deviations
 
 
 def _collect(

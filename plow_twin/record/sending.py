@@ -33,13 +33,15 @@ class PublicationBytes:
         self._arrays = [np.frombuffer(buffer, np.uint8) for buffer in self._buffers]
         self._layouts = (pairs.data, pairs.places, head.data, head.places)
 
-    def write(self, publication: Publication) -> dict[str, bytes]:
-        """Return the bytes by base name of the topic, forces first."""
+    def write(self, publication: Publication) -> dict[str, bytes] | None:
+        """Return the bytes by base name of the topic, forces first; None when a number is not finite."""
         now = publication
-        _write(
+        finite = _write(
             now.stamp_ns, now.penetration, now.rate, now.force, now.makes, now.impulse, now.peak, now.q, now.v,
             *self._arrays, *self._layouts,
         )  # fmt: skip
+        if not finite or (now.slow is not None and not publication.finite):
+            return None
         found = dict(zip(_EACH, map(bytes, self._buffers), strict=True))
         if now.slow is not None:
             slow = {"clearance": now.slow.clearance, "wear_rate": now.slow.wear_rate}
@@ -77,11 +79,13 @@ def _write(  # type: ignore[no-untyped-def]
     stamp_ns, penetration, rate, force, makes, impulse, peak, q, v,
     forces, peaks, head, pairs_data, pairs_places, head_data, head_places,
 ):  # fmt: skip
-    """Write the three messages to `forces`, `peaks` and `head`."""
+    """Write the three messages to `forces`, `peaks` and `head`; False when a number is not finite."""
     start, stamp, motion, numbers = np.zeros(1, np.int64), np.full(1, stamp_ns), np.empty((1, 7)), np.empty((1, 24))
     head_numbers(q.reshape(1, 3), v.reshape(1, 3), motion)
     fill(head, start, head_data, head_places, stamp, motion)
     side_by_side(penetration.reshape(1, 8), rate.reshape(1, 8), force.reshape(1, 8), numbers)
     fill(forces, start, pairs_data, pairs_places, stamp, numbers)
+    total = motion.sum() + numbers.sum()
     side_by_side(makes.reshape(1, 8), impulse.reshape(1, 8), peak.reshape(1, 8), numbers)
     fill(peaks, start, pairs_data, pairs_places, stamp, numbers)
+    return np.isfinite(total + numbers.sum())

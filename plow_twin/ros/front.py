@@ -100,9 +100,9 @@ class RosFront:
         """Return the node's time [ns]."""
         return int(self._node.get_clock().now().nanoseconds)
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> None:
-        """Publish the messages of a publication."""
-        self._publishers.publish(publication, forces_sent)
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> bool:
+        """Publish the messages of a publication, if all its numbers are finite."""
+        return self._publishers.publish(publication, forces_sent)
 
     def publish_quality(self, marks: JointState) -> None:
         """Publish the marks of a publication."""

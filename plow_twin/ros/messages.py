@@ -1,9 +1,11 @@
-"""Between ROS messages and plain numbers. Those sent at each sample are bytes, written over."""
+"""Between ROS messages and plain numbers."""
 
 from __future__ import annotations
 
+import math
 import struct
 from array import array
+from collections.abc import Sequence
 from typing import Final
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -24,6 +26,16 @@ _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{o
 def stamp_ns(header: Header) -> int:
     """Return the stamp of a header [ns]."""
     return int(header.stamp.sec * NS_PER_S + header.stamp.nanosec)
+
+
+def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
+    """Return the standard deviations of x, y [m] and theta [rad] of a covariance, row-major 6 x 6.
+
+    NaN where a variance is negative: such a message is not used. Empty where all are 0, which says that none is known.
+    """
+    variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
+    found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)
+    return found if any(found) else ()
 
 
 def set_stamp(header: Header, stamp: int) -> None:

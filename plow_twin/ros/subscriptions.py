@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final
 
-from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped, WrenchStamped
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
@@ -19,7 +19,7 @@ from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
-from plow_twin.ros.messages import read_wrench, stamp_ns
+from plow_twin.ros.messages import deviations, read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
@@ -65,7 +65,8 @@ class Subscriptions:
             take = self._samples if topic == self._source else self._not_selected
             self._subscribe(kind, topic, depth, partial(take, topic, read_sample[topic]))
         self._subscribe(TwistStamped, "travel", _SLOW_DEPTH, self._travel_speeds)
-        self._subscribe(PoseStamped, "head_pose", _SLOW_DEPTH, self._measured_poses)
+        kind = PoseWithCovarianceStamped if runtime.poses_have_covariance else PoseStamped
+        self._subscribe(kind, "head_pose", _SLOW_DEPTH, partial(self._measured_poses, kind))
         self._subscribe(JointState, "gaps", _SLOW_DEPTH, self._measured_gaps)
 
     def look_for_senders(self) -> None:
@@ -181,11 +182,13 @@ class Subscriptions:
             else:
                 self._inputs.gaps.refuse(Verdict.MALFORMED, stamp, tuple(message.position))
 
-    def _measured_poses(self, batch: list[Taken]) -> None:
-        for message in self._messages("head_pose", PoseStamped, self._inputs.head_pose, batch):
-            position, turn = message.pose.position, message.pose.orientation
-            theta = 2.0 * math.atan2(turn.z, turn.w)
-            self._inputs.take_pose(stamp_ns(message.header), (position.x, position.y, theta))
+    def _measured_poses(self, kind: type, batch: list[Taken]) -> None:
+        for message in self._messages("head_pose", kind, self._inputs.head_pose, batch):
+            with_covariance = kind is PoseWithCovarianceStamped
+            pose = message.pose.pose if with_covariance else message.pose
+            theta = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
+            deviation = deviations(message.pose.covariance) if with_covariance else ()
+            self._inputs.take_pose(stamp_ns(message.header), (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
         """Yield the messages of an input besides the load; what cannot be read is counted."""

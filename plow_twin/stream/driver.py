@@ -306,9 +306,9 @@ class Driver:
         self.rolled_back += late
         if self.every_sample and not late:
             for sample in samples:
-                for series in self.session.apply_samples((sample,)):
-                    self._advanced(now_ns)
-                    self._judge_advance(Status(int(series.status[-1])), StreamState.RUNNING)
+                series = self.session.apply_sample(sample)
+                self._advanced(now_ns)
+                self._judge_advance(Status(int(series.status[-1])), StreamState.RUNNING)
                 self._give_up_after_failures(now_ns)
                 publication = self.due()
                 if publication is not None:

@@ -107,10 +107,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Pose:
-    """The head was measured at `pose` (x, y [m], theta [rad]) at `stamp_ns`: kept for the estimate, moves nothing."""
+    """The head was measured at `pose` (x, y [m], theta [rad]) at `stamp_ns`: kept for the estimate, moves nothing.
+
+    `deviation` holds the three standard deviations that came with it; empty: none came.
+    """
 
     stamp_ns: int
     pose: tuple[float, ...]
+    deviation: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -141,8 +141,7 @@ class Session:
         """
         match entry:
             case Sample():
-                *_, series = self.apply_samples([entry])
-                return series[-1]
+                return self.apply_sample(entry)[-1]
             case Hold() | Unload():
                 return self._apply_hold(entry)
             case Travel():
@@ -175,6 +174,22 @@ class Session:
             case Digest() | Loss():
                 pass
         return None
+
+    def apply_sample(self, sample: Sample) -> AdvanceSeries:
+        """Apply one sample; return the advance that ended at it, or at the newest one where it was late.
+
+        Raises
+        ------
+        ValueError
+            As `apply`.
+        """
+        late = self._is_late(sample.stamp_ns)
+        if late:
+            self._check_late(sample.stamp_ns)
+        self._on_entry(sample)
+        series = self._work_in(sample.stamp_ns, [sample]) if late else self._run([sample])
+        self._count(1)
+        return series
 
     def apply_samples(self, samples: Sequence[Sample]) -> Iterator[AdvanceSeries]:
         """Apply samples of rising stamps in as few calls as digests allow; the same bits as `apply` for each.
