@@ -187,6 +187,27 @@ def test_under_a_flood_of_samples_what_is_due_is_done_and_others_have_their_turn
     assert not errors and len(set(at)) == len(at) and at[-1] > 20
 
 
+def test_loss_is_counted_by_numbers_and_never_asked_of_the_middleware() -> None:
+    asked: list[Any] = []
+    with _node() as node:
+        create = node.create_subscription
+
+        def watched(*arguments: Any, **options: Any) -> Any:
+            asked.append(options.get("event_callbacks"))
+            return create(*arguments, **options)
+
+        node.create_subscription = watched  # type: ignore[method-assign]
+        assert node.start()
+        assert node._front is not None and node.runtime is not None
+        subscriptions = node._front.subscriptions
+        for numbers in ((7, 8), (11,), (10,), (12,)):  # 9 never comes, 10 late
+            batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
+            subscriptions._counted("travel", subscriptions._travel_speeds, batch)
+        assert node.runtime.inputs.lost == 1
+    # taking that event while a message is lost stops rmw_fastrtps for good
+    assert len(asked) == 5 and all(callbacks.message_lost is None for callbacks in asked)
+
+
 def test_an_error_in_the_thread_of_the_inputs_ends_the_program_and_is_said() -> None:
     with _node() as node:
         assert node.start()

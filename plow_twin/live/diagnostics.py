@@ -44,7 +44,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "samples_not_followed": "samples of other publishers of the source than the one followed; not used",
         "queue_peak": "most samples that waited in the input queue since the last report",
         "queue_wait_ms": "longest wait of a sample in the input queue since the last report [ms]",
-        "messages_lost": "messages that the middleware reports as lost on the way, on all inputs",
+        "messages_lost": "messages that publishers sent and that never arrived, by their own numbering, on all inputs",
         "dropped_non_finite": "dropped: a number is not finite",
         "dropped_unstamped": "dropped: the stamp is zero or negative",
         "dropped_duplicate": "dropped: the stamp is that of the sample before",

@@ -73,7 +73,7 @@ class Inputs:
         self._queue_peak = (0, 0.0)
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns = -_OTHER_SENDER_NS
-        #: messages that the transport reports as lost before they could be read
+        #: messages that were sent and could not be read, as far as the transport tells
         self.lost = 0
         self.travel, self.head_pose, self.gaps = Intake(), Intake(), Intake()
         for judge in (intake, self.travel, self.head_pose, self.gaps):

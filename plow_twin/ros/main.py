@@ -11,8 +11,6 @@ from plow_twin.live.stop import StopRequested, StopSignals
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
-#: Longest time for which the recorder or the executor keep the interpreter from the thread of the inputs [s].
-_SWITCH_S: Final = 2e-4
 #: Longest wait for an event [s]: an unbounded wait of the events executor does not end at shutdown.
 _SPIN_S: Final = 0.1
 
@@ -46,7 +44,6 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
     from plow_twin.live.solver_start import leave
     from plow_twin.ros.node import TwinNode
 
-    sys.setswitchinterval(_SWITCH_S)
     rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:

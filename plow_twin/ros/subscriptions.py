@@ -26,6 +26,8 @@ from plow_twin.stream.intake import Intake, Verdict
 
 #: Depth of the optional inputs' queues.
 _SLOW_DEPTH: Final = 200
+#: Publishers whose numbers are remembered; the oldest is forgotten.
+_MOST_PUBLISHERS: Final = 256
 _PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
 #: Stamp [ns] and numbers of a message, whether they are a load, and whether one outside the plane is not zero.
 _Read = tuple[int, tuple[float, ...], bool, bool]
@@ -59,6 +61,8 @@ class Subscriptions:
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.source, self._inputs.depth
         self._names: dict[tuple[str, bytes], str] = {}
+        #: number of the next message, by topic and publisher
+        self._following: dict[tuple[str, bytes], int] = {}
         self._inputs.unused.name_of = self._name_of
         read_sample = {"excitation": self._read_wrench, "tool_forces": self._read_tool_forces}
         for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
@@ -90,8 +94,9 @@ class Subscriptions:
         return self._names.setdefault((topic, sender), sender.hex())
 
     def _subscribe(self, kind: type, topic: str, depth: int, take: Callable[[list[Taken]], None]) -> None:
+        # no message_lost: rmw_fastrtps takes two locks in one order there, in the other where it notes a loss: a node
+        # that loses messages would stand still for good, the interpreter with it
         events = SubscriptionEventCallbacks(
-            message_lost=self._message_lost,
             incompatible_qos=lambda event: self._incompatible(topic, event),
             matched=lambda event: self._matched(topic, event),
         )
@@ -106,10 +111,26 @@ class Subscriptions:
         )
         if topic == self._source:
             self._inputs.senders.start(self._present(topic))
-        self._loop.add(InputQueue(self._node, subscription, take))
+        self._loop.add(InputQueue(self._node, subscription, partial(self._counted, topic, take)))
 
-    def _message_lost(self, event: Any) -> None:
-        self._inputs.lost += event.total_count_change
+    def _counted(self, topic: str, take: Callable[[list[Taken]], None], batch: list[Taken]) -> None:
+        """Count the gaps in the publishers' numbers, and hand the messages on."""
+        inputs, following = self._inputs, self._following
+        for message in batch:
+            key = (topic, message.sender)
+            expected = following.get(key)
+            if expected is None:
+                # what was sent before the first one heard is counted where it is known who was there: `senders`
+                expected = message.number
+                if len(following) >= _MOST_PUBLISHERS:
+                    following.pop(next(iter(following)))
+            if message.number != expected:
+                missed = message.number - expected if message.number > expected else -1
+                inputs.lost = max(0, inputs.lost + missed)
+                if topic != self._source:
+                    inputs.unused.note_lost(topic, message.sender, missed)
+            following[key] = max(expected, message.number + 1)
+        take(batch)
 
     def _incompatible(self, topic: str, event: Any) -> None:
         self._inputs.refused_publishers += event.total_count_change
