@@ -32,7 +32,19 @@ from plow_twin.solve.compiled_scene import compile_scene, inertias
 from plow_twin.solve.loop import advance_batch
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.modes import settle_modes
-from plow_twin.solve.state import PARAMS, ROW, SEGMENT, STATE, TOTALS, WORK, Parts, new_records, new_work
+from plow_twin.solve.state import (
+    PACE,
+    PARAMS,
+    ROW,
+    SEGMENT,
+    STATE,
+    TOTALS,
+    WORK,
+    Parts,
+    new_record,
+    new_records,
+    new_work,
+)
 
 Array = NDArray[np.float64]
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -48,11 +60,11 @@ _UNKNOWN_NOISE = 3e-4
 
 
 @kernel(entry=True)
-def move(params, parts, states, work, totals, times, wrench, rows) -> None:
+def move(params, parts, states, saved, work, totals, times, wrench, rows, pace) -> None:
     """Let all members settle and advance them; arrays as `advance_batch` takes them."""
     for m in range(states.size):
-        settle_modes(params[m], states[m])
-    advance_batch(params, parts, states, work, totals, 0, states.size, times, wrench, 20_000, rows, None)
+        settle_modes(params[m], states[m], parts.terms.stick)
+    advance_batch(params, parts, states, saved, work, totals, 0, states.size, times, wrench, 20_000, rows, None, pace)
 
 
 class Members:
@@ -101,7 +113,12 @@ class Members:
         ends = np.stack([np.interp([start, end], self.load.t, column) for column in self.load.wrench.T], axis=1)
         wrench = ends * unknown[:, None, 4:7] / self._masses
         result = np.zeros((len(out), 1), ROW)
-        move(self._params, self._parts, states, self._work, self._totals, np.array([end]), wrench, result)
+        pace = new_record(PACE)
+        pace.slice = 2**62  # in one go
+        move(
+            self._params, self._parts, states, new_records(STATE, 1), self._work, self._totals, np.array([end]), wrench,
+            result, pace,
+        )  # fmt: skip
         good = (result["status"][:, 0] == 0) & np.isfinite(result["q"][:, 0]).all(axis=1)
         out[good, :3], out[good, 3:6] = result["q"][good, 0], result["v"][good, 0]
         return out

@@ -40,10 +40,12 @@ from plow_twin.run.energy_balance import EnergyBalance as EnergyBalance
 from plow_twin.run.ensemble import Ensemble as Ensemble
 from plow_twin.run.ensemble import simulate_many as simulate_many
 from plow_twin.run.sensitivity import Sensitivity as Sensitivity
+from plow_twin.run.sensitivity import sensitivity_parameters as sensitivity_parameters
 from plow_twin.run.simulate import Result as Result
 from plow_twin.run.simulate import simulate as simulate
 from plow_twin.run.twin import Status as Status
 from plow_twin.run.twin import Twin as Twin
+from plow_twin.run.twin_sensitivity import TwinSensitivity as TwinSensitivity
 
 if _TYPE_CHECKING:
     from plow_twin.scene_file import dump_scene as dump_scene

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,10 +25,16 @@ from plow_twin import (
     PlowTwinError,
     RunInterrupted,
     Scene,
+    Twin,
+    TwinBatch,
     Wear,
     simulate,
+    simulate_many,
 )
 from plow_twin.cli.app import run
+from plow_twin.solve.state import Status
+
+BENCH = preset("bench_kv")
 
 
 def test_a_run_stops_at_its_limits_and_says_where_it_stood() -> None:
@@ -84,7 +92,57 @@ def test_the_command_line_writes_what_has_been_computed(tmp_path: Path, capsys: 
         assert 0 < len(file["t"]) < 1001 and np.isfinite(file["q"]).all()
 
 
-BENCH = preset("bench_kv")
+def test_a_twin_stops_at_its_limits_where_its_last_advance_ended() -> None:
+    times = np.linspace(0.01, 60.0, 600)
+    samples = np.stack([4e4 * np.sin(2.0 * times), 1e4 * np.cos(2.0 * times), 3e4 * np.sin(2.0 * times)], axis=1)
+    free = Twin(BENCH, excitation="sampled")
+    whole = free.advance_samples(times, samples)
+    # a step limit is of the motion: that advance is taken back, with a status
+    tied = Twin(BENCH, excitation="sampled", max_steps=1)
+    assert {tied.advance(t, load).status.name for t, load in zip(times[:50], samples, strict=False)} == {"OK", "BUDGET"}
+    for name in ("sampled", "scene"):
+        late = Twin(BENCH, excitation=name, max_wall_s=1e-9)
+        with pytest.raises(LimitError, match=r"max_wall_s = 1e-09 reached at t = \S+ s after \d+ of ") as stop:
+            if name == "sampled":
+                late.advance_samples(times, samples)
+            else:
+                late.advance(1e4)
+        part = stop.value.result
+        if name == "scene":
+            assert late.time == len(part) == 0 and late.digest() == Twin(BENCH).digest()
+            continue
+        # it goes on as if no more had been asked for
+        assert 0 < len(part) < len(times) and late.time == times[len(part) - 1] == stop.value.time_s
+        assert np.array_equal(part.q, whole.q[: len(part)])
+        late._pace.max_wall_s = np.inf
+        rest = late.advance_samples(times[len(part) :], samples[len(part) :])
+        assert np.array_equal(rest.q, whole.q[len(part) :]) and np.array_equal(rest.impulse, whole.impulse[len(part) :])
+        assert late.digest() == free.digest()
+    batch = TwinBatch([BENCH, BENCH], max_wall_s=1e-9)
+    before = batch.digest()
+    with pytest.raises(LimitError, match=r"max_wall_s = 1e-09 reached in advances from t = 0 s to 60 s of 2 twins"):
+        batch.advance_samples(times, samples)
+    assert batch.digest() == before
+
+
+def test_ctrl_c_ends_the_work_of_a_twin_and_of_an_ensemble() -> None:
+    twin = Twin(BENCH)
+    twin.warm_up()
+    for work, done in (
+        (lambda: twin.advance(1e6), r"interrupted at t = 0 s after 0 of 1 advances"),
+        (lambda: simulate_many([BENCH] * 3, 1e6, 1e5, workers=2), r"interrupted after \d of 3 members"),
+    ):
+        begin = time.perf_counter()
+        press = threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT))
+        press.start()
+        with pytest.raises(RunInterrupted, match=done):
+            work()
+        press.join()
+        assert time.perf_counter() - begin < 60.0
+    ensemble = simulate_many([BENCH] * 2, 1.0, 0.5, max_steps=20)
+    assert {Status(code).name for code in ensemble.status} == {"BUDGET"} and np.isnan(ensemble.q[:, -1]).all()
+    with pytest.raises(LimitError, match="max_wall_s = 1e-09 reached after 0 of 2 members"):
+        simulate_many([BENCH] * 2, 1.0, max_wall_s=1e-9)
 
 
 @pytest.mark.stress

@@ -10,7 +10,24 @@ import pytest
 from scenes import preset
 from test_known_ball import GRAVITY, OMEGA, PERIOD
 
-from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Initial, Scene, ToleranceWarning, simulate
+from plow_twin import (
+    ArgumentError,
+    Clearance,
+    Contact,
+    Frame,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Scene,
+    ToleranceWarning,
+    Twin,
+    TwinSensitivity,
+    sensitivity_parameters,
+    simulate,
+)
+from plow_twin.model.loads import compile_loads
+from plow_twin.study.parameters import with_parameters
 
 
 def bouncing(gamma: float, r: float, stiffness: float) -> Scene:
@@ -54,6 +71,57 @@ def test_the_derivatives_are_finite_differences_of_the_motion() -> None:
             ends.append(np.concatenate([run.q[-1], run.v[-1]]))
         expected = (ends[0] - ends[1]) / (2.0 * size)
         assert found.from_start[-1][:, column] == pytest.approx(expected, abs=1e-3 * abs(found.from_start[-1]).max())
+
+
+@pytest.mark.parametrize("name", ["bench_kv", "paper"])
+def test_the_derivatives_by_parameters_are_finite_differences_of_the_motion(name: str) -> None:
+    """Stiffness, damping, clearances and gains of the loads, over several touches."""
+    scene = replace(preset(name), initial=Initial((0.001, 0.002, 0.003), (0.1, 0.0, 0.2)))
+    paths = sensitivity_parameters(scene)
+    assert {"contact.stiffness", "contact.damping", "clearance.vertical_m"} < set(paths) and len(paths) >= 5
+    result = simulate(scene, 0.5, sensitivity=tuple(paths))
+    assert len(result.events) > 3 and result.sensitivity is not None
+    for path, value in paths.items():
+        ends = []
+        for sign in (1.0, -1.0):
+            run = simulate(with_parameters(scene, {path: value * (1.0 + sign * 1e-5)}), 0.5, tol=1e-12)
+            ends.append(np.concatenate([run.q[-1], run.v[-1]]))
+        expected = (ends[0] - ends[1]) / (2e-5 * value)
+        found = result.sensitivity.by_parameter[path][-1]
+        assert found == pytest.approx(expected, abs=1e-3 * np.abs(expected).max()), path
+    with pytest.raises(ArgumentError, match=r"got 'contact\.exponent', expected some of contact\.stiffness"):
+        simulate(scene, 0.5, sensitivity=("contact.exponent",))
+
+
+def test_a_live_twin_has_the_derivatives_too() -> None:
+    scene = replace(preset("bench_kv"), initial=Initial((0.001, 0.002, 0.003), (0.1, 0.0, 0.2)))
+    times = np.arange(1, 501) * 1e-3
+    loads = compile_loads(scene.loads).at(times)
+    paths = ("contact.stiffness", "contact.damping", "clearance.horizontal_m", "clearance.vertical_m")
+    twin, alone = Twin(scene, excitation="sampled"), Twin(scene, excitation="sampled")
+    followed = TwinSensitivity(twin, paths)
+    for t, load in zip(times, loads, strict=True):
+        followed.advance(t, load)
+    alone.advance_samples(times, loads)
+    assert twin.digest() == alone.digest()
+    assert 0.4 < followed.t <= 0.5 and 1.0 <= followed.growth < 1e4 and np.isfinite(followed.exponent)
+
+    def end(other: Scene) -> np.ndarray:
+        moved = Twin(other, excitation="sampled", tol=1e-12)
+        count = int(np.searchsorted(times, followed.t)) + 1
+        rows = moved.advance_samples(times[:count], loads[:count])
+        return np.concatenate([rows.q[-1], rows.v[-1]])
+
+    values = sensitivity_parameters(scene)
+    for path in paths:
+        ends = [end(with_parameters(scene, {path: values[path] * (1.0 + sign * 1e-5)})) for sign in (1.0, -1.0)]
+        expected = (ends[0] - ends[1]) / (2e-5 * values[path])
+        assert followed.by_parameter[path] == pytest.approx(expected, abs=2e-3 * np.abs(expected).max()), path
+    ends = [end(replace(scene, initial=replace(scene.initial, v=(0.1 + d, 0.0, 0.2)))) for d in (1e-6, -1e-6)]
+    expected = (ends[0] - ends[1]) / 2e-6
+    assert followed.from_start[:, 3] == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+    with pytest.raises(ArgumentError, match=r"parameters: got 'loads\.fx\.scale', expected some of contact\.stiffness"):
+        TwinSensitivity(twin, ("loads.fx.scale",))
 
 
 def test_a_scene_that_amplifies_is_told() -> None:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from plow_twin.errors import ArgumentError
+from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.model.scene import Scene
 from plow_twin.run.advance import AdvanceBatch, check_times
+from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.run.twin import DEFAULT_BUDGET
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
@@ -42,6 +43,10 @@ class TwinBatch:
         Model time of the scenes' initial states in s.
     workers : int, optional
         Threads; one by default, for a call that advances by a sample takes less than it costs to wake a second one.
+    max_steps : int
+        As for `Twin`.
+    max_wall_s : float
+        Seconds that a call for advances may take.
 
     Raises
     ------
@@ -50,10 +55,21 @@ class TwinBatch:
 
     Notes
     -----
+    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: all twins stand as before the call.
     Each member has the bits of a `Twin` of its own, where that has the same terms; else it agrees to the tolerance.
     """
 
-    def __init__(self, scenes: Sequence[Scene], *, tol: float = 1e-9, start: float = 0.0, workers: int = 1) -> None:
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        *,
+        tol: float = 1e-9,
+        start: float = 0.0,
+        workers: int = 1,
+        max_steps: int = DEFAULT_BUDGET,
+        max_wall_s: float = MOST_SECONDS,
+    ) -> None:
+        check_limits(max_steps, max_wall_s)
         if not scenes:
             raise ArgumentError("scenes: got none, expected at least one")
         self.scenes = tuple(scenes)
@@ -66,7 +82,10 @@ class TwinBatch:
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
         self._wrench = np.zeros((len(scenes), 3))
         self._masses = np.array([inertias(scene) for scene in scenes])[:, None]
-        self._workers = [_Worker.of(terms, self._compiled) for _ in range(max(1, min(workers, os.cpu_count() or 1)))]
+        self._max_steps, self._max_wall_s = max_steps, max_wall_s
+        self._workers = [
+            _Worker.of(terms, self._compiled, max_wall_s) for _ in range(max(1, min(workers, os.cpu_count() or 1)))
+        ]
         self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
         self._pool = ThreadPoolExecutor(len(self._workers)) if len(self._workers) > 1 else None
         self.reset(start)
@@ -207,15 +226,36 @@ class TwinBatch:
     def _run(self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: NDArray[np.void]) -> None:
         def run(index: int) -> None:
             worker = self._workers[index]
-            loop.advance_batch(
-                self._params, worker.parts, self._states, worker.work, worker.totals, *self._edges[index : index + 2],
-                times, ends, DEFAULT_BUDGET, rows, None,
-            )  # fmt: skip
+            worker.pace.run(lambda: loop.advance_batch(
+                self._params, worker.parts, self._states, worker.pace.saved, worker.work, worker.totals,
+                *self._edges[index : index + 2], times, ends, self._max_steps, rows, None, worker.pace.record,
+            ))  # fmt: skip
 
-        if self._pool is None:
-            run(0)
-        else:
-            list(self._pool.map(run, range(len(self._workers))))
+        before, begun = self._states.copy(), []
+        try:
+            if self._pool is None:
+                run(0)
+            else:
+                begun = [self._pool.submit(run, index) for index in range(len(self._workers))]
+                for one in begun:
+                    one.result()
+        except (OutOfTimeError, KeyboardInterrupt) as stop:
+            self._stop(begun)
+            self._states[...] = before
+            late = isinstance(stop, OutOfTimeError)
+            what = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
+            message = f"{what} in advances from t = {self.time:.9g} s to {float(times[-1]):.9g} s of {len(self)} twins"
+            raise (LimitError if late else RunInterrupted)(message, None, self.time) from None
+
+    def _stop(self, begun: Sequence[Future[None]]) -> None:
+        """End what other threads still do, within a slice of work."""
+        for worker in self._workers:
+            worker.pace.stopped = True
+        wait(begun)
+        for worker in self._workers:
+            worker.pace.stopped = False
+            for name in ("peak", "impulse", "makes"):
+                worker.totals[name] = 0
 
 
 class _Worker(NamedTuple):
@@ -224,14 +264,15 @@ class _Worker(NamedTuple):
     parts: Parts
     work: NDArray[np.void]
     totals: NDArray[np.void]
+    pace: Pace
 
     @staticmethod
-    def of(terms: Terms, compiled: Sequence[CompiledScene]) -> _Worker:
+    def of(terms: Terms, compiled: Sequence[CompiledScene], max_wall_s: float) -> _Worker:
         stiff = any(one.parts.implicit is not None for one in compiled)
         parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit() if stiff else None)
         work = new_records(WORK, 1)
         work[0] = new_work()
-        return _Worker(parts, work, new_records(TOTALS, 1))
+        return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s))
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:

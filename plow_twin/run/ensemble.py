@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time as _time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.errors import LimitError, RunInterrupted
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.run.motion import BUDGET, Motion, run_events
+from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, check_limits
 from plow_twin.run.simulate import check_times, output_times
 from plow_twin.solve.compiled_scene import compile_scene
 from plow_twin.solve.state import Status, Work, new_work
@@ -66,6 +69,9 @@ def simulate_many(
     tol: float = 1e-9,
     workers: int | None = None,
     on_progress: Callable[[int], None] | None = None,
+    *,
+    max_steps: int = BUDGET,
+    max_wall_s: float = MOST_SECONDS,
 ) -> Ensemble:
     """Simulate every scene from t = 0 to `t_end`; each member has the same bits as `simulate` gives it alone.
 
@@ -78,6 +84,10 @@ def simulate_many(
         Threads; all cores by default. The kernels run without the interpreter's lock.
     on_progress : callable, optional
         Called with the number of members done, from one thread at a time.
+    max_steps : int
+        Steps that each member may take; one that needs more ends with the status `BUDGET`.
+    max_wall_s : float
+        Seconds of wall-clock time that all members together may take, compiling counted.
 
     Returns
     -------
@@ -88,35 +98,66 @@ def simulate_many(
     ------
     ArgumentError
         For an argument that cannot be used.
+    LimitError, RunInterrupted
+        At `max_wall_s`, and after Ctrl-C; `result` holds the members as far as they had come, those not done with the
+        status `BUDGET`.
     """
     check_times(t_end, output_dt)
+    check_limits(max_steps, max_wall_s)
     times = output_times(t_end, output_dt)
     ensemble = _empty(times, len(scenes))
     local, lock = threading.local(), threading.Lock()
-    done = 0
+    done, stopped = 0, threading.Event()
+    end = _time.perf_counter() + max_wall_s
+
+    def look(motion: Motion | None = None) -> None:
+        if stopped.is_set() or _time.perf_counter() > end:
+            raise OutOfTimeError
 
     def run(index: int) -> None:
         nonlocal done
         if not hasattr(local, "work"):
             local.work = new_work()
-        _run_member(scenes[index], index, t_end, tol, local.work, ensemble)
+        look()
+        _run_member(scenes[index], index, t_end, tol, local.work, ensemble, max_steps, look)
         with lock:
             done += 1
             if on_progress is not None:
                 on_progress(done)
 
     with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
-        # the first member alone: it compiles what all need
-        for index in range(min(1, len(scenes))):
-            run(index)
-        list(pool.map(run, range(1, len(scenes))))
+        try:
+            # the first member alone: it compiles what all need
+            for index in range(min(1, len(scenes))):
+                run(index)
+            list(pool.map(run, range(1, len(scenes))))
+        except (OutOfTimeError, KeyboardInterrupt) as stop:
+            stopped.set()
+            pool.shutdown(cancel_futures=True)
+            late = isinstance(stop, OutOfTimeError)
+            what = f"max_wall_s = {max_wall_s:g} reached" if late else "interrupted"
+            message = f"{what} after {done} of {len(scenes)} members"
+            raise (LimitError if late else RunInterrupted)(message, ensemble, 0.0) from None
     return ensemble
 
 
-def _run_member(scene: Scene, index: int, t_end: float, tol: float, work: Work, ensemble: Ensemble) -> None:
+def _run_member(
+    scene: Scene,
+    index: int,
+    t_end: float,
+    tol: float,
+    work: Work,
+    ensemble: Ensemble,
+    max_steps: int,
+    look: Callable[[Motion], None],
+) -> None:
     compiled = compile_scene(scene, tol)
     motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
-    status, rows = run_events(compiled, motion, ensemble.t, t_end, work, BUDGET)
+    try:
+        status, rows = run_events(compiled, motion, ensemble.t, t_end, work, max_steps, look)
+    except OutOfTimeError:
+        ensemble.q[index, motion.rows :] = ensemble.v[index, motion.rows :] = np.nan
+        raise
     ensemble.q[index, rows:] = ensemble.v[index, rows:] = np.nan
     totals = motion.totals
     ensemble.peak[index], ensemble.impulse[index] = totals.peak, totals.impulse
@@ -132,8 +173,8 @@ def _empty(times: Array, members: int) -> Ensemble:
 
     return Ensemble(
         t=times,
-        q=np.zeros((members, len(times), 3)),
-        v=np.zeros((members, len(times), 3)),
+        q=np.full((members, len(times), 3), np.nan),
+        v=np.full((members, len(times), 3), np.nan),
         peak=eight(),
         impulse=eight(),
         time_in_contact=eight(),
@@ -142,5 +183,5 @@ def _empty(times: Array, members: int) -> Ensemble:
         events=np.zeros(members, np.int64),
         wear_depth=eight(),
         steps=np.zeros(members, np.int64),
-        status=np.zeros(members, np.int64),
+        status=np.full(members, int(Status.BUDGET)),
     )

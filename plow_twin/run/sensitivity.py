@@ -8,27 +8,30 @@ the variational equations, saltation) is in them, since each shadow has its own 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import SolverError
+from plow_twin.errors import ArgumentError, SolverError
 from plow_twin.model import geometry
-from plow_twin.model.scene import DOF_NAMES, Scene
+from plow_twin.model.scene import DOF_NAMES, Load, Scene, Table
 from plow_twin.run.motion import Motion, run_events
-from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene
+from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene, law_terms
 from plow_twin.solve.state import Status, Work, first_of, new_records, new_work, state_type
 
 Array = NDArray[np.float64]
 
 #: Displacement of a shadow in shares of the clearance, and the tolerance at which it is followed.
-_DISPLACEMENT: Final = 1e-7
-_TOLERANCE: Final = 1e-12
+DISPLACEMENT: Final = 1e-7
+SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
+#: Change of a parameter that is no length, in shares of it.
+_RELATIVE_CHANGE: Final = 1e-6
 #: A stretch does not end where some pair is nearer to its wall than so many displacements, unless so many in a row do.
-_CLEAR_OF_WALLS, _MOST_MERGED = 100.0, 20
+CLEAR_OF_WALLS, MOST_MERGED = 100.0, 20
 #: Steps of one shadow over one stretch.
 _BUDGET: Final = 10**7
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
@@ -52,6 +55,8 @@ class Sensitivity:
         Largest Lyapunov exponent in 1/s, of the second half of the motion: above 0 errors grow for ever.
     tol : float
         Tolerance that the motion was asked for.
+    by_parameter : mapping of str to ndarray, shape (n, k)
+        Derivatives of the state at `t` by the parameters asked for, in their units.
     """
 
     t: Array
@@ -59,6 +64,7 @@ class Sensitivity:
     from_start: Array
     exponent: float
     tol: float
+    by_parameter: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def trusted(self) -> bool:
@@ -85,7 +91,71 @@ class Sensitivity:
         )
 
 
-def sensitivity_of(scene: Scene, t_end: float, tol: float) -> Sensitivity:
+def sensitivity_parameters(scene: Scene) -> dict[str, float]:
+    """Return the parameters by which a motion has derivatives, by their paths, and their values in the scene.
+
+    Stiffness, damping or restitution, both clearances, and a factor of each load.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    dict of str to float
+        Values by path.
+    """
+    contact, clearance = scene.contact, scene.clearance
+    found = {"contact.stiffness": contact.stiffness, "contact.damping": contact.damping or 0.0}
+    found |= {"contact.restitution": contact.restitution or 0.0}
+    found = {path: value for path, value in found.items() if value > 0.0}
+    found |= {f"clearance.{name}": getattr(clearance, name) for name in ("horizontal_m", "vertical_m")}
+    return found | {f"loads.{load.name}.scale": 1.0 for load in scene.loads}
+
+
+def _changed(scene: Scene, path: str, value: float) -> Scene:
+    """Return the scene with another value of one of `sensitivity_parameters`."""
+    part, _, name = path.rpartition(".")
+    if part in ("contact", "clearance"):
+        return replace(scene, **{part: replace(getattr(scene, part), **{name: value})})
+    return replace(
+        scene, loads=tuple(_scaled(load, value) if f"loads.{load.name}" == part else load for load in scene.loads)
+    )
+
+
+def _scaled(load: Load, factor: float) -> Load:
+    if isinstance(load, Table):
+        return replace(load, wrench=factor * np.asarray(load.wrench))
+    x, y = load.force_n
+    return replace(load, force_n=(factor * x, factor * y), moment_n_m=factor * load.moment_n_m)
+
+
+@dataclass(frozen=True)
+class ChangedScene:
+    """A scene in which one number is a little larger."""
+
+    path: str
+    compiled: CompiledScene
+    change: float
+    damping: float  # factor of the damping that pairs in contact remember
+
+    @staticmethod
+    def of(scene: Scene, path: str, tol: float) -> ChangedScene:
+        """Change the number at a path."""
+        value = sensitivity_parameters(scene)[path]
+        length = path.startswith("clearance")
+        change = DISPLACEMENT * geometry.length_scale(scene) if length else _RELATIVE_CHANGE * value
+        if path == "contact.restitution" and value + change > 1.0:
+            change = -change
+        changed = _changed(scene, path, value + change)
+        numbers = [law_terms(one.contact)[1] for one in (changed, scene)]
+        ratio = numbers[0] / numbers[1] if numbers[1] > 0.0 else 1.0
+        if path == "contact.damping":
+            ratio = (value + change) / value
+        return ChangedScene(path, compile_scene(changed, tol), change, ratio)
+
+
+def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[str] = ()) -> Sensitivity:
     """Follow shadows of a scene's motion up to `t_end`.
 
     Parameters
@@ -95,27 +165,40 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float) -> Sensitivity:
         End in s, above 0.
     tol : float
         Tolerance that the motion itself is asked for.
+    parameters : sequence of str
+        Paths of `sensitivity_parameters` by which derivatives are wanted.
 
     Raises
     ------
+    ArgumentError
+        For a parameter that the scene does not have.
     SolverError
         When a shadow could not be followed.
     """
     # finer than the displacement by so much that the difference keeps five digits
-    compiled = compile_scene(scene, min(max(_TOLERANCE, TOLERANCE_RANGE[0]), tol))
-    scale, free = _scale(compiled), _free(scene)
+    fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
+    compiled, known = compile_scene(scene, fine), sensitivity_parameters(scene)
+    for path in parameters:
+        if path not in known:
+            raise ArgumentError(f"sensitivity: got {path!r}, expected some of {', '.join(known)}")
+    changed = [ChangedScene.of(scene, path, fine) for path in parameters]
+    scale, free = scale_of(compiled), free_places(scene)
     work, state, begin, merged = new_work(), compiled.initial_state(), 0.0, 0
     size = len(free)
     total, since, basis = np.eye(size), np.zeros((0, size, size)), np.eye(size)
     times, growth, from_start, logs = [0.0], [1.0], [np.eye(size)], np.zeros(size)
+    by_parameter = [np.zeros((len(changed), size))]
     for end in _ends(t_end):
         after, reached, nearest = _follow(compiled, state, end, None, work)
-        if nearest < _CLEAR_OF_WALLS * _DISPLACEMENT * scale[0] and merged < _MOST_MERGED:
+        if nearest < CLEAR_OF_WALLS * DISPLACEMENT * scale[0] and merged < MOST_MERGED:
             merged += 1
             continue
         merged = 0
         matrix = _derivatives(compiled, state, end, reached, free, scale, work)
         total = matrix @ total
+        by_parameter.append(
+            by_parameter[-1] @ matrix.T + _parameter_rows(compiled, changed, state, end, reached, free, scale, work)
+        )
         since = matrix @ np.concatenate([since, np.eye(size)[None]])
         basis, upper = np.linalg.qr(matrix @ basis)
         if times[-1] >= 0.5 * t_end:
@@ -126,7 +209,9 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float) -> Sensitivity:
         from_start.append(total * scale[free][:, None] / scale[free][None, :])
         state = after
     exponent = float(logs.max()) / max(times[-1] - begin, 1e-300)
-    return Sensitivity(np.array(times), np.array(growth), np.array(from_start), exponent, tol)
+    rows = np.array(by_parameter) * scale[free]
+    derivatives = {one.path: rows[:, index] for index, one in enumerate(changed)}
+    return Sensitivity(np.array(times), np.array(growth), np.array(from_start), exponent, tol, derivatives)
 
 
 def _ends(t_end: float) -> list[float]:
@@ -136,7 +221,7 @@ def _ends(t_end: float) -> list[float]:
     return [*(ends[:-1] / _STRETCHES * t_end).tolist(), t_end]
 
 
-def _scale(compiled: CompiledScene) -> Array:
+def scale_of(compiled: CompiledScene) -> Array:
     """Return what makes places and rates shares of the clearance, shape (6,)."""
     params, length = compiled.params, geometry.length_scale(compiled.scene)
     place = np.array([1.0, 1.0, 1.0 / float(params.radius)]) * length
@@ -144,7 +229,7 @@ def _scale(compiled: CompiledScene) -> Array:
     return scale
 
 
-def _free(scene: Scene) -> NDArray[np.int64]:
+def free_places(scene: Scene) -> NDArray[np.int64]:
     """Return the indices of what can differ: places and rates of the degrees of freedom that are not locked."""
     places = [index for index, name in enumerate(DOF_NAMES) if name not in scene.locked]
     return np.array(places + [3 + index for index in places], dtype=np.int64)
@@ -164,10 +249,32 @@ def _derivatives(
     columns = []
     for index in free:
         displaced = start.copy()
-        displaced[index] += _DISPLACEMENT * scale[index]
+        displaced[index] += DISPLACEMENT * scale[index]
         shadow = _follow(compiled, state, end, displaced, work)[1]
-        columns.append((shadow - reached)[free] / scale[free] / _DISPLACEMENT)
+        columns.append((shadow - reached)[free] / scale[free] / DISPLACEMENT)
     return np.array(columns).T
+
+
+def _parameter_rows(
+    compiled: CompiledScene,
+    changed: Sequence[ChangedScene],
+    state: Any,
+    end: float,
+    reached: Array,
+    free: NDArray[np.int64],
+    scale: Array,
+    work: Work,
+) -> Array:
+    """Return what each parameter does to the scaled state over one stretch, per its unit, shape (p, k)."""
+    rows = np.zeros((len(changed), len(free)))
+    if changed:
+        start = _follow(compiled, state, float(state.time), None, work)[1]
+    for index, one in enumerate(changed):
+        begin = state.copy()
+        begin["damping_factor"] *= one.damping
+        shadow = _follow(one.compiled, begin, end, start, work)[1]
+        rows[index] = (shadow - reached)[free] / scale[free] / one.change
+    return rows
 
 
 def _follow(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as _time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args
 
@@ -16,6 +16,7 @@ from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.run.energy_balance import EnergyBalance, energy_balance_of
 from plow_twin.run.motion import BUDGET, Motion, run_events, run_fixed
+from plow_twin.run.pace import MOST_SECONDS, check_limits
 from plow_twin.run.sensitivity import Sensitivity, sensitivity_of
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.energy_balance import new_balance
@@ -27,8 +28,6 @@ Array = NDArray[np.float64]
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
-#: Seconds after which a run gives up with a named error, unless its caller says otherwise.
-MOST_SECONDS: Final = 3600.0
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def simulate(
     max_steps: int = BUDGET,
     max_wall_s: float = MOST_SECONDS,
     on_progress: Callable[[float], None] | None = None,
-    sensitivity: bool = False,
+    sensitivity: bool | Sequence[str] = False,
 ) -> Result:
     """Simulate a scene from t = 0 to `t_end`.
 
@@ -117,9 +116,10 @@ def simulate(
         Seconds of wall-clock time that the run may take, compiling not counted.
     on_progress : callable, optional
         Called with the share of the motion that is done, 0..1, some fifty times a second.
-    sensitivity : bool
+    sensitivity : bool or sequence of str
         Follow displaced motions too, and say what the tolerance is worth (`Result.sensitivity`); some ten times the
-        work of the run. Warns with `ToleranceWarning` where errors grow too much for it.
+        work of the run. Paths of parameters (`sensitivity_parameters`) give the derivatives by them too. Warns with
+        `ToleranceWarning` where errors grow too much for it.
 
     Returns
     -------
@@ -138,7 +138,7 @@ def simulate(
         After Ctrl-C, likewise; it is a `KeyboardInterrupt` too.
     """
     check_times(t_end, output_dt, method, dt)
-    _check_limits(max_steps, max_wall_s)
+    check_limits(max_steps, max_wall_s)
     compiled = compile_scene(scene, tol)
     if output_dt is None and dt is not None:
         output_dt = dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
@@ -163,7 +163,7 @@ def simulate(
     result = so_far(len(times), t_end)
     if not sensitivity or t_end == 0.0:
         return result
-    found = sensitivity_of(scene, t_end, tol)
+    found = sensitivity_of(scene, t_end, tol, () if isinstance(sensitivity, bool) else tuple(sensitivity))
     if not found.trusted:
         warnings.warn(str(found), ToleranceWarning, stacklevel=2)
     return replace(result, sensitivity=found)
@@ -196,13 +196,6 @@ class _Watch:
                 f"{wall:.1f} s; the last step was {float(motion.state.last_step_size):.3g} s long, in contact: "
                 f"{pairs or 'no pair'}"
             )
-
-
-def _check_limits(max_steps: int, max_wall_s: float) -> None:
-    if isinstance(max_steps, bool) or not max_steps >= 1:
-        raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
-    if not max_wall_s > 0.0:
-        raise ArgumentError(f"max_wall_s: got {max_wall_s!r}, expected a time > 0 [s]")
 
 
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:

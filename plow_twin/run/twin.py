@@ -5,16 +5,18 @@ from __future__ import annotations
 import hashlib
 import math
 import time as _time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from plow_twin.errors import ArgumentError
+from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Initial, Scene
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
+from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.rest import AT_REST
@@ -62,9 +64,17 @@ class Twin:
         For hard real-time: an advance evaluates the equations of motion at most so often (an order of the series counts
         as one). Where that is not enough the rest of the way is taken by a few Runge-Kutta steps, and
         `error_estimate_m` of the advance is not zero. At least `LEAST_EVALUATIONS`.
+    max_steps : int
+        An advance takes at most so many steps; where that is not enough it ends with the status `BUDGET`, and nothing
+        moved.
+    max_wall_s : float
+        Seconds that a call for advances may take.
 
     Notes
     -----
+    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: the twin stands after the last advance
+    that was done, whose rows are the error's `result`, as if no more had been asked for.
+
     The motion does not depend on the times at which it is asked for, but a sample ends a step: the same samples give
     the same bits.
     """
@@ -77,7 +87,10 @@ class Twin:
         excitation: Literal["scene", "sampled"] = "scene",
         start: float = 0.0,
         max_evaluations: int | None = None,
+        max_steps: int = DEFAULT_BUDGET,
+        max_wall_s: float = MOST_SECONDS,
     ) -> None:
+        check_limits(max_steps, max_wall_s)
         if excitation not in ("scene", "sampled"):
             raise ArgumentError(f"excitation: got {excitation!r}, expected 'scene' or 'sampled'")
         self.scene = scene
@@ -91,7 +104,9 @@ class Twin:
         self._state: State = first_of(self._states)
         self._compiled: CompiledScene = replace(compiled, params=first_of(self._params))
         self._parts = self._compiled.parts
-        self._budget, self._bound = _bounded(max_evaluations, int(compiled.params.order))
+        self._max_steps, self._max_wall_s = max_steps, max_wall_s
+        self._budget, self._bound = _bounded(max_evaluations, int(compiled.params.order), max_steps)
+        self._pace = Pace(self._states.dtype, compiled.parts.implicit is not None, max_wall_s)
         self._works, self._all_totals = new_records(WORK, 1), new_records(TOTALS, 1)
         self._works[0] = new_work()
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
@@ -111,7 +126,7 @@ class Twin:
         return tuple(part is not None for part in there)
 
     def like(self, scene: Scene) -> Twin:
-        """Return a twin of another scene, with the tolerance, excitation and bound of this one.
+        """Return a twin of another scene, with the tolerance, excitation and limits of this one.
 
         Parameters
         ----------
@@ -121,7 +136,10 @@ class Twin:
         -------
         Twin
         """
-        return Twin(scene, tol=self.tol, excitation=self.excitation, max_evaluations=self.max_evaluations)
+        return Twin(
+            scene, tol=self.tol, excitation=self.excitation, max_evaluations=self.max_evaluations,
+            max_steps=self._max_steps, max_wall_s=self._max_wall_s,
+        )  # fmt: skip
 
     @property
     def time(self) -> float:
@@ -195,10 +213,11 @@ class Twin:
         rows = self._new_rows(len(times))
         ends = np.empty((1, len(times) + 1, 3))
         ends[0, 0], ends[0, 1:] = self._wrench, samples
-        loop.advance_batch(
-            self._params, self._parts, self._states, self._works, self._all_totals, 0, 1, times,
-            ends / self._inertias, self._budget, rows[None], self._bound,
-        )  # fmt: skip
+        wrenches, members = ends / self._inertias, rows[None]
+        self._in_slices(lambda: loop.advance_batch(
+            self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, times,
+            wrenches, self._budget, members, self._bound, self._pace.record,
+        ), times, samples, rows)  # fmt: skip
         self._wrench = samples[-1].copy() if len(samples) else self._wrench
         return AdvanceSeries.of(times, rows)
 
@@ -237,10 +256,10 @@ class Twin:
         status = np.zeros(len(t), np.int64)
         snapshots = np.zeros(len(marks), self._states.dtype)
         per = np.concatenate([self._wrench[None], wrench]) / self._inertias
-        loop.advance_marked(
-            self._params, self._parts, self._states, self._works, self._all_totals, t, per, self._budget, marks,
-            snapshots, status, out,
-        )  # fmt: skip
+        self._in_slices(lambda: loop.advance_marked(
+            self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, t, per,
+            self._budget, marks, snapshots, status, out, self._pace.record,
+        ), t, wrench, out)  # fmt: skip
         self._wrench = wrench[-1].copy() if len(wrench) else self._wrench
         speed = np.float64(self._travel_speed).tobytes()
         digests = [
@@ -362,11 +381,48 @@ class Twin:
     def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
         check_times(self.time, times)
         rows = np.zeros(len(times), ROW)
-        loop.advance_times(
-            self._compiled.params, self._parts, self._states, self._work, self._totals, times, self._budget, rows,
-            self._bound,
-        )  # fmt: skip
+        self._in_slices(lambda: loop.advance_times(
+            self._compiled.params, self._parts, self._states, self._pace.saved, self._work, self._totals, times,
+            self._budget, rows, self._bound, self._pace.record,
+        ), times, None, rows)  # fmt: skip
         return AdvanceSeries.of(times, rows)
+
+    def _in_slices(
+        self,
+        work: Callable[[], bool],
+        times: NDArray[np.float64],
+        samples: NDArray[np.float64] | None,
+        rows: NDArray[np.void] | None,
+    ) -> None:
+        """Do the advances to `times`; stopped before the end, stand after the last one that was done.
+
+        Raises
+        ------
+        LimitError, RunInterrupted
+            With the rows of the advances that were done, where there are rows.
+        """
+        try:
+            self._pace.run(work)
+        except (OutOfTimeError, KeyboardInterrupt) as stop:
+            steps, done = self.steps, int(self._pace.record.row)
+            self._go_back()
+            if samples is not None and done > 0:
+                self._wrench = samples[done - 1].copy()
+            part = None if rows is None else AdvanceSeries.of(times[:done], rows[:done])
+            late = isinstance(stop, OutOfTimeError)
+            what = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
+            message = f"{what} at t = {self.time:.9g} s after {done} of {len(times)} advances, {steps} steps in all"
+            raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
+
+    def _go_back(self) -> None:
+        """Take back the advance under way."""
+        if self._pace.record.underway == 0:
+            return
+        self._states[0] = self._pace.saved[0]
+        if self._state.step_size >= 0.0:
+            loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
+        for name in ("peak", "impulse", "makes"):
+            self._all_totals[name] = 0
 
     def _new_rows(self, count: int) -> NDArray[np.void]:
         """Return rows of zeros. One by one they are cut from a stock: numpy takes as long for one as for hundreds."""
@@ -407,10 +463,10 @@ def _digest(snapshot: bytes) -> str:
     return hashlib.blake2b(snapshot, digest_size=8).hexdigest()
 
 
-def _bounded(max_evaluations: int | None, order: int) -> tuple[int, Bound | None]:
+def _bounded(max_evaluations: int | None, order: int, max_steps: int) -> tuple[int, Bound | None]:
     """Return the steps of the series that an advance may take, and what is kept for its coarse end."""
     if max_evaluations is None:
-        return DEFAULT_BUDGET, None
+        return max_steps, None
     if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:
         raise ArgumentError(f"max_evaluations: got {max_evaluations!r}, expected an integer >= {LEAST_EVALUATIONS}")
     coarse = max(LEAST_EVALUATIONS // 4, max_evaluations // 16)

@@ -20,7 +20,7 @@ from plow_twin.solve.step import complete_step, lay_out_step
 from plow_twin.solve.totals import add_to_totals
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
-_BUDGET, _LOG_FULL = int(Status.BUDGET), int(Status.LOG_FULL)
+_BUDGET, _LOG_FULL, _PAUSED = int(Status.BUDGET), int(Status.LOG_FULL), int(Status.PAUSED)
 
 
 @kernel(inline="source")
@@ -116,18 +116,24 @@ def _undo(state, w, target) -> None:
 
 
 @kernel()
-def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound):
-    """Proceed to `target`; return a `Status` and the steps taken.
+def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace):
+    """Proceed to `target`, or go on with it; return a `Status` and the steps taken.
 
     When that fails, time goes on but the head stays as it was, and nothing is counted. `saved` is an array of one
     record. With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
     """
     state = states[index]
-    saved[0] = state
-    _present(p, parts.harmonics, parts.terms.flight, state, w, w.saved[0])
-    _worn_now(state, w, parts.terms.wear, w.saved[1])
-    before = state.steps
-    code = _proceed(p, parts, state, w, totals, target, stop_time, before + budget)
+    if pace.underway == 0:
+        saved[0] = state
+        _present(p, parts.harmonics, parts.terms.flight, state, w, w.saved[0])
+        _worn_now(state, w, parts.terms.wear, w.saved[1])
+    before, begin = saved[0].steps, state.steps
+    code = _proceed(p, parts, state, w, totals, target, stop_time, min(before + budget, begin + pace.left))
+    pace.left = max(pace.left - (state.steps - begin), 0)
+    if code == _BUDGET and state.steps < before + budget:
+        pace.underway = 1
+        return _PAUSED, 0
+    pace.underway = 0
     if bound is not None:
         bound.error = 0.0
         if code == _BUDGET:
@@ -155,12 +161,26 @@ def _read_row(p, parts, state, w, totals, out) -> None:
 
 
 @kernel()
-def _advance_row(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, out) -> None:
-    """Proceed to `target` and write all that a `ROW` tells of it."""
-    out.status, out.steps = _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound)
+def _advance_row(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace, out) -> bool:
+    """Proceed to `target` and write all that a `ROW` tells of it; False where the slice ended before."""
+    out.status, out.steps = _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace)
+    if out.status == _PAUSED:
+        return False
     if bound is not None:
         out.error_estimate = bound.error
     _read_row(p, parts, states[index], w, totals, out)
+    return True
+
+
+@kernel(inline="source")
+def _begin_slice(pace) -> None:
+    pace.left = pace.slice
+
+
+@kernel(inline="source")
+def _is_over(pace) -> bool:
+    """Tell whether the slice is used up between two advances."""
+    return bool(pace.left <= 0 and pace.underway == 0)
 
 
 @kernel(inline="source")
@@ -174,53 +194,81 @@ def _follow_line(piece, start, time, before, sample) -> None:
 
 
 @kernel(entry=True)
-def advance_times(p, parts, states, w, totals, times, budget, rows, bound) -> None:
-    """Advance to each time under the scene's own loads and write a row for each; `states` is an array of one."""
-    saved = np.empty(1, states.dtype)
+def advance_times(p, parts, states, saved, w, totals, times, budget, rows, bound, pace) -> bool:
+    """Advance to each time under the scene's own loads and write a row for each; `states`, `saved` are arrays of one.
+
+    Returns whether all is done; else the caller looks at its limits and calls again with the same `pace`.
+    """
     parts, states = _unowned_loads(parts), unowned(states)
-    for i in range(times.size):
-        _advance_row(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound, rows[i])
+    _begin_slice(pace)
+    while pace.row < times.size:
+        i = pace.row
+        if _is_over(pace):
+            return False
+        if not _advance_row(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound, pace, rows[i]):
+            return False
+        pace.row = i + 1
+    return True
 
 
 @kernel(entry=True)
-def advance_batch(params, parts, states, work, totals, first, last, times, wrench, budget, rows, bound) -> None:
+def advance_batch(
+    params, parts, states, saved, work, totals, first, last, times, wrench, budget, rows, bound, pace
+) -> bool:
     """Advance members `first` to `last` - 1 to each time: arrays but times have an axis of members in front.
 
     A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
-    bits alone. `work` and `totals` are arrays of one.
+    bits alone. `saved`, `work` and `totals` are arrays of one. Returns whether all is done, as `advance_times`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
-    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, states.dtype)
-    for m in range(first, last):
+    w, sums, piece, count = work[0], totals[0], parts.segments[0], times.size
+    _begin_slice(pace)
+    while pace.row < (last - first) * count:
+        m, i = first + pace.row // count, pace.row % count
+        if _is_over(pace):
+            return False
         p, state = params[m], states[m]
-        state.piece = 0
-        for i in range(times.size):
+        if pace.underway == 0:
+            state.piece = 0
             _follow_line(piece, state.step_start, times[i], wrench[m, i], wrench[m, i + 1])
-            _advance_row(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound, rows[m, i])
+        if not _advance_row(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound, pace, rows[m, i]):
+            return False
+        pace.row += 1
+    return True
 
 
 @kernel(entry=True)
-def advance_marked(params, parts, states, work, totals, times, wrench, budget, marks, snapshots, status, rows) -> None:
+def advance_marked(
+    params, parts, states, saved, work, totals, times, wrench, budget, marks, snapshots, status, rows, pace
+) -> bool:
     """Advance one twin to each time, as `advance_batch` does, and save its state where `marks` say.
 
     `marks` are numbers of advances, rising; `snapshots` has room for as many states. `rows` may be None: then nothing
-    is read out.
+    is read out. Returns whether all is done, as `advance_times`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
-    w, sums, piece, saved = work[0], totals[0], parts.segments[0], np.empty(1, states.dtype)
+    w, sums, piece = work[0], totals[0], parts.segments[0]
     p, state = params[0], states[0]
-    state.piece = 0
-    mark = 0
-    for i in range(times.size):
-        _follow_line(piece, state.step_start, times[i], wrench[i], wrench[i + 1])
-        status[i] = _advance(p, parts, states, 0, saved, w, sums, times[i], times[i], budget, None)[0]
+    _begin_slice(pace)
+    while pace.row < times.size:
+        i = pace.row
+        if _is_over(pace):
+            return False
+        if pace.underway == 0:
+            state.piece = 0
+            _follow_line(piece, state.step_start, times[i], wrench[i], wrench[i + 1])
+        status[i] = _advance(p, parts, states, 0, saved, w, sums, times[i], times[i], budget, None, pace)[0]
+        if status[i] == _PAUSED:
+            return False
         if rows is not None:
             _read_row(p, parts, state, w, sums, rows[i])
         else:
             _clear(sums)
-        while mark < marks.size and marks[mark] == i + 1:
-            snapshots[mark] = states[0]
-            mark += 1
+        while pace.mark < marks.size and marks[pace.mark] == i + 1:
+            snapshots[pace.mark] = states[0]
+            pace.mark += 1
+        pace.row = i + 1
+    return True
 
 
 @kernel(entry=True)

@@ -57,7 +57,7 @@ class Status(IntEnum):
         A number became infinite or NaN.
     BUDGET
         The steps that an advance may take were used up.
-    LOG_FULL
+    LOG_FULL, PAUSED
         Internal; never the status of an advance.
     """
 
@@ -67,6 +67,8 @@ class Status(IntEnum):
     BUDGET = 3
     #: internal: the event log is full, the caller makes room and goes on
     LOG_FULL = 4
+    #: internal: a slice of the work is done, the caller looks at its limits and goes on
+    PAUSED = 5
 
     @property
     def text(self) -> str:
@@ -80,6 +82,7 @@ _STATUS_TEXT: Final = {
     Status.NON_FINITE: "the motion became non-finite; load, stiffness or damping is too large for double precision",
     Status.BUDGET: "the budget of steps was used up before the time asked for",
     Status.LOG_FULL: "the event log is full",
+    Status.PAUSED: "a slice of the work is done",
 }
 
 
@@ -329,6 +332,17 @@ BOUND: Final = np.dtype(
 
 #: One change of contact: time in s, pair, modes before and after, rate of penetration in m/s.
 EVENT: Final = np.dtype([("time", "f8"), ("pair", "i8"), ("mode_from", "i8"), ("mode_to", "i8"), ("rate", "f8")])
+
+#: How far a call for many advances has come; it comes back after each slice of work.
+PACE: Final = np.dtype(
+    [
+        ("slice", "i8"),  # steps of a slice
+        ("left", "i8"),  # of it
+        ("row", "i8"),  # the advance that comes next, members one after the other
+        ("underway", "i8"),  # 1 where that one has begun
+        ("mark", "i8"),  # the mark that comes next
+    ]
+)
 
 Bound: TypeAlias = np.record
 Log: TypeAlias = NDArray[np.void]

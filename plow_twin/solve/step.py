@@ -67,7 +67,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
         state.step_size = state.sigma_end
     elif implicit.lay_out(
         p, parts, parts.implicit, terms.ramp, terms.wear, terms.slip, terms.stick, state, w, span, penetrating
-    ) or taylor.lay_out(p, parts, terms.slip, parts.implicit, state, w, span, penetrating):
+    ) or taylor.lay_out(p, parts, terms.slip, terms.ramp, terms.fraction, parts.implicit, state, w, span, penetrating):
         _end_at_event(p, state, w, span, penetrating, law_terms(terms), terms.stick)
         implicit.note_step(parts.implicit, state, w, state.step_size, state.event_pair >= 0)
     else:

@@ -10,7 +10,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
-from plow_twin.solve.state import ON
+from plow_twin.solve.state import CLIPPED, ON
 
 #: A pair that would part within so many steps like the last is looked at, by a series of this order.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
@@ -62,6 +62,25 @@ def before_sticking(p, state, w, order, sigma) -> float:
             # the change is convex in sigma
             within *= limit / change
     return within
+
+
+@kernel()
+def before_pushing_again(p, state, w, order, sigma) -> float:
+    """Return the part of `sigma` over which the ramped force of clipped pairs is accurate: it moves nothing yet.
+
+    Only its guard looks at it, so nothing else shortens a step for it. The same root test as for what moves, of the
+    velocity that it would give; the force d^n has its branch point where the pair parts.
+    """
+    least = np.inf
+    for pair in range(PAIR_COUNT):
+        if state.mode[pair] != CLIPPED:
+            continue
+        for k in range(order - 1, order - 1 - p.lacuna, -1):
+            force = p.stiffness * w.power[0, k, pair] + p.viscous * w.damped[k, pair]
+            size = abs(force) * p.inverse_mass * (state.alpha + abs(state.beta)) / (k + 1)
+            if size > 0.0:
+                least = min(least, math.log(p.threshold[k + 1] / size) / (k + 1))
+    return min(sigma, math.exp(least))
 
 
 @kernel()

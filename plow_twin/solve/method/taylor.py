@@ -7,14 +7,14 @@ import math
 from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.method.implicit import at_most_stable
 from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
-from plow_twin.solve.method.step_size import accurate_step, before_sticking, time_to_separation
+from plow_twin.solve.method.step_size import accurate_step, before_pushing_again, before_sticking, time_to_separation
 
 #: A touch no farther back than so many steps like the last still shapes the series.
 _TOUCH_REACH = 2.5
 
 
 @kernel()
-def lay_out(p, parts, slip, implicit, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, slip, ramp, fraction, implicit, state, w, span, penetrating) -> bool:
     """Lay out a step by Taylor series; False where it is not finite."""
     terms = parts.terms
     limit, whole = _choose_map(p, parts, terms.fraction, state, w, span, penetrating)
@@ -26,6 +26,8 @@ def lay_out(p, parts, slip, implicit, state, w, span, penetrating) -> bool:
         return False
     if slip is not None:
         sigma = before_sticking(p, state, w, order, sigma)
+    if ramp is not None and fraction is not None and penetrating:
+        sigma = before_pushing_again(p, state, w, order, sigma)
     sigma = at_most_stable(p, implicit, state, w, sigma)
     state.sigma_end, state.order = sigma, order
     state.ends_at_stop = 1 if whole and sigma == limit else 0

@@ -1,0 +1,66 @@
+"""Advances in slices of work: between two of them limits are kept and Ctrl-C is seen."""
+
+from __future__ import annotations
+
+import time as _time
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from plow_twin.errors import ArgumentError
+from plow_twin.solve.state import PACE, first_of, new_records
+
+#: Seconds after which a call gives up with a named error, unless its caller says otherwise.
+MOST_SECONDS: Final = 3600.0
+#: Steps of a slice: explicit ones take microseconds, implicit ones up to a millisecond.
+_SLICE, _SLICE_IMPLICIT = 2048, 64
+
+
+class OutOfTimeError(Exception):
+    """The wall-clock time of a call is used up, or it was told to stop."""
+
+
+class Pace:
+    """The slices of one call after the other.
+
+    Parameters
+    ----------
+    state_type : dtype
+        Of the state that is kept from before the advance under way.
+    implicit : bool
+        Whether the scene can need implicit steps.
+    max_wall_s : float
+        Seconds that a call may take.
+    """
+
+    def __init__(self, state_type: np.dtype[np.void], implicit: bool, max_wall_s: float) -> None:
+        self._records = new_records(PACE, 1)
+        self.record = first_of(self._records)
+        self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
+        self._start = self._records.copy()
+        self.saved = new_records(state_type, 1)
+        self.max_wall_s = max_wall_s
+        self.stopped = False
+
+    def run(self, work: Callable[[], bool]) -> None:
+        """Do slices of `work` until it says that all is done.
+
+        Raises
+        ------
+        OutOfTimeError
+            At the limit of time, or when `stopped` was set meanwhile; `record` says how far the work has come.
+        """
+        self._records[:] = self._start
+        begin = _time.perf_counter()
+        while not work():
+            if self.stopped or _time.perf_counter() - begin >= self.max_wall_s:
+                raise OutOfTimeError
+
+
+def check_limits(max_steps: int, max_wall_s: float) -> None:
+    """Raise `ArgumentError` for limits that no call can have."""
+    if isinstance(max_steps, bool) or not max_steps >= 1:
+        raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
+    if not max_wall_s > 0.0:
+        raise ArgumentError(f"max_wall_s: got {max_wall_s!r}, expected a time > 0 [s]")

@@ -1,0 +1,166 @@
+"""How errors and changes of parameters grow along the motion of a live twin: shadows that are advanced beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.errors import ArgumentError, SolverError
+from plow_twin.model import geometry
+from plow_twin.run.advance import Advance
+from plow_twin.run.batch import TwinBatch
+from plow_twin.run.sensitivity import (
+    CLEAR_OF_WALLS,
+    DISPLACEMENT,
+    MOST_MERGED,
+    SHADOW_TOLERANCE,
+    ChangedScene,
+    free_places,
+    scale_of,
+    sensitivity_parameters,
+)
+from plow_twin.run.twin import Twin
+from plow_twin.solve.compiled_scene import compile_scene
+from plow_twin.solve.state import Status
+
+Array = NDArray[np.float64]
+
+#: Stretches begin anew after so many s, or sooner when a shadow is so many displacements away.
+_STRETCH_S, _FAR = 0.1, 100.0
+#: Earlier times from which growth is kept; every second one is dropped beyond.
+_MOST_KEPT: Final = 256
+
+
+class TwinSensitivity:
+    """The derivatives of a twin's state by where it began and by parameters, kept up to date as it is advanced.
+
+    Parameters
+    ----------
+    twin : Twin
+        A twin with `excitation="sampled"`; it is advanced by `advance` from here on, with unchanged bits.
+    parameters : sequence of str
+        Paths of `sensitivity_parameters` by which derivatives are wanted.
+
+    Attributes
+    ----------
+    t : float
+        Model time in s of all that is told: that of the last whole stretch, some 0.1 s behind at most.
+    from_start : ndarray, shape (k, k)
+        Derivatives of the state at `t` by that at the beginning, of the k / 2 free degrees of freedom: places, then
+        rates.
+    by_parameter : dict of str to ndarray, shape (k,)
+        Derivatives of the state at `t` by the parameters, the beginning unchanged.
+    growth : float
+        Largest factor by which an error made at any time before has grown at `t`, as `Sensitivity.growth`.
+    exponent : float
+        Largest Lyapunov exponent in 1/s since the beginning.
+
+    Raises
+    ------
+    ArgumentError
+        For a parameter that the scene does not have, or a twin that is not sampled.
+    """
+
+    def __init__(self, twin: Twin, parameters: Sequence[str] = ()) -> None:
+        if twin.excitation != "sampled":
+            raise ArgumentError("twin: got excitation='scene', expected excitation='sampled'")
+        scene, known = twin.scene, sensitivity_parameters(twin.scene)
+        for path in parameters:
+            if path not in known or path.startswith("loads."):
+                allowed = ", ".join(name for name in known if not name.startswith("loads."))
+                raise ArgumentError(f"parameters: got {path!r}, expected some of {allowed}")
+        self._twin = twin
+        self._changed = [ChangedScene.of(scene, path, SHADOW_TOLERANCE) for path in parameters]
+        self._scale, self._free = scale_of(compile_scene(scene, SHADOW_TOLERANCE, sampled=True)), free_places(scene)
+        size = len(self._free)
+        members = [scene] * (1 + size) + [one.compiled.scene for one in self._changed]
+        self._shadows = TwinBatch(members, tol=SHADOW_TOLERANCE, start=twin.time)
+        self.t = self._begin = twin.time
+        self._total, self._since, self._basis = np.eye(size), np.zeros((0, size, size)), np.eye(size)
+        self._logs, self._rows, self.growth, self._merged = np.zeros(size), np.zeros((len(parameters), size)), 1.0, 0
+        self._start()
+
+    @property
+    def from_start(self) -> Array:
+        """Derivatives by the state at the beginning."""
+        scale = self._scale[self._free]
+        return np.asarray(self._total * scale[:, None] / scale[None, :])
+
+    @property
+    def by_parameter(self) -> dict[str, Array]:
+        """Derivatives by the parameters."""
+        return {one.path: row * self._scale[self._free] for one, row in zip(self._changed, self._rows, strict=True)}
+
+    @property
+    def exponent(self) -> float:
+        """Largest Lyapunov exponent in 1/s."""
+        return float(self._logs.max()) / max(self.t - self._begin, 1e-300)
+
+    def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance:
+        """Advance the twin, as `Twin.advance` does, and its shadows.
+
+        Parameters
+        ----------
+        t : float
+            Model time in s.
+        wrench : array_like, shape (3,), optional
+            As for `Twin.advance`.
+
+        Returns
+        -------
+        Advance
+            That of the twin.
+
+        Raises
+        ------
+        SolverError
+            When a shadow could not be followed.
+        """
+        told = self._twin.advance(t, wrench)
+        rows = self._shadows.advance(t, self._twin.wrench)
+        if (rows.status != Status.OK).any():
+            raise SolverError(f"shadow at t = {t:.9g} s: {Status(int(rows.status.max())).text}")
+        reached = np.concatenate([rows.q[:, 0], rows.v[:, 0]], axis=1)
+        away = (reached[1:] - reached[0])[:, self._free] / self._scale[self._free] / DISPLACEMENT
+        size = len(self._free)
+        if t - self.t >= _STRETCH_S or np.abs(away[:size]).max() > _FAR:
+            enabled = self._twin._compiled.params.enabled == 1
+            nearest = float(np.abs(rows.penetration[0, 0, enabled]).min(initial=np.inf))
+            clear = nearest >= CLEAR_OF_WALLS * DISPLACEMENT * self._scale[0]
+            self._merged += 0 if clear else 1
+            if clear or self._merged > MOST_MERGED:
+                self._end(t, away[:size].T, away[size:] * DISPLACEMENT)
+        return told
+
+    def _end(self, t: float, matrix: Array, changes: Array) -> None:
+        """End a stretch: `matrix` is its fundamental matrix, `changes` what the parameters did in it, scaled."""
+        size = len(matrix)
+        self._total = matrix @ self._total
+        since = matrix @ np.concatenate([self._since, np.eye(size)[None]])
+        self.growth = max(1.0, float(np.linalg.norm(since, 2, axis=(1, 2)).max()))
+        self._since = since if len(since) < _MOST_KEPT else since[::2]
+        self._basis, upper = np.linalg.qr(matrix @ self._basis)
+        self._logs += np.log(np.maximum(np.abs(np.diag(upper)), 1e-300))
+        for index, one in enumerate(self._changed):
+            self._rows[index] = matrix @ self._rows[index] + changes[index] / one.change
+        self.t, self._merged = t, 0
+        self._start()
+
+    def _start(self) -> None:
+        """Begin a stretch: all shadows at the twin's state, the displaced ones a little beside it."""
+        states, here = self._shadows._states, self._twin._states[0]
+        states[:] = here
+        self._shadows._wrench[:] = self._twin.wrench
+        offset = self._twin.scene.head.com_offset_m
+        row = self._shadows.advance(self._twin.time)
+        q, v = row.q[0, 0], row.v[0, 0]
+        states[:] = here
+        for member, index in enumerate(self._free, start=1):
+            moved = np.concatenate([q, v])
+            moved[index] += DISPLACEMENT * self._scale[index]
+            states["y"][member] = geometry.body_state(moved[:3], moved[3:], offset)
+        for member, one in enumerate(self._changed, start=1 + len(self._free)):
+            states["damping_factor"][member] *= one.damping
