@@ -67,18 +67,21 @@ CLAMPED = replace(BENCH, clearance=Clearance(-1e-3, -1e-3))
 
 
 def overdamped(law: str, damping: float) -> Contact:
-    additive = law in ("kelvin_voigt", "ramped_damping")
+    """Return a contact of a damping, or of a restitution up to 1 where the law takes one."""
+    given = law in ("kelvin_voigt", "ramped_damping") or damping > 1.0
     return Contact(
-        law, 1e9, 1.5 if law == "ramped_damping" else 1.0, damping=damping if additive else None,
-        restitution=None if additive else damping, ramp_m=1e-4 if law == "ramped_damping" else None,
+        law, 1e9, 1.5 if law == "ramped_damping" else 1.0, damping=damping if given else None,
+        restitution=None if given else damping, ramp_m=1e-4 if law == "ramped_damping" else None,
     )  # fmt: skip
 
 
 def assert_within_the_gate(scene: Scene, tolerances: tuple[float, ...]) -> None:
     """Check that errors stay within ten tolerances of a tight run, and the steps within their limit."""
     exact = simulate(scene, 2.0, output_dt=0.01, tol=1e-12)
-    nudged = replace(scene, initial=replace(scene.initial, q=(1e-12, 0.0, 0.0)))
-    growth = np.abs(simulate(nudged, 2.0, output_dt=0.01, tol=1e-12).q - exact.q).max() / 1e-12
+    growth = 0.0
+    for moved in ((1e-12, 0.0, 0.0), (0.0, 0.0, 1e-12)):
+        nudged = replace(scene, initial=replace(scene.initial, q=moved))
+        growth = max(growth, np.abs(simulate(nudged, 2.0, output_dt=0.01, tol=1e-12).q - exact.q).max() / 1e-12)
     wide = abs(scene.clearance.horizontal_m), abs(scene.clearance.vertical_m)
     shown = replace(scene, clearance=Clearance(*wide))
     for tol in tolerances:
@@ -98,12 +101,18 @@ def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
         assert_within_the_gate(replace(other, contact=scene.contact), (1e-4,))
 
 
+@pytest.mark.parametrize(("law", "damping"), [("exact_restitution", 0.05), ("hunt_crossley", 1e8)])
+def test_the_tolerance_holds_for_a_factor_of_the_force_too(law: str, damping: float) -> None:
+    assert_within_the_gate(replace(BENCH, contact=overdamped(law, damping)), (1e-2, 1e-6, 1e-10))
+
+
 @pytest.mark.stress
 @pytest.mark.parametrize("start", [BENCH, THROWN, CLAMPED], ids=["driven", "thrown", "clamped"])
 @pytest.mark.parametrize(
     ("law", "damping"),
     [(law, 10.0**k) for law in ("kelvin_voigt", "ramped_damping") for k in range(4, 14)]
-    + [(law, e) for law, entry in LAWS.items() if entry.takes_restitution for e in (0.05, 0.4, 0.9)],
+    + [("hunt_crossley", 10.0**k) for k in range(4, 10)]
+    + [(law, e) for law, entry in LAWS.items() if entry.takes_restitution for e in (0.0, 0.05, 0.4, 0.9)],
 )
 def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law: str, damping: float) -> None:
     scene = replace(start, contact=overdamped(law, damping))

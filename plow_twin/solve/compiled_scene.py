@@ -41,6 +41,8 @@ from plow_twin.solve.state import (
 TOLERANCE_RANGE = (1e-13, 1e-1)
 #: Share of the tolerance that one step may spend: hundreds of steps and impacts that amplify must stay within it.
 STEP_SHARE = 3e-4
+#: And the most that one may, as a share of the length scale: loose tolerances are exceeded in fewer steps.
+LARGEST_STEP_ERROR = 1e-6
 #: The same for exponents that are not integers: what follows the last term falls slower near a branch point.
 STEP_SHARE_FRACTION = 1e-6
 #: Mode changes at one instant before the solver goes on past it.
@@ -102,7 +104,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     terms, number = law_terms(scene.contact)
     length = geometry.length_scale(scene)
     speed = _velocity_scale(scene, loads, length)
-    admissible = tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION)
+    admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order, radius = order_for(admissible), geometry.half_diagonal(scene)
     params, rows = new_record(PARAMS), geometry.penetration_rows(scene)
     values: dict[str, Any] = dict(
