@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped
 from ros_processes import ROOT, Bench, bench, value
 from scenes import preset
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from plow_twin import Twin, Wear
 from plow_twin.estimate.result import Estimate, Interval, State
@@ -25,6 +26,7 @@ from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.estimation import entry_of, message_of
 from plow_twin.record.replay import replay
 from plow_twin.ros.messages import set_stamp
+from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Sample, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
@@ -104,8 +106,14 @@ def _play(running: Bench, truth: Truth, late: bool) -> None:
 
 def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path: Path) -> None:
     truth = draw(replace(GROUPS["plain"], periods=5.0, rate_hz=50.0), 3)
+    scene = tmp_path / "worn.yaml"
+    scene.write_text(dump_scene(replace(preset("paper"), wear=Wear(2e-14, 0.015, 2.0))), encoding="utf-8")
     settings = {
+        "scene": scene,
         "estimate": "true",
+        "estimate_forces": 20,
+        "forecast_limits": "[0.04, 0.05]",
+        "forecast_horizon": 3.6e7,
         "hold_limit": 3600.0,  # an estimate may take long on a busy machine
         "estimate_window": WINDOW_S,
         "estimate_interval": INTERVAL_S,
@@ -116,6 +124,8 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         probe = running.probe
         heard: list[JointState] = probe.listen(JointState, "estimate")
         clearances: list[JointState] = probe.listen(JointState, "clearance")
+        forces: list[JointState] = probe.listen(JointState, "force_intervals")
+        forecasts: list[JointState] = probe.listen(JointState, "forecast")
         assert value(probe.status[-1], "horizontal") == "prior"
         _play(running, truth, late=True)
         probe.until(lambda: heard, "an estimate", 100.0)
@@ -126,6 +136,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         probe.until(lambda: abs(clearances[-1].position[0] - found["horizontal"]) < 1e-9, "the clearance")
         last = dict(zip(clearances[-1].name, clearances[-1].position, strict=True))
         status: DiagnosticStatus = probe.status[-1]
+        answer = probe.call(Trigger, f"{running.namespace}/plow_twin/forecast", Trigger.Request())
         assert running.twin.stop() == 0
     for name, true in zip(("horizontal", "vertical"), truth.clearance, strict=True):
         assert found[f"{name}/p05"] < found[name] < found[f"{name}/p95"]
@@ -142,6 +153,14 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     facts = json.loads(done.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
     assert facts["horizontal"]["mean_m"] == found["horizontal"]
+    # what follows from the estimate is the same too
+    assert facts["forecast"] == json.loads(answer.message)
+    told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))
+    assert told["seconds/p50"] == pytest.approx(3600.0 * facts["forecast"]["p50"]["hours"])
+    assert told["seconds/p10"] < told["seconds/p50"] and told["not_reached_in_horizon"] < 0.5
+    peaks = dict(zip(forces[-1].name, forces[-1].effort, strict=True))
+    assert peaks["top_left_top/p95"] == facts["forces"]["pairs"]["top_left_top"]["peak_n"]["p95"] > 0.0
+    assert len(peaks) == len(forces[-1].velocity) == 24 and facts["forces"]["members"] == 20
     report = replay(run)
     assert (report.exit_code, report.first_divergence) == (0, None)
     assert report.compared["clearance"] > 0

@@ -122,7 +122,9 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
 
 def _repeated(source: Path) -> _Task | None:
     """Return the task of making the newest estimate of a live node again, or None where it made none."""
-    from plow_twin.estimate.estimate import estimate_window
+    from plow_twin.estimate.answer import answer
+    from plow_twin.live.estimation import asked_of
+    from plow_twin.live.parameters import settings
     from plow_twin.record.estimated import live_estimates
     from plow_twin.record.reader import RunReader
     from plow_twin.scene_file import loads_scene
@@ -137,10 +139,10 @@ def _repeated(source: Path) -> _Task | None:
     def run() -> tuple[Estimate, dict[str, Any]]:
         entry, window = whole[-1].entry, whole[-1].window
         assert window is not None
-        result, _ = estimate_window(scene, window.load, window.pose, window.lost, entry.guess)
-        same = json.dumps(result.as_dict(), allow_nan=False) == entry.result
+        again = answer(scene, window, entry.guess, asked_of(settings(reader.header.parameters)))
+        same = again.text == entry.result
         live = {"estimates": len(found), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
-        return result, {"live": live}
+        return again.estimate, {**again.also, "live": live}
 
     newest = whole[-1].window
     assert newest is not None

@@ -139,17 +139,15 @@ def _history(path: Path) -> History:
 
 def _now(scene: Scene, facts: dict[str, Any] | None) -> tuple[Scene, tuple[float, float]]:
     """Return the scene with the clearances estimated, if there is an estimate, and their standard deviations."""
-    from plow_twin.estimate.forecast import with_clearances
-    from plow_twin.estimate.result import NORMAL_P95
+    from plow_twin.estimate.forecast import with_estimate
+    from plow_twin.estimate.life import LifeError
 
     if facts is None:
         return scene, (0.0, 0.0)
-    values = [facts[name] for name in ("horizontal", "vertical")]
-    withdrawn = [name for name in ("horizontal", "vertical") if facts[name]["state"] == "withdrawn"]
-    if withdrawn:
-        raise click.UsageError(f"estimate: got a withdrawn {withdrawn[0]} clearance, expected one that holds")
-    low, high = ((value["p95_m"] - value["p05_m"]) / (2.0 * NORMAL_P95) for value in values)
-    return with_clearances(scene, values[0]["mean_m"], values[1]["mean_m"]), (low, high)
+    try:
+        return with_estimate(scene, facts)
+    except LifeError as error:
+        raise click.UsageError(str(error)) from error
 
 
 def _show(facts: dict[str, Any]) -> None:

@@ -7,7 +7,7 @@ that look like the measured one then tells by how much the clearance differs fro
 computation with local-linear adjustment). What it leaves over is the interval.
 
 References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012)
-419; Wood, Nature 466 (2010) 1102.
+419; Wood, Nature 466 (2010) 1102; Blum and Francois, Stat. Comput. 20 (2010) 63.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ _LAGS_S: Final = np.linspace(-0.1, 0.1, 11)
 _DRAWS: Final = (40, 40, 40)
 #: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
 _NEAR, _RIDGE = 0.7, 0.3
+#: The same for the regression of what is left over, and a square that counts as nothing.
+_SCATTER_RIDGE, _NO_SCATTER = 5.0, 1e-14
 #: Steps of the solver after which no further draw is made.
 _MOST_WORK = 3_500_000
 #: Drawn: logarithm of the penetration under the reference force [m] and its bounds; deviations of the damping's
@@ -184,11 +186,27 @@ def _regress(features: Array, targets: Array, measured: Array) -> _Regressed:
     beta = inverse @ (basis.T @ (weight[:, None] * targets))
     leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
     error = targets - basis @ beta
-    variance = (weight[:, None] * error**2).sum(axis=0) / (weight * (1.0 - np.minimum(leverage, 0.9))).sum()
-    deviation = np.sqrt(variance * (1.0 + inverse[0, 0]))
+    deviation = np.sqrt(_scatter_at(basis, weight, error, leverage) * (1.0 + inverse[0, 0]))
     between = ((features[:, None] - features[None]) ** 2 / scale**2).mean(axis=2)
     nearest = np.sort(between, axis=1)[:, 1:6].mean(axis=1)
     return _Regressed(beta[0], deviation, float(np.sort(distance)[:5].mean() / np.quantile(nearest, 0.95)))
+
+
+def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
+    """Return the variance of what a regression leaves over, at what was measured, shape (k,).
+
+    It is another one for softer or noisier draws: the logarithm of the squares is regressed too (Blum and Francois).
+    """
+    freed = 1.0 - np.minimum(leverage, 0.9)
+    square = error**2 / freed[:, None]
+    held = np.diag([0.0] + [_SCATTER_RIDGE] * (basis.shape[1] - 1))
+    beta = np.linalg.solve(
+        basis.T @ (weight[:, None] * basis) + held, basis.T @ (weight[:, None] * np.log(square + _NO_SCATTER))
+    )
+    told = np.exp(basis @ beta)
+    size = (weight[:, None] * square / told).sum(axis=0) / weight.sum()
+    variance: Array = size * np.exp(beta[0])
+    return variance
 
 
 class _Eye:

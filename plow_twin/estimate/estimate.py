@@ -14,7 +14,7 @@ from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.start import range_of_motion
-from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, SIZE, SOFTNESS, Spread, Unknowns
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, MOVING, SIZE, SOFTNESS, Spread, Unknowns
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, sandwich
 from plow_twin.model.scene import Scene
 
@@ -24,6 +24,8 @@ Guess = tuple[float, ...]
 
 #: Largest standard deviation in m with which a clearance counts as estimated.
 OBSERVED = 1e-3
+#: Longest distance of poses in s: where fewer lie in a flight, its start is guessed wrong and the fit with it.
+SPARSEST = 0.125
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
 #: Knots of the load in a period that are simulated, about.
@@ -33,15 +35,19 @@ _MOST_KNOTS = 3
 #: What a hard contact adds to the standard deviation of a clearance in m: the fit ends in one of many optima, and this
 #: is their scatter in the benchmark's own hard group.
 HARD_SCATTER = 4e-4
-#: The same where bounces were compared; and how far, in that of drawn ones, a motion may be from those drawn.
-BOUNCED_LEAST, MOST_DISTANCE = 4e-5, 4.0
-#: And how far the mean path may be from theirs: right models of the same seeds reach 1.01, wrong ones begin at 1.35.
+#: How far, in that of drawn ones, a motion may be from those drawn.
+MOST_DISTANCE = 4.0
+#: How far the mean path may be from theirs: right models of the same seeds reach 1.01, wrong ones begin at 1.35.
 MOST_PATH = 1.3
 #: Largest standard deviation in m there: beyond it the wall was touched too seldom, and the answer is a wrong one.
 #: Set on seeds 100 to 119 and 230 to 249 of the benchmark; see docs/estimate.md.
 BOUNCED_MOST = 2.8e-4
 #: Widening of a fit that had not come to its end.
 UNFINISHED = 1.3
+#: Gain in the cost that a fit may still have before it.
+MOST_LEFT = 25.0
+#: Most that the freedom of the fit adds to the scatter of few swings.
+_MOST_FREED = 3.0
 #: Pairs of the left, right, top and bottom walls of the cavity.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
@@ -70,8 +76,10 @@ def estimate_window(scene: Scene, load: Load, poses: Poses, lost: int = 0, guess
     """
     unknowns = Unknowns(scene, Spread.stated(load, poses))
     poses = poses.between(float(load.t[0]), float(load.t[-1]) + 1e-9)
+    span = float(load.t[0]), float(load.t[-1])
     if len(poses.t) < FEWEST_POSES:
-        return prior_of(unknowns, (float(load.t[0]), float(load.t[-1])), lost), ()
+        few = f"got {len(poses.t)} poses from {span[0]:g} s to {span[1]:g} s, the load's span, expected {FEWEST_POSES}"
+        return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
     lacking = _lacking(poses)
     if lacking:
         nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
@@ -84,7 +92,7 @@ def estimate_window(scene: Scene, load: Load, poses: Poses, lost: int = 0, guess
         numbers = np.array(guess)
         near = refine(forward, unknowns, poses, period, unknowns.within(numbers[:SIZE]), numbers[SIZE:], broad)
         verdict = judge(*near, period) if near else None
-        if near and verdict and not (verdict.model or verdict.sensor):
+        if near and verdict and not (verdict.model or verdict.sensor) and near[1].gain_left < MOST_LEFT:
             return summarise(*near, verdict, lost), _next_guess(near[1])
         forward = Forward(scene, felt)
     first = candidate(forward, unknowns, poses, period)
@@ -114,7 +122,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
     reasons = sensor or model
     clearances, states = [], []
     for index in (GX, GY):
-        deviation = float(np.hypot(bounced.clearance_deviation[index], BOUNCED_LEAST))
+        deviation = float(bounced.clearance_deviation[index])
         observed = deviation < BOUNCED_MOST
         value = Interval.normal(bounced.clearance[index], deviation)
         if not observed:
@@ -186,11 +194,17 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
     covariance = _covariance(problem, fit, verdict)
     deviation, shared = np.sqrt(np.diag(covariance)), fit.shared
     suspect = bool(verdict.model or verdict.sensor)
+    finished = fit.gain_left < MOST_LEFT
+    reasons = verdict.model + verdict.sensor
+    if not finished and not suspect:
+        reasons = [
+            f"the fit has not come to its end: {fit.gain_left:.0f} are left to gain, expected at most {MOST_LEFT:g}"
+        ]
     least, _ = range_of_motion(unknowns.scene, poses)
     clearances, states = [], []
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
-        observed = touched > TOUCHED and deviation[index] < OBSERVED
+        observed = finished and touched > TOUCHED and deviation[index] < OBSERVED
         value = Interval.normal(shared[index], deviation[index])
         if not observed:
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
@@ -218,27 +232,35 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
         noise=(float(fit.noise[0]), float(fit.noise[1]), float(fit.noise[2])),
         model="suspect" if verdict.model else "ok",
         sensor="suspect" if verdict.sensor else "ok",
-        reasons=(*verdict.model, *verdict.sensor),
+        reasons=tuple(reasons),
         lost=lost,
         correlation=_correlation(covariance),
-        figures={**verdict.figures, "iterations": float(fit.iterations), "work": float(problem.forward.work)},
+        figures={
+            **verdict.figures,
+            "iterations": float(fit.iterations),
+            "gain_left": fit.gain_left,
+            "work": float(problem.forward.work),
+        },
     )
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
     """Return the covariance of the shared unknowns: as the noise gives it, or as the swings scatter if that is more.
 
-    Residuals beyond the noise are of one piece for long: the deviations grow with their size, not with its root.
+    What scatters, a load that is not known between its samples, is one thing for all unknowns that move the head: the
+    ratio is the mean of theirs, since each by itself is a chance of some tens of swings. The fit has taken its own
+    freedom out of the scatter. Residuals beyond the noise are of one piece for long: the deviations grow with their
+    size, not with its root. The step that a fit would still take is no part of what it knows.
     """
     size = len(fit.shared)
     plain = fit.covariance[:size, :size]
     scattered = np.diag(sandwich(fit, 1.0 / problem.deviation**2))
-    # a ratio from some twenty swings is itself uncertain by a quarter
-    ratio = np.maximum(scattered / np.diag(plain), 1.0)
+    swings, moving = problem.window.swings, list(MOVING)
+    freed = swings / max(swings - len(moving), swings / _MOST_FREED)
+    ratio = max(1.0, freed * float((scattered / np.diag(plain))[moving].mean()))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else UNFINISHED)
-    scale = widened * np.sqrt(ratio)
-    covariance: Array = plain * np.outer(scale, scale)
+    covariance: Array = plain * (widened**2 * ratio) + np.outer(fit.left[:size], fit.left[:size])
     if problem.unknowns.is_hard(fit.shared):
         covariance[GX, GX] += HARD_SCATTER**2
         covariance[GY, GY] += HARD_SCATTER**2
@@ -287,11 +309,14 @@ def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estima
 def _lacking(poses: Poses) -> tuple[str, ...]:
     """Return which components were hardly measured: a corner's place follows from all three only."""
     counts = np.isfinite(poses.q).sum(axis=0).tolist()
-    return tuple(
+    lacking = tuple(
         f"{name}: measured {count} times, expected at least {FEWEST_POSES}"
         for name, count in zip(COMPONENTS, counts, strict=True)
         if count < FEWEST_POSES
     )
+    if not lacking and poses.interval() > SPARSEST:
+        lacking = (f"poses: got {1.0 / poses.interval():.1f} a second, expected at least {1.0 / SPARSEST:.1f}",)
+    return lacking
 
 
 def _without_fit(unknowns: Unknowns, poses: Poses, lost: int) -> Estimate:

@@ -89,6 +89,8 @@ class Fit:
     variance : (n, 3) variance of each measurement as weighted
     jitter : (n, 3) variance of what cannot be foretold
     jacobian : (n, 3, 17) of the predicted measurements by the shared unknowns and the state of the own swing
+    left : (11 + 6 s,) the step that is still to be taken, linearised; none at an optimum
+    gain_left : what that step would gain of the cost
     """
 
     point: Point
@@ -97,6 +99,8 @@ class Fit:
     variance: Array
     jitter: Array
     jacobian: Array
+    left: Array
+    gain_left: float
     iterations: int
     converged: bool
 
@@ -232,9 +236,11 @@ def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations
     noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.spread.noise)
     variance = noise**2 + JITTER_WEIGHT * jitter
     point.cost = problem.cost(point, variance)
-    normal, _ = normal_equations(problem, point, jacobian, variance)
+    normal, gradient = normal_equations(problem, point, jacobian, variance)
     covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    return Fit(point, covariance, noise, variance, jitter, jacobian, done, converged)
+    left = covariance @ gradient
+    gain_left = float(gradient @ left)
+    return Fit(point, covariance, noise, variance, jitter, jacobian, left, gain_left, done, converged)
 
 
 def normal_equations(problem: Problem, point: Point, jacobian: Array, variance: Array) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ MEMBERS: Final = 256
 #: Tolerance of the pose relative to the clearance.
 TOLERANCE: Final = 1e-4
 #: Fewest of them: fewer have no 5 % point.
-_FEWEST = 20
+FEWEST = 20
 #: Quantiles that are told.
 POINTS: Final = (0.05, 0.5, 0.95)
 _LEAST_CLEARANCE = 5e-4
@@ -99,8 +99,8 @@ class ForceEnsemble:
     ) -> None:
         if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
             raise ForcesError(f"estimate: got a withdrawn one ({'; '.join(found.reasons)}), expected one that holds")
-        if members < _FEWEST:
-            raise ForcesError(f"members: got {members}, expected at least {_FEWEST}")
+        if members < FEWEST:
+            raise ForcesError(f"members: got {members}, expected at least {FEWEST}")
         scenes, self._gain = draw_scenes(scene, found, members, np.random.default_rng(seed))
         self._twins = TwinBatch(scenes, tol=TOLERANCE, start=start)
         self._good = np.ones(members, dtype=bool)
@@ -122,9 +122,9 @@ class ForceEnsemble:
             part = slice(first, first + _CALL)
             batch = self._twins.advance_samples(t[part], wrench[part] * self._gain[:, None, :])
             self._good &= (batch.status == 0).all(axis=1)
-            if self._good.sum() < _FEWEST:
+            if self._good.sum() < FEWEST:
                 raise ForcesError(
-                    f"t = {t[first]:.3f} s: got {self._good.sum()} members within the model's range, expected {_FEWEST}"
+                    f"t = {t[first]:.3f} s: got {self._good.sum()} members within the model's range, expected {FEWEST}"
                 )
             force[:, part] = quantiles(batch.force[self._good])
             np.maximum(peak, batch.peak.max(axis=1), out=peak)

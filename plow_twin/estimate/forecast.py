@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate.coefficient import Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
-from plow_twin.estimate.result import NORMAL_P95
+from plow_twin.estimate.result import NORMAL_P95, State
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
@@ -163,5 +165,22 @@ def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
 
 
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float) -> Scene:
-    """Return the scene with other clearances: those that were estimated."""
-    return replace(scene, clearance=Clearance(horizontal_m, vertical_m))
+    """Return the scene with other clearances: those that were estimated, which hold all the wear there is."""
+    wear = None if scene.wear is None else replace(scene.wear, initial_depth_m=(0.0,) * PAIR_COUNT)
+    return replace(scene, clearance=Clearance(horizontal_m, vertical_m), wear=wear)
+
+
+def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
+    """Return the scene with the clearances of an estimate, as its JSON has them, and their standard deviations in m.
+
+    Raises
+    ------
+    LifeError
+        For a withdrawn one.
+    """
+    names = ("horizontal", "vertical")
+    withdrawn = [name for name in names if facts[name]["state"] == State.WITHDRAWN.value]
+    if withdrawn:
+        raise LifeError(f"estimate: got a withdrawn {withdrawn[0]} clearance, expected one that holds")
+    low, high = ((facts[name]["p95_m"] - facts[name]["p05_m"]) / (2.0 * NORMAL_P95) for name in names)
+    return with_clearances(scene, facts["horizontal"]["mean_m"], facts["vertical"]["mean_m"]), (low, high)

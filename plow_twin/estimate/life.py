@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.estimate.measurements import Load
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
-from plow_twin.model.scene import Harmonic, Scene, Wear
+from plow_twin.model.scene import Harmonic, Scene, Table, Wear
 from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
@@ -62,17 +63,25 @@ class Path:
 
 
 def period_of(scene: Scene) -> float:
-    """Return the period in s of a scene's slowest harmonic load.
+    """Return the period in s of a scene's slowest harmonic load, or without one that of its table.
 
     Raises
     ------
     LifeError
-        Without a harmonic load.
+        Without either, or where the table is too short to take the means of.
     """
     omegas = [load.omega_rad_s for load in scene.loads if isinstance(load, Harmonic)]
-    if not omegas:
-        raise LifeError("loads: got no harmonic load, expected one whose period the cycles are counted by")
-    return 2.0 * math.pi / min(omegas)
+    if omegas:
+        return 2.0 * math.pi / min(omegas)
+    tables = [load for load in scene.loads if isinstance(load, Table)]
+    if not tables:
+        raise LifeError("loads: got no harmonic load and no table, expected one whose period the cycles are counted by")
+    longest = max(tables, key=lambda load: float(load.t[-1]))
+    period = Load(longest.t, longest.wrench).period()
+    periods = float(longest.t[-1]) / period
+    if periods < SETTLE_PERIODS + MEAN_PERIODS:
+        raise LifeError(f"loads: got {periods:.1f} periods, expected at least {SETTLE_PERIODS + MEAN_PERIODS}")
+    return period
 
 
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:

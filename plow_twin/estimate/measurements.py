@@ -21,6 +21,8 @@ UNSTATED: Deviation = (0.0, 0.0, 0.0)
 _FINER = 8
 #: Fewest measured poses from which anything is estimated.
 FEWEST_POSES = 20
+#: Beyond it a number is none of a head's pose, in m or rad, or of a load, in N or N m.
+_LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
 
 
 class EstimateError(PlowTwinError):
@@ -49,7 +51,8 @@ class Poses:
     def of(t: ArrayLike, q: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Poses, int]:
         """Put rows in order of time; return them and how many had to be left out.
 
-        Rows without a finite stamp, without any finite component, or with a stamp that is there already are left out.
+        Rows without a finite stamp, without any finite component, with one beyond 1e6, or with a stamp that is there
+        already are left out.
 
         Raises
         ------
@@ -60,8 +63,14 @@ class Poses:
         if times.ndim != 1 or rows.shape != (len(times), 3):
             raise EstimateError(f"poses: got t {times.shape} and q {rows.shape}, expected (n,) and (n, 3)")
         rows[~np.isfinite(rows)] = np.nan
-        index = _in_order(times, np.isfinite(rows).any(axis=1))
+        absurd = (np.abs(rows) > _LARGEST_POSE).any(axis=1)
+        index = _in_order(times, np.isfinite(rows).any(axis=1) & ~absurd)
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
+
+    def interval(self) -> float:
+        """Return the distance in s of poses, were those that lack a component merged into whole ones."""
+        measured = int(np.isfinite(self.q).sum())
+        return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
     def between(self, start: float, end: float) -> Poses:
         """Return the poses stamped in [start, end)."""
@@ -89,7 +98,9 @@ class Load:
 
     @staticmethod
     def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
-        """Put samples in order of time; return them and how many had to be left out (not finite, stamp repeated).
+        """Put samples in order of time; return them and how many had to be left out.
+
+        That is those that are not finite, beyond 1e15, or have a stamp that is there already.
 
         Raises
         ------
@@ -99,7 +110,7 @@ class Load:
         times, rows = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
         if times.ndim != 1 or rows.shape != (len(times), 3):
             raise EstimateError(f"load: got t {times.shape} and wrench {rows.shape}, expected (n,) and (n, 3)")
-        index = _in_order(times, np.isfinite(rows).all(axis=1))
+        index = _in_order(times, (np.abs(rows) < _LARGEST_LOAD).all(axis=1))
         if len(index) < 2:
             raise EstimateError(f"load: got {len(index)} samples that can be used, expected at least 2")
         return Load(times[index], rows[index], deviation), len(times) - len(index)

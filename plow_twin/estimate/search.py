@@ -45,7 +45,7 @@ _SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.12, np.inf)
 
 def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> Fit | None:
     """Return the best fit to the beginnings of the first swings, or None where no start could be run."""
-    interval = float(np.median(np.diff(poses.t)))
+    interval = poses.interval()
     first = poses.between(float(poses.t[0]), float(poses.t[0]) + _FIRST_PERIODS * period)
     window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
     horizons = [max(stage.horizon * period, _FEWEST_ROWS[0] * interval) for stage in STAGES]
@@ -66,7 +66,7 @@ def refine(
 ) -> tuple[Problem, Fit] | None:
     """Fit all poses from a good start: the beginning of each swing first; `broad`: the load is broad-band."""
     hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
-    rows = float(np.median(np.diff(poses.t))) * np.array(_FEWEST_ROWS)
+    rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest, horizon = _SHORT if hard else _BROAD if broad else _LONG
     shortest, horizon = max(shortest * period, rows[1]), max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)

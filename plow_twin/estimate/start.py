@@ -75,7 +75,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
 
     No swing is shorter than `shortest` in s.
     """
-    interval = float(np.median(np.diff(poses.t)))
+    interval = poses.interval()
     raw, t = filled(poses), poses.t
     width = smooth_width(poses, 0.04)
     reach = reaches(scene, smoothed(raw, width))

@@ -14,14 +14,15 @@ import sys
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from types import MappingProxyType
 from typing import Any, Final
 
-from plow_twin.estimate.estimate import Guess, estimate_window, warm_up
+from plow_twin.estimate.answer import Asked, answer
+from plow_twin.estimate.estimate import Guess, warm_up
 from plow_twin.estimate.measurements import Deviation
 from plow_twin.estimate.result import Estimate
 from plow_twin.estimate.window import Window, Windows
@@ -34,6 +35,7 @@ _MOST_WAITING: Final = 1_000_000
 #: How much the far side gives way to all others (`nice`).
 _NICE: Final = 10
 _STOP_S: Final = 5.0
+_ESTIMATE_ALONE: Final = Asked()
 
 
 def _view(contents: dict[Any, Any]) -> MappingProxyType[Any, Any]:
@@ -49,6 +51,7 @@ class Found:
     """An estimate of one window: its bounds [ns], how many rows it had, what it started from, and what came out.
 
     wall_s : how long it took; skipped : windows before it that gave way; restarts : times that all began anew before it
+    text : all of it as JSON, with `forces` and `forecast` where they were asked for, which `also` has too
     """
 
     start_ns: int
@@ -60,6 +63,8 @@ class Found:
     wall_s: float
     skipped: int
     restarts: int
+    text: str = ""
+    also: dict[str, Any] = field(default_factory=dict)
 
 
 class Worker:
@@ -71,9 +76,11 @@ class Worker:
         The nominal scene.
     windows : Windows
         What forms the windows, nothing in it yet; the process has a copy.
+    asked : Asked
+        What is wanted beside the estimate.
     """
 
-    def __init__(self, scene: Scene, windows: Windows) -> None:
+    def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno())]
         # one thread of linear algebra: it is to take no more than one core
@@ -83,7 +90,7 @@ class Worker:
         )
         far.close()
         self._connection = near
-        self._connection.send((scene, windows))
+        self._connection.send((scene, windows, asked))
         self._waiting: deque[tuple[Any, ...]] = deque()
         self._restarts = 0
         self._closed = threading.Event()
@@ -150,7 +157,7 @@ class Worker:
 
 def serve(connection: Connection) -> None:
     """Estimate what comes until the other side is gone."""
-    scene, windows = connection.recv()
+    scene, windows, asked = connection.recv()
     warm_up(scene)
     guess: Guess = ()
     skipped = restarts = 0
@@ -167,11 +174,11 @@ def serve(connection: Connection) -> None:
                     skipped += due is not None
                     due = formed
         begin = time.perf_counter()
-        result, following = estimate_window(scene, due.load, due.pose, due.lost, guess)
+        found = answer(scene, due, guess, asked)
         wall_s = time.perf_counter() - begin
         bounds = (due.start_ns, due.end_ns, due.samples, due.poses)
-        connection.send(Found(*bounds, guess, result, wall_s, skipped, restarts))
-        guess, skipped = following, 0
+        connection.send(Found(*bounds, guess, found.estimate, wall_s, skipped, restarts, found.text, found.also))
+        guess, skipped = found.following, 0
 
 
 def take(windows: Windows, item: tuple[Any, ...]) -> Window | None:

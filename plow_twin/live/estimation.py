@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import json
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
+from plow_twin.errors import Problem
+from plow_twin.estimate.answer import Asked
+from plow_twin.estimate.forces import FEWEST
+from plow_twin.estimate.forecast import HOUR_S, Plan
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.window import Windows
 from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.parameters import Settings
+from plow_twin.live.runtime import ESTIMATES
 from plow_twin.model.scene import Scene
 from plow_twin.record import messages as plain
 from plow_twin.stream.journal import Entry, Estimated, Pose, Reset, Sample, SetWear, Spread
@@ -21,6 +25,10 @@ NAMES: Final = (
     "horizontal", "vertical", "stiffness", "damping", "gain_fx", "gain_fy", "gain_m", "bias_x", "bias_y", "bias_theta",
     "delay",
 )  # fmt: skip
+#: Topics of what is published, by base name.
+ESTIMATE, FORCE_INTERVALS, FORECAST = ESTIMATES
+#: What a number of a forecast is called in SI.
+_SI: Final = {"hours": "seconds", "km": "metres"}
 #: How often one looks whether an estimate has come [Hz].
 RATE_HZ: Final = 10.0
 
@@ -32,7 +40,7 @@ class Estimation:
         self._frame_id = settings.frame_id
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation)
-        self._worker = Worker(scene, windows)
+        self._worker = Worker(scene, windows, asked_of(settings))
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
@@ -41,6 +49,9 @@ class Estimation:
         self.count = self.skipped = 0
         self.wall_s = 0.0
         self.end_ns: int | None = None
+        #: the newest forecast, or why there is none
+        self.forecast: dict[str, Any] | None = None
+        self.forecast_error = "nothing has been estimated yet"
         #: the newest one, for a journal that is begun anew
         self.entry: Estimated | None = None
 
@@ -65,11 +76,11 @@ class Estimation:
             case Reset():
                 self._worker.restart()
 
-    def poll(self, session: Session) -> plain.JointState | None:
-        """Hand an estimate that has come to the session; return its message, if there is one."""
+    def poll(self, session: Session) -> dict[str, plain.JointState]:
+        """Hand an estimate that has come to the session; return its messages by topic, none if none has come."""
         found = self._worker.poll()
         if found is None:
-            return None
+            return {}
         self.count += 1
         self.skipped += found.skipped
         self.wall_s, self.end_ns = found.wall_s, found.end_ns
@@ -79,7 +90,13 @@ class Estimation:
         self.reasons = result.reasons
         self.entry = entry_of(found, session, self.entry)
         session.apply(self.entry)
-        return message_of(found, self._frame_id)
+        self.forecast, self.forecast_error = found.also.get("forecast"), found.also.get("forecast_error", "")
+        messages = {ESTIMATE: message_of(found, self._frame_id)}
+        if "forces" in found.also:
+            messages[FORCE_INTERVALS] = forces_message(found, self._frame_id)
+        if "forecast" in found.also:
+            messages[FORECAST] = forecast_message(found, self._frame_id)
+        return messages
 
     def close(self) -> None:
         """End the process."""
@@ -103,9 +120,8 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
             shift[own] = np.array([value.mean, value.p05, value.p95]) - model[own]
         elif state is not State.NOT_OBSERVABLE:
             shift[own] = 0.0
-    text = json.dumps(result.as_dict(), allow_nan=False)
     bounds = (found.start_ns, found.end_ns, found.samples, found.poses)
-    return Estimated(*bounds, found.guess, tuple(shift.tolist()), text)
+    return Estimated(*bounds, found.guess, tuple(shift.tolist()), found.text)
 
 
 def message_of(found: Found, frame_id: str) -> plain.JointState:
@@ -120,3 +136,62 @@ def message_of(found: Found, frame_id: str) -> plain.JointState:
             names += [name, f"{name}/p05", f"{name}/p95"]
             numbers += [value.mean, value.p05, value.p95]
     return plain.JointState(found.end_ns, frame_id, tuple(names), position=np.array(numbers))
+
+
+def forces_message(found: Found, frame_id: str) -> plain.JointState:
+    """Return the message of the forces of a window's end, as `contact_peaks` has them; empty where there are none."""
+    names: list[str] = []
+    peaks: list[float] = []
+    impulses: list[float] = []
+    for pair, told in ((found.also["forces"] or {}).get("pairs", {})).items():
+        for suffix, point in (("", "p50"), ("/p05", "p05"), ("/p95", "p95")):
+            names.append(f"{pair}{suffix}")
+            peaks.append(told["peak_n"][point])
+            impulses.append(told["impulse_n_s"][point])
+    numbers = {"velocity": np.array(impulses), "effort": np.array(peaks)}
+    return plain.JointState(found.end_ns, frame_id, tuple(names), **numbers)
+
+
+def forecast_message(found: Found, frame_id: str) -> plain.JointState:
+    """Return the message of a forecast: seconds, metres, passes and shifts to the limit.
+
+    What is not reached within the horizon is left out.
+    """
+    told = found.also["forecast"] or {}
+    names: list[str] = []
+    numbers: list[float] = []
+    for point in ("p10", "p50", "p90"):
+        for key, factor in (("hours", HOUR_S), ("km", 1e3), ("passes", 1.0), ("shifts", 1.0)):
+            value = told.get(point, {}).get(key)
+            if value is not None:
+                names.append(f"{_SI.get(key, key)}/{point}")
+                numbers.append(factor * value)
+    for key in ("not_reached_in_horizon", "probability_before_stop"):
+        if told.get(key) is not None:
+            names.append(key)
+            numbers.append(told[key])
+    return plain.JointState(found.end_ns, frame_id, tuple(names), position=np.array(numbers))
+
+
+def asked_of(settings: Settings) -> Asked:
+    """Return what the parameters want beside the estimate."""
+    horizontal, vertical = settings.forecast_limits
+    plan = None
+    if horizontal or vertical:
+        plan = Plan(horizontal, vertical, settings.forecast_horizon / HOUR_S, settings.forecast_stop / HOUR_S or None)
+    return Asked(settings.estimate_forces, settings.estimate_interval, plan)
+
+
+def problems(settings: Settings, scene: Scene) -> list[Problem]:
+    """Return what contradicts itself, or the scene, in the parameters of the estimate."""
+    found = []
+    if settings.excitation_source == "scene":
+        found.append(Problem("estimate", True, "false where excitation_source is scene: no load comes"))
+    limits = settings.forecast_limits
+    if any(limits) and not all(limits):
+        found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))
+    if any(limits) and (scene.wear is None or scene.wear.travel_speed_m_s <= 0.0):
+        found.append(Problem("forecast_limits", limits, "0 where the scene has no wear or no travel speed"))
+    if 0 < settings.estimate_forces < FEWEST:
+        found.append(Problem("estimate_forces", settings.estimate_forces, f"0, or at least {FEWEST}"))
+    return found

@@ -13,7 +13,7 @@ from plow_twin.live.bridge.source import Bridge, BridgeError
 from plow_twin.live.load_model import read_load_model
 from plow_twin.live.parameters import Settings
 from plow_twin.live.part import Part
-from plow_twin.live.runtime import ESTIMATE, QUALITY, Runtime
+from plow_twin.live.runtime import ESTIMATES, QUALITY, Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
 from plow_twin.record.mapping import Role, read_map
@@ -65,7 +65,7 @@ class BridgeFront:
     ) -> None:
         self.name = NAME
         self.topics: Mapping[str, str] = {
-            topic: f"/{topic}" for topic in (*PUBLICATION_TOPICS, QUALITY, "status", "alarms", ESTIMATE)
+            topic: f"/{topic}" for topic in (*PUBLICATION_TOPICS, QUALITY, "status", "alarms", *ESTIMATES)
         }
         self.follows_samples = bridge.ends
         self._bridge, self._settings, self._say = bridge, settings, say
@@ -97,10 +97,11 @@ class BridgeFront:
         """Say the alarms."""
         self._say("alarms", (status.level, status.message, dict(status.values)))
 
-    def publish_estimate(self, message: JointState) -> None:
-        """Say an estimate."""
-        values = zip(message.name, message.position.tolist(), strict=True)
-        self._say(ESTIMATE, (0, "", {name: repr(value) for name, value in values}))
+    def publish_estimate(self, topic: str, message: JointState) -> None:
+        """Say an estimate, or what follows from it; of forces their peaks."""
+        numbers = message.position if len(message.position) else message.effort
+        values = zip(message.name, numbers.tolist(), strict=True)
+        self._say(topic, (0, "", {name: repr(value) for name, value in values}))
 
     def changed(self) -> None:
         """Say the status when it is another one."""

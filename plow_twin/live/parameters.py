@@ -114,6 +114,35 @@ class Settings:
     estimate_interval: float = _number(
         10.0, "s", 0.5, 3600.0, Effect.CONFIGURE, "distance of the ends of the windows; one takes some seconds of work"
     )
+    estimate_forces: int = _number(
+        0,
+        "twins",
+        0,
+        4096,
+        Effect.CONFIGURE,
+        "twins drawn from each estimate, whose forces give the intervals on force_intervals: at least 20, 256 is "
+        "plenty; 0: none",
+    )
+    forecast_limits: tuple[float, ...] = _list(
+        (0.0, 0.0),
+        "m",
+        0.0,
+        1.0,
+        Effect.CONFIGURE,
+        "limits of the horizontal and the vertical clearance, both: the time until one is reached follows from each "
+        "estimate; 0: no forecast",
+    )
+    forecast_horizon: float = _number(
+        1.44e7, "s", 1.0, 1e10, Effect.CONFIGURE, "hours of operation, in s, beyond which a limit counts as not reached"
+    )
+    forecast_stop: float = _number(
+        0.0,
+        "s",
+        0.0,
+        1e10,
+        Effect.CONFIGURE,
+        "time of operation to a planned stop, for the probability of a limit before it; 0: none",
+    )
     wear_state_path: str = _plain(
         "",
         Effect.CONFIGURE,

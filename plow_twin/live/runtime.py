@@ -5,6 +5,7 @@ A front brings samples and takes messages away: the ROS node is one, `plow-twin 
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import ArgumentError, Problem
+from plow_twin.errors import ArgumentError
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
 from plow_twin.live.solver_start import Prepared
@@ -41,8 +42,8 @@ if TYPE_CHECKING:
 
 #: Topic of the marks.
 QUALITY: Final = "quality"
-#: Topic of the estimate.
-ESTIMATE: Final = "estimate"
+#: Topics of the estimate and of what follows from it.
+ESTIMATES: Final = ("estimate", "force_intervals", "forecast")
 _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: What is not used goes into the journal so often [Hz].
@@ -81,8 +82,8 @@ class Front(Protocol):
     def publish_alarms(self, status: DiagnosticStatus) -> None:
         """Send the alarms."""
 
-    def publish_estimate(self, message: JointState) -> None:
-        """Send an estimate."""
+    def publish_estimate(self, topic: str, message: JointState) -> None:
+        """Send an estimate, or what follows from it, on one of `ESTIMATES`."""
 
     def changed(self) -> None:
         """Take note that the state of the stream may have changed."""
@@ -145,8 +146,6 @@ class Runtime:
             self.wear_keeper = WearKeeper(Path(settings.wear_state_path), settings.hardware_id, self.scene)
             depth = self.wear_keeper.load() or depth
         self.alarms = alarms_of(asdict(settings))
-        if settings.estimate and settings.excitation_source == "scene":
-            raise ParameterError([Problem("estimate", True, "false where excitation_source is scene: no load comes")])
         # refuses, here and not while samples come, what the settings would change
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
@@ -397,6 +396,13 @@ class Runtime:
         self._publish_alarms(self._stamp_ns())
         return True, f"still there: {', '.join(left)}" if left else "no alarm is left"
 
+    def forecast(self) -> tuple[bool, str]:
+        """Return the newest forecast as JSON."""
+        if self.estimation is None or not any(self._settings.forecast_limits):
+            return False, "no forecast is made: estimate is false or forecast_limits are 0"
+        found = self.estimation.forecast
+        return (True, json.dumps(found)) if found is not None else (False, self.estimation.forecast_error)
+
     def set_wear(self) -> tuple[bool, str]:
         """Set the wear of the pads to the parameter `set_wear`."""
         depth = self._settings.set_wear
@@ -437,8 +443,11 @@ class Runtime:
     def _estimate(self) -> Estimation | None:
         if not self._settings.estimate:
             return None
-        from plow_twin.live.estimation import Estimation
+        from plow_twin.live.estimation import Estimation, problems
 
+        found = problems(self._settings, self.scene)
+        if found:
+            raise ParameterError(found)
         return Estimation(self._settings, self.scene)
 
     def _journal(self) -> Callable[[Entry], object]:
@@ -465,11 +474,12 @@ class Runtime:
 
     def _look_for_estimate(self) -> None:
         assert self.estimation is not None
-        message = self.estimation.poll(self.driver.session)
-        if message is not None:
-            self._front.publish_estimate(message)
+        messages = self.estimation.poll(self.driver.session)
+        for topic, message in messages.items():
+            self._front.publish_estimate(topic, message)
             if self.recording:
-                self.recording.message(ESTIMATE, message.stamp_ns, message)
+                self.recording.message(topic, message.stamp_ns, message)
+        if messages:
             self._front.changed()
 
     def _look_for_clock(self) -> None:

@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState as RosJointState
 from std_srvs.srv import Trigger
 
 from plow_twin.live.parameters import Settings
-from plow_twin.live.runtime import ESTIMATE, Runtime
+from plow_twin.live.runtime import ESTIMATES, Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.ros.input_loop import InputLoop, Turns
@@ -25,7 +25,16 @@ from plow_twin.ros.subscriptions import Subscriptions
 from plow_twin.stream.outputs import Publication
 
 #: Services by name, each a method of the runtime.
-SERVICES: Final = ("reset", "switch_publisher", "set_wear", "acknowledge_alarms", "snapshot", "restore", "mark")
+SERVICES: Final = (
+    "reset",
+    "switch_publisher",
+    "set_wear",
+    "acknowledge_alarms",
+    "snapshot",
+    "restore",
+    "mark",
+    "forecast",
+)
 
 
 class RosFront:
@@ -59,7 +68,7 @@ class RosFront:
         self._node = node
         self.name: str = node.get_fully_qualified_name()
         self.topics: Mapping[str, str] = {
-            topic: node.resolve_topic_name(topic) for topic in (*TOPICS, "status", "alarms", ESTIMATE)
+            topic: node.resolve_topic_name(topic) for topic in (*TOPICS, "status", "alarms", *ESTIMATES)
         }
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.changed = changed
@@ -81,10 +90,12 @@ class RosFront:
         made.callback(self._publishers.close)
         self._alarms = node.create_publisher(RosDiagnosticStatus, "alarms", LATCHED)
         made.callback(node.destroy_publisher, self._alarms)
-        self._estimates: Any = None
-        if settings.estimate:
-            self._estimates = node.create_publisher(RosJointState, ESTIMATE, LATCHED)
-            made.callback(node.destroy_publisher, self._estimates)
+        self._estimates: dict[str, Any] = {}
+        wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
+        for topic, one in zip(ESTIMATES, wanted, strict=True):
+            if settings.estimate and one:
+                self._estimates[topic] = node.create_publisher(RosJointState, topic, LATCHED)
+                made.callback(node.destroy_publisher, self._estimates[topic])
         self._loop = loop = InputLoop(self.turns, self._failed)
         made.callback(loop.close)
         self.subscriptions = Subscriptions(node, runtime, loop, self.turns, self.changed)
@@ -112,9 +123,9 @@ class RosFront:
         """Publish the alarms."""
         self._alarms.publish(ros_status(status))
 
-    def publish_estimate(self, message: JointState) -> None:
-        """Publish an estimate."""
-        self._estimates.publish(ros_joint_state(message))
+    def publish_estimate(self, topic: str, message: JointState) -> None:
+        """Publish an estimate, or what follows from it."""
+        self._estimates[topic].publish(ros_joint_state(message))
 
     def say_error(self, text: str) -> None:
         """Log an error."""

@@ -1,0 +1,98 @@
+"""All that a window tells: the estimate, and what is asked beside it, forces with intervals and the time to a limit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from plow_twin.estimate.estimate import Guess, estimate_window
+from plow_twin.estimate.forces import ForcesError, forces_of
+from plow_twin.estimate.forecast import Plan, forecast, with_estimate
+from plow_twin.estimate.life import LifeError, period_of
+from plow_twin.estimate.measurements import Load
+from plow_twin.estimate.result import Estimate, State
+from plow_twin.estimate.window import Window
+from plow_twin.model.scene import Scene, Table
+
+#: Load periods in which the members of the forces forget where they began.
+_SETTLE_PERIODS: Final = 1.0
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is wanted beside the estimate.
+
+    members : twins that the forces' intervals are drawn from; 0: no forces
+    span_s : the end of a window that the forces are told of [s]
+    plan : limits of the clearances; None: no forecast
+    """
+
+    members: int = 0
+    span_s: float = 0.0
+    plan: Plan | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The estimate, the guess for the next window, and what was asked beside it, for JSON.
+
+    also : `forces` and `forecast` as far as they were asked for; null, with `<name>_error`, where there is none
+    """
+
+    estimate: Estimate
+    following: Guess
+    also: dict[str, Any]
+
+    @property
+    def text(self) -> str:
+        """All of it as JSON."""
+        return json.dumps({**self.estimate.as_dict(), **self.also}, allow_nan=False)
+
+
+def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
+    """Estimate from a window, beginning at `guess`, and tell what is asked beside that."""
+    result, following = estimate_window(scene, window.load, window.pose, window.lost, guess)
+    also: dict[str, Any] = {}
+    if asked.members:
+        try:
+            also["forces"] = _forces(scene, result, window.load, asked)
+        except ForcesError as error:
+            also |= {"forces": None, "forces_error": str(error)}
+    if asked.plan is not None:
+        try:
+            also["forecast"] = forecast_from(scene, result, window.load, asked.plan)
+        except LifeError as error:
+            also |= {"forecast": None, "forecast_error": str(error)}
+    return Answer(result, following, also)
+
+
+def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[str, Any]:
+    if State.PRIOR in (result.horizontal_state, result.vertical_state):
+        raise ForcesError("estimate: got the prior, expected one to draw from")
+    settle = _SETTLE_PERIODS * load.period()
+    end = float(load.t[-1])
+    return forces_of(scene, result, load.between(end - asked.span_s - settle, end), asked.members, settle).as_dict()
+
+
+def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dict[str, Any]:
+    """Return the forecast from an estimate on, for JSON.
+
+    The load is expected to go on as in the window, with the gains that were estimated; as in the scene where the window
+    is too short to tell.
+
+    Raises
+    ------
+    LifeError
+        For a withdrawn estimate; where the scene has no wear or does not travel.
+    """
+    now, deviation = with_estimate(scene, result.as_dict())
+    gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
+    felt = load.thinned()
+    seen = replace(now, loads=(Table("window", felt.t - felt.t[0], felt.wrench * gains),))
+    try:
+        period_of(seen)
+        now = seen
+    except LifeError:
+        pass
+    return forecast(now, plan, deviation).as_dict()
