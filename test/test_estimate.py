@@ -19,7 +19,7 @@ from plow_twin.estimate.bouncing import _regress
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.measurements import EstimateError, Load, Poses
-from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.unknowns import GAIN, Spread, Unknowns
 from plow_twin.model.loads import compile_loads
 
@@ -87,6 +87,9 @@ def test_forces_have_intervals_that_hold_peaks_and_impulses(known: list[tuple[Tr
         for value, low, high in zip(values, getattr(forces, name)[0], getattr(forces, name)[2], strict=True)
     ]
     assert sum(held) >= 11, "of 16, whose errors go together"
+    # confounded: a softer contact with a smaller clearance moves the head much alike
+    softness = CORRELATED.index("softness")
+    assert all(result.correlation[axis][softness] < -0.3 for axis in (0, 1))
     assert forces.peak[2].max() < 1.4 * forces.peak[0].max()
     withdrawn = replace(result, horizontal_state=State.WITHDRAWN)
     with pytest.raises(ForcesError, match="withdrawn"):
@@ -105,7 +108,8 @@ def test_members_are_drawn_with_the_estimate_s_correlation(known: list[tuple[Tru
     stiffness = np.log([scene.contact.stiffness for scene in scenes])
     # a softer contact goes with a smaller clearance
     assert np.corrcoef(clearance, stiffness)[0, 1] == pytest.approx(0.8, abs=0.04)
-    assert np.quantile(clearance, [0.05, 0.95]) == pytest.approx([drawn.horizontal.p05, drawn.horizontal.p95], abs=5e-6)
+    ends = drawn.horizontal.p05, drawn.horizontal.p95
+    assert np.quantile(clearance, [0.05, 0.95]) == pytest.approx(ends, abs=0.05 * (ends[1] - ends[0]))
     assert gains.shape == (2000, 3)
 
 
@@ -202,6 +206,46 @@ def test_without_measurements_the_prior_is_what_there_is() -> None:
     result = estimate(nominal, load, poses, lost)
     assert (result.horizontal_state, result.vertical_state, result.lost) == (State.PRIOR, State.PRIOR, 2)
     assert result.horizontal.p05 < 0.025 < result.horizontal.p95
+    assert result.reasons == ("got 2 poses from 0 s to 1 s, the load's span, expected 20",)
+
+
+def test_poses_with_which_a_fit_goes_astray_are_not_fitted() -> None:
+    """At 5 Hz, or 200 Hz of which 3 % arrive, a swing's start cannot be told: the fit was wrong, and sure of it."""
+    nominal = preset("paper")
+    load, _ = Load.of([0.0, 20.0], np.ones((2, 3)))
+    rng = np.random.default_rng(1)
+    rare, some = np.arange(0.0, 20.0, 0.2), np.arange(0.0, 20.0, 0.005)
+    q = np.where(rng.random((len(some), 3)) < 0.03, 0.0, np.nan)
+    for t, rows in ((rare, np.zeros((len(rare), 3))), (some, q)):
+        poses, _ = Poses.of(t, rows)
+        result = estimate(nominal, load, poses)
+        assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
+        assert "a second, expected at least 8.0" in result.reasons[0]
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("what", ["nine of ten components missing", "noise of 5 mm"])
+def test_too_little_to_tell_is_no_narrow_interval_beside_the_truth(what: str) -> None:
+    noisy = replace(GROUPS["plain"], periods=6.0, noise_m=5e-3 if what == "noise of 5 mm" else 5e-4)
+    truth = draw(noisy, 2)
+    q = truth.poses.q.copy()
+    if what != "noise of 5 mm":
+        q[np.random.default_rng(2).random(q.shape) < 0.9] = np.nan
+    poses, _ = Poses.of(truth.poses.t, q)
+    result = estimate(truth.nominal, truth.load, poses)
+    for value, state, true in zip(
+        (result.horizontal, result.vertical), (result.horizontal_state, result.vertical_state), truth.clearance,
+        strict=True,
+    ):  # fmt: skip
+        assert state is not State.ESTIMATED or abs(value.mean - true) < 1.5 * (value.p95 - value.p05)
+
+
+def test_numbers_that_can_be_no_pose_or_load_are_left_out_and_counted() -> None:
+    """One pose of 1e300 m ended the estimate with an overflow."""
+    poses, lost = Poses.of([0.0, 1.0, 2.0], [[0.0, 0.0, 0.0], [1e300, 0.0, 0.0], [np.inf, 0.0, 0.0]])
+    assert (poses.t.tolist(), lost) == ([0.0, 2.0], 1)
+    load, lost = Load.of([0.0, 1.0, 2.0], [[0.0, 0.0, 0.0], [1e5, 0.0, 1e300], [0.0, 0.0, 0.0]])
+    assert (load.t.tolist(), lost) == ([0.0, 2.0], 1)
 
 
 def test_a_component_never_measured_is_said_and_nothing_is_estimated(known: list[tuple[Truth, Estimate]]) -> None:

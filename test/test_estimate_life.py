@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Wear, simulate
+from plow_twin import Table, Wear, simulate
 from plow_twin.cli.app import run as cli
 from plow_twin.estimate.coefficient import History, coefficient
-from plow_twin.estimate.forecast import Plan, forecast
+from plow_twin.estimate.forecast import Plan, forecast, with_estimate
 from plow_twin.estimate.life import LifeError, mean_forces, period_of, wear_path
+from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
 from plow_twin.scene_file import dump_scene
 
@@ -72,6 +73,31 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     assert now == pytest.approx([0.025, 0.030], abs=1e-9)
     late = life.clearances(np.array([0.99 * p50]))[1, 0]
     assert max(late - [0.028, 0.034]) == pytest.approx(0.0, abs=3e-4)
+
+
+def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:
+    """The load as a recording has it: the harmonic one sampled gives the same mean forces."""
+    scene = preset("paper")
+    t = np.arange(0.0, 20.0, 0.01)
+    sampled = replace(scene, loads=(Table("recorded", t, compile_loads(scene.loads).at(t)),))
+    assert period_of(sampled) == pytest.approx(period_of(scene), rel=0.1)
+    depth = np.zeros(8)
+    assert mean_forces(sampled, depth)[0].sum() == pytest.approx(mean_forces(scene, depth)[0].sum(), rel=0.1)
+    with pytest.raises(LifeError, match=r"got [0-9.]+ periods, expected at least 6"):
+        period_of(replace(scene, loads=(Table("short", t[:900], compile_loads(scene.loads).at(t[:900])),)))
+
+
+def test_an_estimated_clearance_holds_the_wear_that_there_is() -> None:
+    """Pads worn by 2 mm and a clearance estimated with that: the forecast must not count the wear twice."""
+    worn = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, initial_depth_m=(2e-3,) * 8))
+    facts = {
+        name: {"mean_m": mean, "p05_m": mean - 1e-4, "p95_m": mean + 1e-4, "state": "estimated"}
+        for name, mean in (("horizontal", 0.029), ("vertical", 0.034))
+    }
+    now, deviation = with_estimate(worn, facts)
+    found = forecast(now, Plan(0.033, 0.038, 1e6, draws=50), deviation)
+    assert np.quantile(found.now, 0.5, axis=0) == pytest.approx([0.029, 0.034], abs=5e-5)
+    assert found.clearances(np.zeros(1))[1, 0] == pytest.approx([0.029, 0.034], abs=5e-5)
 
 
 def test_a_scene_without_wear_or_period_is_refused() -> None:

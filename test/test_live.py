@@ -39,7 +39,7 @@ from plow_twin.record.reader import EntryRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import Arrived
 from plow_twin.record.unused import unused_messages
-from plow_twin.stream.journal import Gaps, Pose
+from plow_twin.stream.journal import Gaps, PartOfPose, Pose
 
 ROOT = Path(__file__).resolve().parent.parent
 START_S = 200.0
@@ -113,14 +113,16 @@ def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> N
     values = _run(path, tmp_path / "map.yaml", record_path=str(tmp_path / "run"), **stated)["input"][2]
     measured = read_recording(tmp_path / "run")
     assert (measured.pose_deviation, measured.load_deviation) == ((1e-4, 2e-4, 3e-4), (1e3, 0.0, 2e3))
-    assert (values["samples_used"], values["head_pose_used"], values["gaps_used"]) == ("100", "1", "2")
-    assert values["head_pose_dropped"] == "1"
+    assert (values["samples_used"], values["head_pose_used"], values["gaps_used"]) == ("100", "2", "2")
+    assert values["head_pose_dropped"] == "0"
     entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
-    assert [entry for entry in entries if isinstance(entry, Pose | Gaps)] == [
+    assert [entry for entry in entries if isinstance(entry, Pose | PartOfPose | Gaps)] == [
         Pose(1_030_200_000, (0.001, 0.002, 0.003)),
         Gaps(1_030_200_000, (0,), (0.004,)),
         Gaps(1_040_500_000, (0,), (0.005,)),
+        PartOfPose(1_020_500_000, (0, 2), (0.001, 0.003)),
     ]
+    assert np.array_equal(measured.poses[-1, 1:], (0.001, np.nan, 0.003), equal_nan=True)
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code) == (100, 0)
 

@@ -17,7 +17,17 @@ from plow_twin.live.parameters import Settings
 from plow_twin.live.runtime import ESTIMATES
 from plow_twin.model.scene import Scene
 from plow_twin.record import messages as plain
-from plow_twin.stream.journal import Entry, Estimated, Pose, Reset, Sample, SetWear, Spread
+from plow_twin.stream.journal import (
+    Entry,
+    Estimated,
+    PartOfPose,
+    Pose,
+    Reset,
+    Sample,
+    SetWear,
+    Spread,
+    whole_pose,
+)
 from plow_twin.stream.session import Session
 
 #: Base names of what `estimate` tells; each has its points `<name>/p05` and `<name>/p95` too.
@@ -67,6 +77,8 @@ class Estimation:
                 self._worker.take_load(stamp_ns, wrench)
             case Pose(stamp_ns, pose, deviation):
                 self._worker.take_pose(stamp_ns, pose, deviation)
+            case PartOfPose(stamp_ns) as part:
+                self._worker.take_pose(stamp_ns, whole_pose(part))
             case Spread(_, deviation):
                 self._worker.take_spread(deviation)
             case SetWear():

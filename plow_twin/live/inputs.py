@@ -135,11 +135,17 @@ class Inputs:
             self._on_travel(stamp_ns, speed_m_s)
 
     def take_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
-        """Take in a measured pose: x, y [m], theta [rad], and their standard deviations where they are known."""
-        verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*pose, *deviation), self._poses)
+        """Take in a measured pose: x, y [m], theta [rad], and their standard deviations where they are known.
+
+        A component that was not measured is NaN, not all of them.
+        """
+        missing = [math.isnan(value) for value in pose]
+        # what was not measured breaks no limit
+        judged = pose if all(missing) else tuple(0.0 if math.isnan(value) else value for value in pose)
+        verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if not verdict.used:
             return
-        if verdict is not Verdict.WORKED_IN:
+        if verdict is not Verdict.WORKED_IN and not any(missing):
             self.measured = pose
         if self._on_pose is not None and self._poses is not None:
             if verdict.resets:

@@ -6,6 +6,7 @@ A front brings samples and takes messages away: the ROS node is one, `plow-twin 
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -30,7 +31,7 @@ from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Entry, Gaps, Pose, Snapshot
+from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Snapshot
 from plow_twin.stream.limits import Limits, excitation_limits
 from plow_twin.stream.model_changes import changed_twin
 from plow_twin.stream.outputs import Publication
@@ -465,6 +466,10 @@ class Runtime:
         return both
 
     def _pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...]) -> None:
+        known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
+        if len(known) < len(pose):
+            self.driver.session.apply(PartOfPose(stamp_ns, known, tuple(pose[index] for index in known)))
+            return
         self.driver.session.apply(Pose(stamp_ns, pose, deviation))
         if self.alarms.take_pose(stamp_ns, pose):
             self._alarms_changed(stamp_ns)

@@ -9,7 +9,7 @@ from typing import Any
 from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import Estimated, Pose, Reset, SetWear, Spread
+from plow_twin.stream.journal import Estimated, PartOfPose, Pose, Reset, SetWear, Spread, whole_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +44,8 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
             match entries.others[index]:
                 case Pose(stamp_ns, pose, deviation):
                     windows.take_pose(stamp_ns, pose, deviation)
+                case PartOfPose(stamp_ns) as part:
+                    windows.take_pose(stamp_ns, whole_pose(part))
                 case Spread(_, deviation):
                     windows.take_spread(deviation)
                 case Reset() | SetWear():

@@ -25,7 +25,7 @@ from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Pose, Spread
+from plow_twin.stream.journal import PartOfPose, Pose, Spread, whole_pose
 
 Array = NDArray[np.float64]
 
@@ -123,6 +123,8 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, list[tuple[float, 
             if isinstance(entry, Pose):
                 poses.append((entry.stamp_ns, *entry.pose))
                 deviations += [entry.deviation] if entry.deviation else []
+            elif isinstance(entry, PartOfPose):
+                poses.append((entry.stamp_ns, *whole_pose(entry)))
             elif isinstance(entry, Spread):
                 spread = np.maximum(spread, entry.deviation)
     return np.concatenate(loads), np.array(poses, dtype=np.float64).reshape(-1, 4), spread, deviations

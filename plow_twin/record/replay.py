@@ -49,7 +49,19 @@ from plow_twin.record.template import Indexes, Templates, differing, read_number
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
-from plow_twin.stream.journal import Digest, Gaps, Hold, Loss, Parameter, Pose, Sample, Snapshot, Unload, Unused
+from plow_twin.stream.journal import (
+    Digest,
+    Gaps,
+    Hold,
+    Loss,
+    Parameter,
+    PartOfPose,
+    Pose,
+    Sample,
+    Snapshot,
+    Unload,
+    Unused,
+)
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.session import Session
 
@@ -169,7 +181,7 @@ class _Replay:
         breaks[1:] = np.diff(entries.sequence) != 1
         for index, entry in sorted(entries.others.items()):
             goes_on = not breaks[index] and (index - 1 not in entries.others or not breaks[index - 1])
-            if not (goes_on and isinstance(entry, Digest | Pose | Gaps | Unused)):
+            if not (goes_on and isinstance(entry, Digest | Pose | PartOfPose | Gaps | Unused)):
                 breaks[index : index + 2] = True
         samples = np.flatnonzero(entries.sample)
         late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # worked in one by one

@@ -10,7 +10,7 @@ from typing import Any
 
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.reader import Entries, RunReader
-from plow_twin.stream.journal import Entry, Gaps, Pose, Sample, Travel, Unused
+from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Travel, Unused
 
 
 @dataclass
@@ -38,7 +38,7 @@ class InputCounts:
                 self._count(topic, reason, count)
             case Travel():
                 self._count("travel", "used", 1)
-            case Pose():
+            case Pose() | PartOfPose():
                 self._count("head_pose", "used", 1)
             case Gaps():
                 self._count("gaps", "used", 1)

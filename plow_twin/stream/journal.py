@@ -5,6 +5,7 @@ Stamps are integer nanoseconds on the clock of the samples; they are never round
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 #: A value that a parameter can take.
@@ -118,6 +119,15 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class PartOfPose:
+    """Of a pose only `components` (0, 1, 2: x, y, theta) were measured, as `values` [m, rad]: kept for the estimate."""
+
+    stamp_ns: int
+    components: tuple[int, ...]
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Gaps:
     """Sensors have measured gaps [m] of the pairs numbered `pairs` at `stamp_ns`: kept for the estimate."""
 
@@ -198,6 +208,7 @@ Entry = (
     | Spread
     | Parameter
     | Pose
+    | PartOfPose
     | Gaps
     | Unused
     | Estimated
@@ -205,3 +216,9 @@ Entry = (
     | Digest
     | Loss
 )
+
+
+def whole_pose(part: PartOfPose) -> tuple[float, ...]:
+    """Return x, y [m], theta [rad], NaN where it was not measured."""
+    known = dict(zip(part.components, part.values, strict=True))
+    return tuple(known.get(index, math.nan) for index in range(3))

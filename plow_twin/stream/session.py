@@ -22,6 +22,7 @@ from plow_twin.stream.journal import (
     Loss,
     Mark,
     Parameter,
+    PartOfPose,
     Pose,
     Reset,
     Restore,
@@ -164,7 +165,7 @@ class Session:
             case Restore(_, data):
                 self._on_entry(entry)
                 self._restore_motion(data)
-            case Parameter() | Pose() | Gaps() | Mark() | Spread() | Unused():
+            case Parameter() | Pose() | PartOfPose() | Gaps() | Mark() | Spread() | Unused():
                 # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):
