@@ -44,7 +44,7 @@ _DRAWS: Final = (40, 40, 40)
 #: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
 _NEAR, _RIDGE = 0.7, 0.3
 #: The same for the regression of what is left over, and a square that counts as nothing.
-_SCATTER_RIDGE, _NO_SCATTER = 5.0, 1e-14
+_SCATTER_RIDGE, _NO_SCATTER = 20.0, 1e-14
 #: Steps of the solver after which no further draw is made.
 _MOST_WORK = 3_500_000
 #: Drawn: logarithm of the penetration under the reference force [m] and its bounds; deviations of the damping's
@@ -158,7 +158,7 @@ def _off_path(eye: _Eye, features: Array, paths: Array, measured: Array) -> floa
     there = np.isfinite(paths).all(axis=0) & np.isfinite(eye.path(eye.q))
     if there.sum() < _PATH_PHASES:
         return 0.0
-    found = _regress(features, paths[:, there], measured)
+    found = _regress(features, paths[:, there], measured, local=False)
     # stamps may be late or early: a delay is no other path
     off = [(eye.path(eye.q, lag_s)[there] - found.value) / found.deviation for lag_s in _LAGS_S]
     return float(min(np.nanmean(one**2) for one in off))
@@ -171,10 +171,11 @@ class _Regressed:
     distance: float
 
 
-def _regress(features: Array, targets: Array, measured: Array) -> _Regressed:
+def _regress(features: Array, targets: Array, measured: Array, local: bool = True) -> _Regressed:
     """Regress targets (n, k) on features (n, m), the nearest to what was measured most.
 
-    The deviations are those of a prediction at `measured`, which may lie at the edge of what was drawn.
+    The deviations are those of a prediction at `measured`, which may lie at the edge of what was drawn; `local`: of
+    what scatters as it does there, else as it does among all that are near.
     """
     scale = features.std(axis=0) + 1e-12
     z = (features - measured) / scale
@@ -186,7 +187,10 @@ def _regress(features: Array, targets: Array, measured: Array) -> _Regressed:
     beta = inverse @ (basis.T @ (weight[:, None] * targets))
     leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
     error = targets - basis @ beta
-    deviation = np.sqrt(_scatter_at(basis, weight, error, leverage) * (1.0 + inverse[0, 0]))
+    variance = (weight[:, None] * error**2).sum(axis=0) / (weight * (1.0 - np.minimum(leverage, 0.9))).sum()
+    if local:
+        variance = _scatter_at(basis, weight, error, leverage)
+    deviation = np.sqrt(variance * (1.0 + inverse[0, 0]))
     between = ((features[:, None] - features[None]) ** 2 / scale**2).mean(axis=2)
     nearest = np.sort(between, axis=1)[:, 1:6].mean(axis=1)
     return _Regressed(beta[0], deviation, float(np.sort(distance)[:5].mean() / np.quantile(nearest, 0.95)))
