@@ -79,7 +79,7 @@ class Windows:
         self._load_deviation = deviation
 
     def take_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
-        """Take in a measured pose x, y [m], theta [rad], NaN where not measured, with its deviations if they are known."""
+        """Take in a measured pose x, y [m], theta [rad], NaN where not measured, with its deviations if known."""
         self._poses.append((stamp_ns, *q))  # type: ignore[arg-type]
         if deviation:
             self._deviations.append((stamp_ns, *deviation))  # type: ignore[arg-type]
