@@ -13,8 +13,7 @@ from plow_twin.estimate.forecast import HOUR_S, Plan
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.window import Windows
 from plow_twin.estimate.worker import Found, Worker
-from plow_twin.live.parameters import Settings
-from plow_twin.live.runtime import ESTIMATES
+from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.model.scene import Scene
 from plow_twin.record import messages as plain
 from plow_twin.stream.journal import (

@@ -17,6 +17,9 @@ from typing import Any, Final
 
 from plow_twin.errors import PlowTwinError, Problem
 
+#: Topics of the estimate and of what follows from it.
+ESTIMATES: Final = ("estimate", "force_intervals", "forecast")
+
 
 class Effect(Enum):
     """When a changed value takes effect; the value says so in words."""

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
 #: Topic of the marks.
 QUALITY: Final = "quality"
-#: Topics of the estimate and of what follows from it.
-ESTIMATES: Final = ("estimate", "force_intervals", "forecast")
 _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: What is not used goes into the journal so often [Hz].

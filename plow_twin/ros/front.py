@@ -13,8 +13,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState as RosJointState
 from std_srvs.srv import Trigger
 
-from plow_twin.live.parameters import Settings
-from plow_twin.live.runtime import ESTIMATES, Runtime
+from plow_twin.live.parameters import ESTIMATES, Settings
+from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.ros.input_loop import InputLoop, Turns
