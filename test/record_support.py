@@ -101,14 +101,17 @@ def rewrite(
     target: Path,
     change: Callable[[str, Any], bytes | None] = lambda topic, message: None,
     metadata: Callable[[dict[str, str]], dict[str, str]] = dict,
+    *,
+    metadata_last: bool = False,
 ) -> Path:
     """Copy an MCAP file with other tools than the package's; `change` may return other bytes for a message."""
     with source.open("rb") as stream, target.open("wb") as out:
         writer = Writer(out, chunk_size=64 * 1024)
         writer.start(profile="ros2", library="test")
         reader = make_reader(stream)
-        for record in reader.iter_metadata():
-            writer.add_metadata(record.name, metadata(dict(record.metadata)))
+        kept = [(record.name, metadata(dict(record.metadata))) for record in reader.iter_metadata()]
+        for name, content in [] if metadata_last else kept:
+            writer.add_metadata(name, content)
         schemas: dict[int, int] = {}
         channels: dict[int, int] = {}
         for schema, channel, message in reader.iter_messages(log_time_order=False):
@@ -125,6 +128,8 @@ def rewrite(
                 message.publish_time,
                 message.sequence,
             )
+        for name, content in kept if metadata_last else []:
+            writer.add_metadata(name, content)
         writer.finish()
     return target
 

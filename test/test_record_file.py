@@ -22,7 +22,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from record_support import BASE_NS, Run, chunk_spans, paper_entries, record_run
+from record_support import BASE_NS, Run, chunk_spans, paper_entries, record_run, rewrite
 from rosbags.highlevel import AnyReader
 
 from plow_twin.errors import RecordingError
@@ -249,6 +249,20 @@ def test_ten_gigabytes_take_the_memory_of_some_chunks(run: Run, tmp_path: Path) 
     large = check_large(run, tmp_path, images=50, image_size=80_000_000, attachments=20)
     assert (tmp_path / "large.mcap").stat().st_size > 10_000_000_000
     assert large - small < 5 * 80_000_000
+
+
+def test_a_file_that_another_program_wrote_anew_is_a_run(run: Run, tmp_path: Path) -> None:
+    """Its header stands behind the chunks; without an index at the end it is found all the same."""
+    file = rewrite(run.file, tmp_path / "anew.mcap", metadata_last=True)
+    report = replay(file)
+    assert (report.exit_code, report.messages_compared) == (0, replay(run.file).messages_compared)
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    last = summary.metadata_indexes[-1]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes()[: last.offset + last.length])
+    assert replay(cut).status is FileStatus.TRUNCATED
 
 
 @pytest.mark.parametrize(

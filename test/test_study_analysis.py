@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rainflow
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -25,7 +26,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry, Pose
-from plow_twin.study.analysis import thinned
+from plow_twin.study.analysis import loads, thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
 from plow_twin.study.analysis.loads import reversals
 
@@ -282,6 +283,17 @@ def test_rows_beyond_what_fits_are_kept_evenly(monkeypatch: pytest.MonkeyPatch) 
     for stamps, values in (rows.series(), signal.series()):
         np.testing.assert_array_equal(stamps, np.arange(0, 901, 16))
         np.testing.assert_array_equal(values.ravel(), 2.0 * stamps)
+
+
+def test_cycles_are_those_of_the_whole_series_whatever_its_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loads, "_IN_MEMORY", 4096)  # of 40 000 bytes
+    forces, series = np.abs(np.random.default_rng(1).normal(size=5000)), loads.Series()
+    for part in np.array_split(forces, 7):
+        series.add(reversals(part))
+    expected = rainflow.count_cycles(forces, nbins=loads.CYCLE_BINS)
+    for _ in range(2):  # a run that is still written is asked again and again
+        counted = rainflow.count_cycles(series, binsize=(series.high - series.low) / loads.CYCLE_BINS)
+        np.testing.assert_allclose(counted, expected, rtol=1e-12)
 
 
 def test_turning_points_keep_peaks_and_ends() -> None:

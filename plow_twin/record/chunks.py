@@ -253,6 +253,38 @@ class ChunkReader:
             self.channels.setdefault(channel.id, Channel(channel.topic, name, channel.message_encoding, text))
 
 
+def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield name and content of the metadata records of a file, wherever they stand; no chunk is opened."""
+    from mcap.reader import make_reader
+
+    found: list[tuple[str, dict[str, str]]] = []
+    with open_mcap(path) as stream:
+        try:
+            found = [(record.name, dict(record.metadata)) for record in make_reader(stream).iter_metadata()]
+        except Exception:  # no index at the end, or a damaged one
+            found = _metadata_by_heads(stream.fileno())
+    yield from found
+
+
+def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
+    """Return the metadata records of a file without an index: from one record's head to the next."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Metadata
+
+    found, place, size = [], len(MAGIC), os.fstat(descriptor).st_size
+    while place + _HEAD.size <= size:
+        opcode, length = _HEAD.unpack(os.pread(descriptor, _HEAD.size, place))
+        place += _HEAD.size
+        if opcode == _METADATA and length <= RECORD_LIMIT:
+            try:
+                record = Metadata.read(ReadDataStream(BytesIO(os.pread(descriptor, length, place))))
+            except Exception:  # damage
+                break
+            found.append((record.name, dict(record.metadata)))
+        place += length
+    return found
+
+
 def _indexed(descriptor: int, place: int, size: int) -> tuple[set[int], int]:
     """Return the channels in the index records from `place` on, and where these end."""
     numbers: set[int] = set()

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
-from plow_twin.record.chunks import ChunkReader, Messages
+from plow_twin.record.chunks import ChunkReader, Messages, metadata_records
 from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message
@@ -456,6 +456,9 @@ def read_header(path: Path) -> RunHeader | None:
 
     for _ in ChunkReader(path, on_metadata):
         break
+    if not found:  # ours stands before the first chunk; a program that has written the file anew may put it last
+        for name, record in metadata_records(path):
+            on_metadata(name, record)
     return found[0] if found else None
 
 

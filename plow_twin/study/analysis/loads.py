@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import tempfile
+import weakref
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -20,8 +23,8 @@ Array = NDArray[np.float64]
 CYCLE_BINS: Final = 16
 #: Length of a piece of the face [m].
 FACE_BIN_M: Final = 1.0
-#: Reversals of the force kept before they are counted.
-_MOST_REVERSALS: Final = 2_000_000
+#: Bytes of the reversals of one pair that are kept in memory: 131 072 of them, all others on the disk.
+_IN_MEMORY: Final = 2**20
 
 
 @dataclass
@@ -38,6 +41,27 @@ class Pass:
     impacts: int
     largest_force_n: float
     contact_loss_j: float
+
+
+class Series:
+    """A series of any length that is written once and read from its start as often as asked: on the disk when long."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
+        weakref.finalize(self, self._file.close)
+        self.low, self.high = math.inf, -math.inf
+
+    def __iter__(self) -> Iterator[float]:
+        """Yield the numbers; nothing may be added meanwhile."""
+        self._file.seek(0)
+        while block := self._file.read(_IN_MEMORY):
+            yield from np.frombuffer(block).tolist()
+
+    def add(self, values: Array) -> None:
+        """Add numbers, at least one, at the end."""
+        self._file.seek(0, 2)
+        self._file.write(values.astype(np.float64).tobytes())
+        self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
 
 
 @dataclass
@@ -59,7 +83,7 @@ class LoadTotals:
     _last: tuple[int, Array, Array, Array] | None = None
     _place_m: float = 0.0
     _direction: float = 0.0
-    _reversals: list[list[Array]] = field(default_factory=lambda: [[] for _ in range(PAIR_COUNT)])
+    _reversals: list[Series] = field(default_factory=lambda: [Series() for _ in range(PAIR_COUNT)])
 
     def restart(self) -> None:
         """Go on after a reset: what happened between two stamps across it counts for nothing."""
@@ -84,7 +108,7 @@ class LoadTotals:
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
             if turning.size > 1 or turning.any():
-                kept.append(turning)
+                kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
         self._face(walked, steps, loss)
@@ -138,11 +162,9 @@ class LoadTotals:
 
         found = {}
         for pair, kept in enumerate(self._reversals):
-            if not kept or self.largest[pair] <= 0.0:
-                continue
-            series = reversals(np.concatenate(kept))[:_MOST_REVERSALS]
-            counted = rainflow.count_cycles(series, nbins=CYCLE_BINS)
-            found[PAIR_NAMES[pair]] = [{"range_n": float(size), "count": float(count)} for size, count in counted]
+            if kept.high > kept.low:
+                bins = rainflow.count_cycles(kept, binsize=(kept.high - kept.low) / CYCLE_BINS)
+                found[PAIR_NAMES[pair]] = [{"range_n": float(size), "count": float(count)} for size, count in bins]
         return found
 
     def facts(self) -> dict[str, Any]:
