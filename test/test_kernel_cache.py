@@ -20,6 +20,14 @@ LINKED = (
     "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
     "(overload,) = modes.mode_inside.overloads.values(); print(len(list(overload.library.get_defined_functions())))"
 )
+#: How a kernel that Python calls holds the kernels that it calls: none of them is one that other code can be given.
+ENTRY = (
+    "from plow_twin import load_scene; from plow_twin.solve import compiled_scene, modes; "
+    "compiled_scene.compile_scene(load_scene('paper'), 1e-6).initial_state(); "
+    "(overload,) = modes.settle_modes.overloads.values(); "
+    "held = [function.linkage.name for function in overload.library.get_defined_functions()]; "
+    "print('internal' in held, 'linkonce_odr' in held)"
+)
 MISSES = (
     "import numpy as np; from plow_twin.model.contact import power_term; a = np.ones((1, 8)); "
     "power_term(a, a, 0, 0, 1.5, 0); print(sum(power_term.stats.cache_misses.values()))"
@@ -43,6 +51,11 @@ def test_an_index_of_other_sources_is_replaced_unread(tmp_path: Path) -> None:
 def test_a_kernel_that_only_kernels_call_has_no_machine_code(tmp_path: Path) -> None:
     """It would be compiled again in each caller: that took a third of the time."""
     assert run(tmp_path, LINKED) == "0"
+
+
+def test_what_an_entry_calls_is_its_own(tmp_path: Path) -> None:
+    """Bits would depend on which entry a process loads first, and on whether it compiles or finds them compiled."""
+    assert run(tmp_path, ENTRY) == "True False"
 
 
 def test_a_call_from_python_of_what_has_no_machine_code_says_so() -> None:

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numba
 
-from plow_twin.kernel.linked import LinkedCompiler, keep_from_python
+from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, keep_from_python
 
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
@@ -56,8 +56,7 @@ def kernel(
     else:
         options["forceinline"] = inline == "code"
         options["no_cpython_wrapper"], options["no_cfunc_wrapper"] = not entry, True
-        if not entry:
-            options["pipeline_class"] = LinkedCompiler
+        options["pipeline_class"] = EntryCompiler if entry else LinkedCompiler
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
@@ -67,7 +66,7 @@ def kernel(
             cache_file._source_stamp = SOURCE_DIGEST
             # read before the rest of an index, which cannot be read once a type that it names is gone
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
-            if "pipeline_class" in options:
+            if inline != "source" and not entry:
                 keep_from_python(dispatcher)
         compiled: Callable[..., Any] = dispatcher
         return compiled

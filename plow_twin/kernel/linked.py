@@ -45,28 +45,64 @@ def _declare(module: llvmlite.ir.Module, name: str) -> None:
     variable.linkage, variable.initializer = "common", llvmlite.ir.Constant(pointer, None)
 
 
-@register_pass(mutates_CFG=False, analysis_only=True)
-class _LowerForLinking(AnalysisPass):
-    _name = "lower_for_linking"
+class EntryLibrary(JITCodeLibrary):
+    """The code of a kernel that Python calls, with all that it calls for itself alone.
+
+    Otherwise the first entry loaded would lend its copies of them to the next: optimised for another caller, they may
+    differ in the last bit.
+    """
+
+    def _optimize_final_module(self) -> None:
+        super()._optimize_final_module()
+        for function in self._final_module.functions:
+            if function.linkage == llvm.Linkage.linkonce_odr and not function.is_declaration:
+                function.linkage = llvm.Linkage.internal
+
+
+class _ChooseLibrary(AnalysisPass):
+    library: type[JITCodeLibrary]
 
     def __init__(self) -> None:
         AnalysisPass.__init__(self)
 
     def run_pass(self, state: Any) -> bool:
-        state.library = LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
         state.library.enable_object_caching()
         return False
 
 
-class LinkedCompiler(CompilerBase):
-    """numba's compiler, but for the library that it lowers into."""
+@register_pass(mutates_CFG=False, analysis_only=True)
+class _LowerForLinking(_ChooseLibrary):
+    _name = "lower_for_linking"
+    library = LinkedLibrary
+
+
+@register_pass(mutates_CFG=False, analysis_only=True)
+class _LowerForPython(_ChooseLibrary):
+    _name = "lower_for_python"
+    library = EntryLibrary
+
+
+class _Compiler(CompilerBase):
+    choice: type[_ChooseLibrary]
 
     def define_pipelines(self) -> list[Any]:
-        """Give numba's passes, with the choice of the library before lowering."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_LowerForLinking, AnnotateTypes)
+        passes.add_pass_after(self.choice, AnnotateTypes)
         passes.finalize()
         return [passes]
+
+
+class LinkedCompiler(_Compiler):
+    """numba's compiler, but for the library that it lowers into: for what kernels call."""
+
+    choice = _LowerForLinking
+
+
+class EntryCompiler(_Compiler):
+    """numba's compiler, but for the library that it lowers into: for what Python calls."""
+
+    choice = _LowerForPython
 
 
 def keep_from_python(dispatcher: Any) -> None:
