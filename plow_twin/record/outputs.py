@@ -53,14 +53,10 @@ def publication_templates(frame_id: str, child_frame_id: str) -> dict[str, Templ
     def joints(values: Array) -> Message:
         return JointState(0, frame_id, PAIR_NAMES, *values.reshape(3, PAIR_COUNT))
 
-    def odometry(values: Array) -> Message:
-        x, y, z, w, vx, vy, omega = values.tolist()
-        return Odometry(0, frame_id, child_frame_id, (x, y, 0.0), (0.0, 0.0, z, w), (vx, vy, 0.0), (0.0, 0.0, omega))
-
     return {
         "contact_forces": Template.of(joints, 3 * PAIR_COUNT),
         "contact_peaks": Template.of(joints, 3 * PAIR_COUNT),
-        "head_state": Template.of(odometry, 7),
+        "head_state": Template.of(lambda numbers: _odometry(0, frame_id, child_frame_id, numbers), 7),
         "clearance": Template.of(
             lambda values: JointState(0, frame_id, CLEARANCE_NAMES, position=values), len(CLEARANCE_NAMES)
         ),
@@ -130,15 +126,12 @@ def contact_peaks(publication: Publication, frame_id: str) -> JointState:
 
 def head_state(publication: Publication, frame_id: str, child_frame_id: str) -> Odometry:
     """Return the head's pose in the slide's frame and its twist in the head's own axes, as Odometry asks."""
-    x, y, theta = publication.q.tolist()
-    vx, vy, omega = publication.v.tolist()
-    cos, sin = math.cos(theta), math.sin(theta)
-    return Odometry(
-        publication.stamp_ns,
-        frame_id,
-        child_frame_id,
-        position=(x, y, 0.0),
-        orientation=(0.0, 0.0, math.sin(0.5 * theta), math.cos(0.5 * theta)),
-        linear=(cos * vx + sin * vy, cos * vy - sin * vx, 0.0),
-        angular=(0.0, 0.0, omega),
-    )
+    numbers = np.empty((1, 7))
+    head_numbers(publication.q[None], publication.v[None], numbers)
+    return _odometry(publication.stamp_ns, frame_id, child_frame_id, numbers[0])
+
+
+def _odometry(stamp_ns: int, frame_id: str, child_frame_id: str, numbers: Array) -> Odometry:
+    """Return the message of what `head_numbers` writes."""
+    x, y, z, w, vx, vy, omega = numbers.tolist()
+    return Odometry(stamp_ns, frame_id, child_frame_id, (x, y, 0.0), (0.0, 0.0, z, w), (vx, vy, 0.0), (0.0, 0.0, omega))
