@@ -64,11 +64,6 @@ def publication_templates(frame_id: str, child_frame_id: str) -> dict[str, Templ
     }
 
 
-def quality_template(frame_id: str) -> Template:
-    """Return the template of `quality`."""
-    return Template.of(lambda values: JointState(0, frame_id, QUALITY_NAMES, position=values), len(QUALITY_NAMES))
-
-
 def publication_numbers(publications: Publications) -> dict[str, tuple[NDArray[np.int64], Array]]:
     """Return, by base name of the topic, stamps (n,) and numbers (n, k) of the messages of many publications."""
     stamps, slow = publications.stamp_ns, publications.stamp_ns[publications.slow_index]

@@ -18,7 +18,6 @@ from plow_twin.stream.intake import NS_PER_S
 Wrench = tuple[float, float, float]
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
-_STAMP: Final = struct.Struct("<iI")
 #: Stamp and length of the publication's name, then force and torque; big endian and little endian.
 _WRENCH_LAYOUTS: Final = tuple((struct.Struct(f"{order}iII"), struct.Struct(f"{order}6d")) for order in "><")
 
