@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 DISPLACEMENT: Final = 1e-7
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
+#: Earlier times from which growth is kept; every second one is dropped beyond.
+_MOST_KEPT: Final = 256
 #: Change of a parameter that is no length, in shares of it.
 _RELATIVE_CHANGE: Final = 1e-6
 #: A stretch does not end where some pair is nearer to its wall than so many displacements, unless so many in a row do.
@@ -155,6 +157,44 @@ class ChangedScene:
         return ChangedScene(path, compile_scene(changed, tol), change, ratio)
 
 
+class StretchProduct:
+    """What the fundamental matrices of one stretch of a motion after the other come to.
+
+    Parameters
+    ----------
+    size : int
+        Places and rates.
+    parameters : int
+        Parameters beside them.
+
+    Attributes
+    ----------
+    total : ndarray, shape (k, k)
+        Derivatives by the state at the beginning.
+    rows : ndarray, shape (p, k)
+        Derivatives by the parameters.
+    growth : float
+        Largest growth since any of the times that are kept, at least 1.
+    """
+
+    def __init__(self, size: int, parameters: int) -> None:
+        self.total, self.rows, self.growth = np.eye(size), np.zeros((parameters, size)), 1.0
+        self._since, self._basis = np.zeros((0, size, size)), np.eye(size)
+
+    def add(self, matrix: Array, changes: Array) -> Array:
+        """Go on by a stretch: `matrix` is its fundamental matrix, `changes` what the parameters did in it, (p, k).
+
+        Returns the logarithms of what it stretched a basis by, shape (k,).
+        """
+        self.total, self.rows = matrix @ self.total, self.rows @ matrix.T + changes
+        since = matrix @ np.concatenate([self._since, np.eye(len(matrix))[None]])
+        self.growth = max(1.0, float(np.linalg.norm(since, 2, axis=(1, 2)).max()))
+        self._since = since if len(since) < _MOST_KEPT else since[::2]
+        self._basis, upper = np.linalg.qr(matrix @ self._basis)
+        stretched: Array = np.log(np.maximum(np.abs(np.diag(upper)), 1e-300))
+        return stretched
+
+
 def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[str] = ()) -> Sensitivity:
     """Follow shadows of a scene's motion up to `t_end`.
 
@@ -184,29 +224,29 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
     scale, free = scale_of(compiled), free_places(scene)
     work, state, begin, merged = new_work(), compiled.initial_state(), 0.0, 0
-    size = len(free)
-    total, since, basis = np.eye(size), np.zeros((0, size, size)), np.eye(size)
-    times, growth, from_start, logs = [0.0], [1.0], [np.eye(size)], np.zeros(size)
-    by_parameter = [np.zeros((len(changed), size))]
+    product = StretchProduct(len(free), len(changed))
+    times, growth, from_start, logs = [0.0], [1.0], [product.total], np.zeros(len(free))
+    by_parameter = [product.rows]
     for end in _ends(t_end):
         after, reached, nearest = _follow(compiled, state, end, None, work)
         if nearest < CLEAR_OF_WALLS * DISPLACEMENT * scale[0] and merged < MOST_MERGED:
             merged += 1
             continue
         merged = 0
-        matrix = _derivatives(compiled, state, end, reached, free, scale, work)
-        total = matrix @ total
-        by_parameter.append(
-            by_parameter[-1] @ matrix.T + _parameter_rows(compiled, changed, state, end, reached, free, scale, work)
+        start = _follow(compiled, state, float(state.time), None, work)[1]
+        away = _displaced(compiled, state, end, start, free, scale, work) - reached
+        rows = _with_changed(changed, state, end, start, work) - reached
+        stretched = product.add(
+            (away[:, free] / scale[free] / DISPLACEMENT).T,
+            rows[:, free] / scale[free] / np.array([one.change for one in changed])[:, None],
         )
-        since = matrix @ np.concatenate([since, np.eye(size)[None]])
-        basis, upper = np.linalg.qr(matrix @ basis)
         if times[-1] >= 0.5 * t_end:
             begin = begin if begin > 0.0 else times[-1]
-            logs += np.log(np.maximum(np.abs(np.diag(upper)), 1e-300))
+            logs += stretched
         times.append(end)
-        growth.append(max(1.0, float(np.linalg.norm(since, 2, axis=(1, 2)).max())))
-        from_start.append(total * scale[free][:, None] / scale[free][None, :])
+        growth.append(product.growth)
+        from_start.append(product.total * scale[free][:, None] / scale[free][None, :])
+        by_parameter.append(product.rows)
         state = after
     exponent = float(logs.max()) / max(times[-1] - begin, 1e-300)
     rows = np.array(by_parameter) * scale[free]
@@ -235,46 +275,26 @@ def free_places(scene: Scene) -> NDArray[np.int64]:
     return np.array(places + [3 + index for index in places], dtype=np.int64)
 
 
-def _derivatives(
-    compiled: CompiledScene,
-    state: Any,
-    end: float,
-    reached: Array,
-    free: NDArray[np.int64],
-    scale: Array,
-    work: Work,
+def _displaced(
+    compiled: CompiledScene, state: Any, end: float, start: Array, free: NDArray[np.int64], scale: Array, work: Work
 ) -> Array:
-    """Return the derivatives of the scaled state at `end`, where it is `reached`, by the one at the start."""
-    start = _follow(compiled, state, float(state.time), None, work)[1]
-    columns = []
-    for index in free:
+    """Return pose and rate at `end` of shadows that are displaced from `start` by one free place or rate, (k, 6)."""
+    reached = np.empty((len(free), 6))
+    for row, index in zip(reached, free, strict=True):
         displaced = start.copy()
         displaced[index] += DISPLACEMENT * scale[index]
-        shadow = _follow(compiled, state, end, displaced, work)[1]
-        columns.append((shadow - reached)[free] / scale[free] / DISPLACEMENT)
-    return np.array(columns).T
+        row[:] = _follow(compiled, state, end, displaced, work)[1]
+    return reached
 
 
-def _parameter_rows(
-    compiled: CompiledScene,
-    changed: Sequence[ChangedScene],
-    state: Any,
-    end: float,
-    reached: Array,
-    free: NDArray[np.int64],
-    scale: Array,
-    work: Work,
-) -> Array:
-    """Return what each parameter does to the scaled state over one stretch, per its unit, shape (p, k)."""
-    rows = np.zeros((len(changed), len(free)))
-    if changed:
-        start = _follow(compiled, state, float(state.time), None, work)[1]
-    for index, one in enumerate(changed):
+def _with_changed(changed: Sequence[ChangedScene], state: Any, end: float, start: Array, work: Work) -> Array:
+    """Return pose and rate at `end` of shadows from `start` with one parameter changed, shape (p, 6)."""
+    reached = np.empty((len(changed), 6))
+    for row, one in zip(reached, changed, strict=True):
         begin = state.copy()
         begin["damping_factor"] *= one.damping
-        shadow = _follow(one.compiled, begin, end, start, work)[1]
-        rows[index] = (shadow - reached)[free] / scale[free] / one.change
-    return rows
+        row[:] = _follow(one.compiled, begin, end, start, work)[1]
+    return reached
 
 
 def _follow(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +17,7 @@ from plow_twin.run.sensitivity import (
     MOST_MERGED,
     SHADOW_TOLERANCE,
     ChangedScene,
+    StretchProduct,
     free_places,
     scale_of,
     sensitivity_parameters,
@@ -30,8 +30,6 @@ Array = NDArray[np.float64]
 
 #: Stretches begin anew after so many s, or sooner when a shadow is so many displacements away.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Earlier times from which growth is kept; every second one is dropped beyond.
-_MOST_KEPT: Final = 256
 
 
 class TwinSensitivity:
@@ -79,20 +77,26 @@ class TwinSensitivity:
         members = [scene] * (1 + size) + [one.compiled.scene for one in self._changed]
         self._shadows = TwinBatch(members, tol=SHADOW_TOLERANCE, start=twin.time)
         self.t = self._begin = twin.time
-        self._total, self._since, self._basis = np.eye(size), np.zeros((0, size, size)), np.eye(size)
-        self._logs, self._rows, self.growth, self._merged = np.zeros(size), np.zeros((len(parameters), size)), 1.0, 0
+        self._product, self._logs, self._merged = StretchProduct(size, len(parameters)), np.zeros(size), 0
         self._start()
 
     @property
     def from_start(self) -> Array:
         """Derivatives by the state at the beginning."""
         scale = self._scale[self._free]
-        return np.asarray(self._total * scale[:, None] / scale[None, :])
+        return np.asarray(self._product.total * scale[:, None] / scale[None, :])
 
     @property
     def by_parameter(self) -> dict[str, Array]:
         """Derivatives by the parameters."""
-        return {one.path: row * self._scale[self._free] for one, row in zip(self._changed, self._rows, strict=True)}
+        return {
+            one.path: row * self._scale[self._free] for one, row in zip(self._changed, self._product.rows, strict=True)
+        }
+
+    @property
+    def growth(self) -> float:
+        """Largest factor by which an error made before has grown."""
+        return self._product.growth
 
     @property
     def exponent(self) -> float:
@@ -137,15 +141,7 @@ class TwinSensitivity:
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
         """End a stretch: `matrix` is its fundamental matrix, `changes` what the parameters did in it, scaled."""
-        size = len(matrix)
-        self._total = matrix @ self._total
-        since = matrix @ np.concatenate([self._since, np.eye(size)[None]])
-        self.growth = max(1.0, float(np.linalg.norm(since, 2, axis=(1, 2)).max()))
-        self._since = since if len(since) < _MOST_KEPT else since[::2]
-        self._basis, upper = np.linalg.qr(matrix @ self._basis)
-        self._logs += np.log(np.maximum(np.abs(np.diag(upper)), 1e-300))
-        for index, one in enumerate(self._changed):
-            self._rows[index] = matrix @ self._rows[index] + changes[index] / one.change
+        self._logs += self._product.add(matrix, changes / np.array([one.change for one in self._changed])[:, None])
         self.t, self._merged = t, 0
         self._start()
 
