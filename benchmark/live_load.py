@@ -2,7 +2,8 @@
 
 `python benchmark/live_load.py [--seconds N] [--repeats N]` prints a line of JSON for each case, medians of the repeats,
 in each of which every case runs once, and then the targets with what was reached. `--minutes N` runs the node with its
-recorder at 1 kHz (or `--rate`) for so long instead, prints a line each ten seconds, and what has grown.
+recorder at 1 kHz (or `--rate`) for so long instead, prints a line each ten seconds, what has grown, and
+whether each message sent was used or counted.
 The machine is shared by publisher, node and subscriber: what is compared is the node and the echo in the same run.
 """
 
@@ -226,36 +227,53 @@ def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, f
         yield f"share of a core, 100 Hz out{how}", rows[case]["core"], 1.0 / 3.0
 
 
-def soak(minutes: float, rate_hz: float) -> None:
-    """Run the node with its recorder; print its size and figures, and what has grown in the last half."""
-    rows: list[dict[str, float]] = []
+def soak(minutes: float, rate_hz: float) -> bool:
+    """Run the node with its recorder; print its size and figures, what has grown in the last half, and the account.
+
+    True when each message that was sent was used, dropped for a reason or counted as lost.
+    """
+    rows: list[dict[str, float | None]] = []
     with tempfile.TemporaryDirectory() as folder, running(_twin("on_sample", f"{folder}/soak")) as (probe, process_id):
         sender, begin = source(rate_hz, 60.0 * minutes), time.monotonic()
         while sender.poll() is None:
             count, busy = len(probe.ages), _cpu_s(process_id)
             probe.spin(lambda: sender.poll() is not None, PERIOD_S)
             ages, figures = sorted(probe.ages[count:]), probe.figures
-            if not ages:
-                continue
             rows.append({
                 "minute": round((time.monotonic() - begin) / 60.0, 2),
                 "rss_mib": round(_status(process_id, "VmRSS") / 1024.0, 2),
                 "threads": _status(process_id, "Threads"),
                 "files": len(os.listdir(f"/proc/{process_id}/fd")),
                 "core": round((_cpu_s(process_id) - busy) / PERIOD_S, 3),
-                "age_p50_ms": round(ages[len(ages) // 2], 3),
-                "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+                "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else None,  # None: it stands still
+                "age_p99_ms": round(ages[len(ages) * 99 // 100], 3) if ages else None,
                 "queued": int(figures.get("queued") or 0),
-                "used": int(figures.get("samples_used", 0)),
-                "lost": int(figures.get("samples_lost", 0)),
+                **_account(figures),
             })  # fmt: skip
             print(json.dumps(rows[-1]), flush=True)
-            del probe.ages[:count]
+            probe.ages.clear()
+        probe.figures.clear()
+        probe.spin(lambda: "samples_used" in probe.figures, 10.0)
+        account = _account(probe.figures)
     later = rows[len(rows) // 2 :]
-    hours = (later[-1]["minute"] - later[0]["minute"]) / 60.0
+    hours = ((later[-1]["minute"] or 0.0) - (later[0]["minute"] or 0.0)) / 60.0
     for key in ("rss_mib", "threads", "files", "age_p50_ms", "queued"):
-        grown = later[-1][key] - later[0][key]
-        print(f"{key}: {later[0][key]:g} -> {later[-1][key]:g}, {grown / hours if hours else 0.0:.3g} an hour")
+        first, last = later[0][key], later[-1][key]
+        if first is not None and last is not None:
+            print(f"{key}: {first:g} -> {last:g}, {(last - first) / hours if hours else 0.0:.3g} an hour")
+    sent = round(rate_hz * 60.0 * minutes)
+    print(f"sent {sent}, {account}: {sent - sum(account.values())} not accounted for")
+    return sent == sum(account.values())
+
+
+def _account(figures: dict[str, str]) -> dict[str, int]:
+    """Return how many of the messages sent were used, dropped for a reason, and lost."""
+    dropped = sum(int(value) for key, value in figures.items() if key.startswith("dropped_"))
+    return {
+        "used": int(figures.get("samples_used", 0)),
+        "dropped": dropped,
+        "lost": int(figures.get("samples_lost", 0)),
+    }
 
 
 def _status(process_id: int, key: str) -> int:
@@ -279,9 +297,8 @@ def main() -> None:
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", "91")
     if options.minutes:
-        soak(options.minutes, options.rate)
-    else:
-        compare(options.seconds, options.repeats)
+        sys.exit(0 if soak(options.minutes, options.rate) else 1)
+    compare(options.seconds, options.repeats)
 
 
 if __name__ == "__main__":

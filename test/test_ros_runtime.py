@@ -187,16 +187,8 @@ def test_under_a_flood_of_samples_what_is_due_is_done_and_others_have_their_turn
     assert not errors and len(set(at)) == len(at) and at[-1] > 20
 
 
-def test_loss_is_counted_by_numbers_and_never_asked_of_the_middleware() -> None:
-    asked: list[Any] = []
+def test_loss_is_counted_by_the_publishers_numbers() -> None:
     with _node() as node:
-        create = node.create_subscription
-
-        def watched(*arguments: Any, **options: Any) -> Any:
-            asked.append(options.get("event_callbacks"))
-            return create(*arguments, **options)
-
-        node.create_subscription = watched  # type: ignore[method-assign]
         assert node.start()
         assert node._front is not None and node.runtime is not None
         subscriptions = node._front.subscriptions
@@ -204,8 +196,16 @@ def test_loss_is_counted_by_numbers_and_never_asked_of_the_middleware() -> None:
             batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
             subscriptions._counted("travel", subscriptions._travel_speeds, batch)
         assert node.runtime.inputs.lost == 1
-    # taking that event while a message is lost stops rmw_fastrtps for good
-    assert len(asked) == 5 and all(callbacks.message_lost is None for callbacks in asked)
+
+
+def test_the_middleware_is_asked_for_no_events() -> None:
+    with _node(estimate=True) as node:
+        assert node.start()
+        topics = [*node.publishers, *node.subscriptions, *node._front.subscriptions._taken_from.values()]  # type: ignore[union-attr]
+        names = {topic.topic_name.rpartition("/")[2] for topic in topics}
+        assert {"contact_forces", "excitation", "estimate", "status", "parameter_events"} <= names
+        # taking one while another arises stops rmw_fastrtps for good
+        assert [topic.topic_name for topic in topics if topic.event_handlers] == []
 
 
 def test_an_error_in_the_thread_of_the_inputs_ends_the_program_and_is_said() -> None:

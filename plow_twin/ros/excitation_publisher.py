@@ -27,7 +27,6 @@ from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from numpy.typing import NDArray
 from rclpy.duration import Duration
 from rclpy.executors import Executor
-from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -37,6 +36,7 @@ from plow_twin.live.cutting_load import CuttingLoad, Face
 from plow_twin.live.stop import StopRequested, StopSignals
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Clearance, Scene
+from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import set_stamp
 from plow_twin.ros.qos import LATCHED, sensor_input
@@ -75,7 +75,7 @@ class Plan:
     pose_every: int = 1
 
 
-class ExcitationPublisher(Node):
+class ExcitationPublisher(WithoutEvents):
     """Sends the samples of a plan."""
 
     def __init__(self, plan: Plan, stop: StopSignals, *, fast: bool) -> None:

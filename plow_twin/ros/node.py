@@ -23,6 +23,7 @@ from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Preparation, key
 from plow_twin.record import messages as plain
 from plow_twin.record import sending
+from plow_twin.ros.connections import LOOK_S, Connections, WithoutEvents
 from plow_twin.ros.front import RosFront
 from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
@@ -32,7 +33,7 @@ from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
 _SAY_AGAIN: Final = 5
 
 
-class TwinNode(LifecycleNode):
+class TwinNode(WithoutEvents, LifecycleNode):
     """The twin on ROS 2.
 
     Takes the keyword arguments of `rclpy.node.Node`, so that several can live in one process and executor. Code that
@@ -50,6 +51,7 @@ class TwinNode(LifecycleNode):
     ) -> None:
         super().__init__(node_name, automatically_declare_parameters_from_overrides=True, **options)
         self._stop_asked = stop_asked
+        self._connections = Connections(self)
         self._front: RosFront | None = None
         self.lifecycle = "unconfigured"
         #: why the last configure failed
@@ -65,7 +67,9 @@ class TwinNode(LifecycleNode):
         self._status = self.create_publisher(DiagnosticStatus, "status", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         # steady: reports go on when /clock is paused
-        self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._publish_diagnostics, clock=steady)
+        self.create_timer(LOOK_S, self._look_for_publishers, clock=steady)
         self._refuse_invalid_transitions()
         self._reports = 0
         self._publish_status()
@@ -217,12 +221,15 @@ class TwinNode(LifecycleNode):
             if self.runtime is not None:
                 self.runtime.record_status(status)
 
+    def _look_for_publishers(self) -> None:
+        if self._front is not None:
+            self._front.subscriptions.look()
+
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
             if self._front.error is not None:
                 raise self._front.error  # as from any callback: the program ends, and says why
-            with self._turn():
-                self._front.subscriptions.look_for_senders()
+            self._connections.look_for_subscribers(self.publishers)
         elif self.lifecycle == "unconfigured" and not self.reason:
             # a manager that configures later, perhaps another scene, need not wait for the compiler then
             self.prepare()

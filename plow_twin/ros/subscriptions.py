@@ -9,14 +9,15 @@ from functools import partial
 from typing import Any, Final
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped, WrenchStamped
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.messages import deviations, read_wrench, stamp_ns
@@ -46,18 +47,22 @@ class Subscriptions:
         Where samples go.
     loop, turns
         The thread that takes the messages, and what keeps it apart from the executor's.
-    on_matched
-        Called when the number of publishers of an input has changed.
+    on_changed
+        Called when the publishers of an input have changed.
     """
 
     def __init__(
-        self, node: Node, runtime: Runtime, loop: InputLoop, turns: Turns, on_matched: Callable[[], None]
+        self, node: Node, runtime: Runtime, loop: InputLoop, turns: Turns, on_changed: Callable[[], None]
     ) -> None:
         self._node, self._loop, self._turns = node, loop, turns
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
-        self._inputs.look_for_senders = self.look_for_senders
+        self._inputs.look_for_senders = self._look_for_senders
         self._on_samples = runtime.samples
-        self._on_matched = on_matched
+        self._on_changed = on_changed
+        self._connections = Connections(node)
+        self._taken_from: dict[str, Subscription] = {}
+        #: publishers of each input at the last look
+        self._found: dict[str, list[bytes]] = {}
         self._tool_forces = ToolForces(runtime.scene)
         self._source, depth = runtime.source, self._inputs.depth
         self._names: dict[tuple[str, bytes], str] = {}
@@ -73,16 +78,33 @@ class Subscriptions:
         self._subscribe(kind, "head_pose", _SLOW_DEPTH, partial(self._measured_poses, kind))
         self._subscribe(JointState, "gaps", _SLOW_DEPTH, self._measured_gaps)
 
-    def look_for_senders(self) -> None:
+    def look(self) -> None:
+        """Look who publishes the inputs; not in a turn, which the samples would have to wait for."""
+        found = {topic: self._connections.publishers(taken) for topic, taken in self._taken_from.items()}
+        present = {topic: self._noted(topic, publishers) for topic, (publishers, _) in found.items()}
+        refused = sum(count for _, count in found.values())
+        if present == self._found and not refused:
+            return
+        self._found = present
+        with self._turns:
+            self._inputs.refused_publishers += refused
+            self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
+            if self._source in present:
+                self._look_for_senders()  # anew: samples may have been taken since
+        self._on_changed()
+
+    def _look_for_senders(self) -> None:
         """Find out whether the followed publisher is still there."""
-        if self._source != "scene":
-            self._inputs.senders.alive(self._present(self._source))
+        self._inputs.senders.alive(self._present(self._source))
 
     def _present(self, topic: str) -> list[bytes]:
         """Return the publishers of an input that there are."""
-        found = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
-        present = [bytes(publisher.endpoint_gid) for publisher in found]
-        for gid, publisher in zip(present, found, strict=True):
+        return self._noted(topic, self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic)))
+
+    def _noted(self, topic: str, publishers: list[Any]) -> list[bytes]:
+        """Return the identities of publishers, and take note of their names."""
+        present = [bytes(publisher.endpoint_gid) for publisher in publishers]
+        for gid, publisher in zip(present, publishers, strict=True):
             space = publisher.node_namespace.rstrip("/")
             self._names[topic, gid] = f"{space}/{publisher.node_name} {gid.hex()}"
         return present
@@ -94,23 +116,17 @@ class Subscriptions:
         return self._names.setdefault((topic, sender), sender.hex())
 
     def _subscribe(self, kind: type, topic: str, depth: int, take: Callable[[list[Taken]], None]) -> None:
-        # no message_lost: rmw_fastrtps takes two locks in one order there, in the other where it notes a loss: a node
-        # that loses messages would stand still for good, the interpreter with it
-        events = SubscriptionEventCallbacks(
-            incompatible_qos=lambda event: self._incompatible(topic, event),
-            matched=lambda event: self._matched(topic, event),
-        )
         subscription = self._node.create_subscription(
             kind,
             topic,
             lambda message: None,  # the queue below takes the messages, with their publishers
             sensor_input(depth),
-            event_callbacks=events,
             qos_overriding_options=OVERRIDABLE,
             raw=True,
         )
         if topic == self._source:
             self._inputs.senders.start(self._present(topic))
+        self._taken_from[topic] = subscription
         self._loop.add(InputQueue(self._node, subscription, partial(self._counted, topic, take)))
 
     def _counted(self, topic: str, take: Callable[[list[Taken]], None], batch: list[Taken]) -> None:
@@ -131,20 +147,6 @@ class Subscriptions:
                     inputs.unused.note_lost(topic, message.sender, missed)
             following[key] = max(expected, message.number + 1)
         take(batch)
-
-    def _incompatible(self, topic: str, event: Any) -> None:
-        self._inputs.refused_publishers += event.total_count_change
-        self._node.get_logger().warning(
-            f"{topic}: nothing is received from a publisher of incompatible quality of service "
-            f"({event.last_policy_kind})"
-        )
-
-    def _matched(self, topic: str, event: Any) -> None:
-        with self._turns:
-            self._inputs.publishers[topic] = event.current_count
-            if topic == self._source:
-                self.look_for_senders()
-            self._on_matched()
 
     def _samples(self, topic: str, read: Callable[[bytes], _Read], batch: list[Taken]) -> None:
         """Take in what has been in the queue of the selected source."""

@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.cdr import schema_text
 from plow_twin.record.metadata_yaml import dump_yaml, offered
+from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.main import make_executor
@@ -153,7 +154,7 @@ def record_topics(
         return every and not hidden and not excluded and name not in left_out
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = Node("plow_twin_record", start_parameter_services=False, enable_rosout=False)
+    node = WithoutEvents("plow_twin_record", start_parameter_services=False, enable_rosout=False)
     writer = BagWriter(folder)
     try:
         recorder = TopicRecorder(node, writer, wanted)

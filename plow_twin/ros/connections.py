@@ -1,0 +1,104 @@
+"""Who is at the other end of a node's topics, looked up in the graph.
+
+The middleware has events for it. None is asked for: rmw_fastrtps takes two locks in one order where an event is taken
+or asked for and in the other where one arises (ros2/rmw_fastrtps#890), and a node that meets both at once stands still
+for good, the interpreter with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from rclpy.duration import Infinite
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.subscription import Subscription
+
+#: Looked up so often [s].
+LOOK_S: Final = 0.2
+
+
+class WithoutEvents(Node):
+    """A node that asks for no events of the middleware, neither for its own topics nor for those that rclpy makes."""
+
+    def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
+        """As rclpy's."""
+        events = PublisherEventCallbacks(use_default_callbacks=False)
+        return super().create_publisher(*arguments, **{"event_callbacks": events, **options})
+
+    def create_subscription(self, *arguments: Any, **options: Any) -> Subscription:
+        """As rclpy's."""
+        events = SubscriptionEventCallbacks(use_default_callbacks=False)
+        return super().create_subscription(*arguments, **{"event_callbacks": events, **options})
+
+
+class Connections:
+    """The other ends of a node's topics; one that cannot connect is said once.
+
+    Parameters
+    ----------
+    node
+        The node.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._said: set[tuple[str, bytes]] = set()
+
+    def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
+        """Return who publishes what a subscription can take, and how many that cannot connect are new."""
+        topic, found = subscription.topic_name, []
+        kind, refused = type_name(subscription.msg_type), 0
+        for publisher in self._node.get_publishers_info_by_topic(topic):
+            reason = _reason(publisher, kind, publisher.qos_profile, _in_full(subscription.qos_profile))
+            if not reason:
+                found.append(publisher)
+            elif self._say(topic, publisher, f"nothing is received from the publisher {publisher.node_name}: {reason}"):
+                refused += 1
+        return found, refused
+
+    def look_for_subscribers(self, publishers: Iterable[Publisher]) -> None:
+        """Say which subscribers of the node's own topics cannot connect."""
+        for publisher in publishers:
+            topic, kind = publisher.topic_name, type_name(publisher.msg_type)
+            for subscriber in self._node.get_subscriptions_info_by_topic(topic):
+                reason = _reason(subscriber, kind, _in_full(publisher.qos_profile), subscriber.qos_profile)
+                if reason:
+                    self._say(topic, subscriber, f"nothing goes to the subscriber {subscriber.node_name}: {reason}")
+
+    def _say(self, topic: str, other: Any, text: str) -> bool:
+        key = (topic, bytes(other.endpoint_gid))
+        if key in self._said:
+            return False
+        self._said.add(key)
+        self._node.get_logger().warning(f"{topic}: {text}")
+        return True
+
+
+def type_name(message_class: Any) -> str:
+    """Return the name of a message type, as the graph has it."""
+    package, folder = message_class.__module__.split(".")[:2]
+    return f"{package}/{folder}/{message_class.__name__}"
+
+
+def _in_full(own: QoSProfile) -> QoSProfile:
+    """Return a profile of the node's own, as it was asked for, with what is understood as the graph has it."""
+    return QoSProfile(
+        depth=own.depth,
+        reliability=own.reliability,
+        durability=own.durability,
+        deadline=Infinite,
+        liveliness=LivelinessPolicy.AUTOMATIC,
+        liveliness_lease_duration=Infinite,
+    )
+
+
+def _reason(other: Any, kind: str, offered: Any, asked: Any) -> str:
+    """Return why a publisher and a subscriber do not connect; empty: they do."""
+    if other.topic_type != kind:
+        return f"type: got {other.topic_type}, expected {kind}"
+    compatibility, reason = qos_check_compatible(offered, asked)
+    return f"incompatible quality of service: {reason}" if compatibility == QoSCompatibility.ERROR else ""
