@@ -69,7 +69,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "gaps_used": "measurements of gaps used",
         "gaps_dropped": "measurements of gaps dropped",
         "head_pose_residual": "model minus newest measured pose: x, y [m], theta [rad]; empty without one",
-        "refused_publishers": "publishers of incompatible quality of service",
+        "refused_publishers": "publishers that cannot connect: quality of service or type is incompatible",
     },
     "output": {
         "published": "messages on contact_forces",
