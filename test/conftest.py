@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import shutil
+import signal
 import tempfile
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -25,6 +26,8 @@ def _prepare_environment() -> None:
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
+    # a suite that a shell started in the background would ignore Ctrl-C, and with it the tests that press it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 _prepare_environment()

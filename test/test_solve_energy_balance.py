@@ -31,7 +31,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_the_balance_balance(name: str) -> None:
+def test_the_energy_balances(name: str) -> None:
     balance = simulate(SCENES[name], 5.0, energy_balance=True).energy_balance
     assert balance is not None
     assert balance.relative_imbalance < 1e-11

@@ -53,7 +53,7 @@ def test_a_push_above_the_limit_accelerates_it_by_what_is_left() -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", "bench_hc"])
-def test_both_solvers_agree_and_the_books_balance(name: str) -> None:
+def test_both_solvers_agree_and_the_energy_balances(name: str) -> None:
     scene = replace(preset(name), friction=Friction(0.3, 0.02))
     events = simulate(scene, 2.0, output_dt=0.1, energy_balance=True)
     steps = simulate(scene, 2.0, output_dt=0.1, method="rk4", dt=1e-5)

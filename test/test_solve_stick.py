@@ -165,7 +165,7 @@ def test_a_load_below_the_limit_is_held_without_creep() -> None:
 
 
 @pytest.mark.parametrize("name", ["paper", pytest.param("bench_hc", marks=pytest.mark.stress)])
-def test_fixed_steps_come_to_the_same_motion_and_the_books_balance(name: str) -> None:
+def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) -> None:
     friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5, static_coefficient=0.3)
     scene = replace(preset(name), friction=friction)
     events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
