@@ -44,6 +44,7 @@ pytestmark = [pytest.mark.stress, pytest.mark.timeout(600)]
 
 T0 = 1_795_000_000_000_000_000
 MS = 1_000_000
+ROOT = Path(__file__).resolve().parent.parent
 RELIABLE_INPUT = {"qos_overrides.{ns}/excitation.subscription.reliability": "reliable"}
 
 
@@ -111,7 +112,9 @@ def test_a_node_that_is_stopped_counts_what_overran_its_queue_and_goes_on(tmp_pa
 
 
 def test_outputs_come_in_time_while_samples_come_ten_times_as_fast(tmp_path: Path) -> None:
-    with bench(tmp_path, publish_mode="fixed_rate", publish_rate=100.0, input_depth=20000) as running:
+    # reliable: what a best-effort reader loses at the very end would never be known
+    settings = {"publish_mode": "fixed_rate", "publish_rate": 100.0, "input_depth": 20000}
+    with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
         publisher = running.publisher("--rate", "10000", "--seconds", "5")
         _until_accounted(running, _sent(publisher))
         # an executor that looked at its timers only when nothing waited sent 23 of the 500 that were due
@@ -448,3 +451,15 @@ def test_two_twins_in_one_process_do_not_disturb_each_other() -> None:
             executor.remove_node(node)
             node.release()
             node.destroy_node()
+
+
+def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_nothing() -> None:
+    command = [sys.executable, str(ROOT / "benchmark" / "live_load.py"), "--minutes", "2", "--rate", "500"]
+    environment = os.environ | {"ROS_DOMAIN_ID": "97"}  # reports of other nodes are not its
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=400.0)
+    rows = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    assert len(rows) >= 10 and all(row["age_p50_ms"] is not None for row in rows[1:-1])
+    first, last = rows[2], rows[-1]
+    assert (last["threads"], last["files"]) == (first["threads"], first["files"])
+    assert last["rss_mib"] - first["rss_mib"] < 4.0

@@ -127,7 +127,10 @@ def test_at_a_fixed_rate_the_latency_includes_the_wait_for_the_publication(tmp_p
         forces = running.probe.listen(JointState, "contact_forces")
         running.probe.excitation()(T0, (1.0, 2.0, 3.0))
         running.probe.until(lambda: forces, "a frame")
-        assert float(running.probe.figures("output")["latency_max_ms"]) > 0.0
+        found = running.probe.figures("output")
+        assert float(found["latency_max_ms"]) > 0.0
+        running.probe.until_figure("output", "periods_missed", "0", "1", "2", "3")
+        running.probe.until(lambda: running.probe.figures("output")["period_mean_ms"] != "", "a period")
 
 
 @pytest.mark.parametrize(
@@ -514,7 +517,16 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
         probe.until(lambda: clock.publish(message) or len(forces) == 200, "200 answers")
         for _ in range(2):
             assert probe.figures("input")["holds"] == "0"
-        assert value(probe.status[-1], "stream") == "running"
+        probe.until(lambda: value(probe.status[-1], "clock") == "paused", "the clock stands still")
+        assert value(probe.status[-1], "stream") == "running" and probe.status[-1].level == b"\x00"
+        assert "/clock is paused" in probe.status[-1].message
+
+        def tick() -> bool:
+            message.clock.nanosec += MS
+            clock.publish(message)
+            return value(probe.status[-1], "clock") == "running"
+
+        probe.until(tick, "the clock goes on")
         assert running.twin.stop() == 0
     report = replay(run)
     assert (report.exit_code, report.samples) == (0, 200)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plow_twin.stream.health import DurationHistogram, RealTimeFactor
+from plow_twin.stream.health import DurationHistogram, Periods, RealTimeFactor
 
 
 @given(st.lists(st.floats(2e-6, 90.0), min_size=1, max_size=300), st.sampled_from((0.5, 0.9, 0.99, 1.0)))
@@ -41,3 +41,16 @@ def test_real_time_factor_is_model_time_over_wall_time() -> None:
     assert factor.recent(20_000_000_000) == pytest.approx(1.5)
     factor.advanced(1.0, 21_000_000_000)
     assert factor.recent(22_000_000_000) == pytest.approx(0.5)
+
+
+def test_periods_left_out_are_counted_and_the_others_described_since_the_last_look() -> None:
+    periods = Periods(0.01)
+    for now_s in (1.0, 1.011, 1.02, 1.051, 1.06):  # the one at 1.05 comes after two have been left out
+        periods.turn(now_s)
+    mean, deviation, largest = periods.recent()
+    passed = np.array([0.011, 0.009, 0.031, 0.009])
+    assert (mean, deviation, largest) == pytest.approx((passed.mean(), passed.std(), 0.031))
+    assert periods.missed == 2 and np.isnan(periods.recent()).all()
+    periods.begin()
+    periods.turn(7.0)  # a time spent inactive is no period
+    assert periods.missed == 2 and np.isnan(periods.recent()).all()

@@ -62,12 +62,13 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "holds": "advances under the hold policy",
         "travel_used": "speeds along the face used",
         "travel_dropped": "speeds along the face dropped",
-        "travel_implausible": "of these, larger than limit_travel",
+        "travel_implausible": "of these, larger than limit_travel, or changed faster than it can",
         "head_pose_used": "measured poses used",
         "head_pose_dropped": "measured poses dropped",
-        "head_pose_implausible": "of these, larger than limit_pose",
+        "head_pose_implausible": "of these, larger than limit_pose, or changed faster than it can",
         "gaps_used": "measurements of gaps used",
         "gaps_dropped": "measurements of gaps dropped",
+        "gaps_implausible": "of these, larger than limit_gap, or changed faster than it can",
         "head_pose_residual": "model minus newest measured pose: x, y [m], theta [rad]; empty without one",
         "refused_publishers": "publishers that cannot connect: quality of service or type is incompatible",
     },
@@ -83,6 +84,10 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "age_p99_ms": "the same, 99 % [ms]",
         "recent_latency_p99_ms": "reception to publication since the last report, 99 % [ms]; empty: none",
         "recent_age_p99_ms": "system time minus stamp when published since the last report, 99 % [ms]",
+        "periods_missed": "periods of publish_rate or step_rate left out, the phase kept; empty: samples set the pace",
+        "period_mean_ms": "time between two turns since the last report, mean [ms]; empty: none",
+        "period_deviation_ms": "the same, standard deviation [ms]",
+        "period_max_ms": "the same, largest [ms]",
     },
     "estimate": {
         "estimates": "estimates that have come since configure; empty: none are made",
@@ -107,6 +112,7 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "lifecycle": "unconfigured, inactive, active or finalized",
     "stream": "waiting, running, stale, ended or failed",
     "stale_inputs": "inputs that have gone silent, separated by commas",
+    "clock": "running, or under use_sim_time waiting for the first message on /clock, or paused",
     "recorder": "off, recording, or trouble: something was lost or it has stopped",
     "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated, not_observable or "
     "withdrawn",
@@ -151,6 +157,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     stale = ["excitation"] if state in (StreamState.STALE, StreamState.ENDED) else []
     stale += runtime.inputs.silent()
     values["stale_inputs"] = ",".join(stale)
+    values["clock"] = runtime.clock
     values["recorder"] = runtime.recorder_state
     values |= dict.fromkeys(("horizontal", "vertical", "pads"), "prior")
     estimation = runtime.estimation
@@ -171,6 +178,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
             estimation is not None and bool(estimation.reasons),
             "; ".join(estimation.reasons if estimation else ()),
         ),
+        (OK, runtime.clock == "paused", "/clock is paused"),
         (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
         (WARN, runtime.inputs.other_sender, "another publisher sends too and is not followed"),
         (WARN, bool(runtime.inputs.silent()), f"silent: {', '.join(runtime.inputs.silent())}"),
@@ -247,6 +255,7 @@ class Health:
             "head_pose_used": str(inputs.head_pose.used),
             "gaps_used": str(inputs.gaps.used),
             "gaps_dropped": str(inputs.gaps.arrived - inputs.gaps.used),
+            "gaps_implausible": str(inputs.gaps.counts[Verdict.IMPLAUSIBLE]),
             "head_pose_dropped": str(inputs.head_pose.arrived - inputs.head_pose.used),
             "head_pose_residual": "" if residual is None else "{:.6g} {:.6g} {:.6g}".format(*residual),
             "refused_publishers": str(inputs.refused_publishers),
@@ -281,8 +290,22 @@ class Health:
             "recent_latency_p99_ms": _ms(latency.recent(0.99)),
             "recent_age_p99_ms": _ms(age.recent(0.99)),
         }
-        grown = self._grown({"withheld": runtime.withheld}, ("withheld",))
-        return (ERROR if grown else OK), "; ".join(grown) or "publishing", values
+        missed = self._note_periods(runtime, values)
+        if self._grown({"withheld": runtime.withheld}, ("withheld",)):
+            return ERROR, "withheld", values
+        return (WARN if missed else OK), missed or "publishing", values
+
+    def _note_periods(self, runtime: Runtime, values: dict[str, str]) -> str:
+        """Add what is known of the loop's periods to `values`; return what is wrong with them, if anything."""
+        keys = ("periods_missed", "period_mean_ms", "period_deviation_ms", "period_max_ms")
+        values |= dict.fromkeys(keys, "")
+        if runtime.periods is None:
+            return ""
+        missed, before = runtime.periods.missed, self._before.get("periods_missed", 0)
+        self._before["periods_missed"] = missed
+        values |= zip(keys, (str(missed), *map(_ms, runtime.periods.recent())), strict=True)
+        new = missed - before
+        return f"{new} periods left out since the last report" if 0 < runtime.missed_periods <= new else ""
 
     def estimate(self, runtime: Runtime) -> Part:
         """Return how the estimate is doing."""

@@ -80,16 +80,19 @@ class Inputs:
             judge.on_unused = self._sample_unused if judge is intake else self._unused
         self._on_gaps = on_gaps
         self._gap_stamps = RecentStamps(pose_span_s)
+        self._gap_limits: Limits | None = None
+        #: newest stamp [ns] and gap [m] of each pair
+        self._newest_gaps: dict[int, tuple[int, float]] = {}
+        self._newest_pose = (0.0, 0.0, 0.0)
         #: newest measured pose x, y [m], theta [rad]
         self.measured: tuple[float, float, float] | None = None
         self.refused_publishers = 0
         #: senders that each input is connected to
         self.publishers = dict.fromkeys(TOPICS, 0)
 
-    def set_limits(self, travel_m_s: float, pose_m: float) -> None:
-        """Set the largest speed along the face [m/s] and the largest displacement of the head [m] that are used."""
-        self.travel.limits = Limits((travel_m_s,), (math.inf,))
-        self.head_pose.limits = Limits((pose_m, pose_m, math.pi), (math.inf,) * 3)
+    def set_limits(self, travel: Limits, pose: Limits, gap: Limits) -> None:
+        """Set what is used of speeds along the face [m/s], of poses (x, y [m], theta [rad]) and of gaps [m]."""
+        self.travel.limits, self.head_pose.limits, self._gap_limits = travel, pose, gap
 
     @property
     def other_sender(self) -> bool:
@@ -141,12 +144,14 @@ class Inputs:
         """
         missing = [math.isnan(value) for value in pose]
         # what was not measured breaks no limit
-        judged = pose if all(missing) else tuple(0.0 if math.isnan(value) else value for value in pose)
+        judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if not verdict.used:
             return
-        if verdict is not Verdict.WORKED_IN and not any(missing):
-            self.measured = pose
+        if verdict is not Verdict.WORKED_IN:
+            self._newest_pose = judged
+            if not any(missing):
+                self.measured = pose
         if self._on_pose is not None and self._poses is not None:
             if verdict.resets:
                 self._poses.clear()
@@ -155,12 +160,30 @@ class Inputs:
 
     def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
         """Take in measured gaps [m] by number of their pairs."""
-        verdict = self._judged("gaps", self.gaps, stamp_ns, tuple(gaps.values()), self._gap_stamps)
+        values = tuple(gaps.values())
+        if self.active and self._is_implausible(stamp_ns, gaps):
+            self.gaps.refuse(Verdict.IMPLAUSIBLE, stamp_ns, values)
+            return
+        verdict = self._judged("gaps", self.gaps, stamp_ns, values, self._gap_stamps)
         if verdict.used:
             if verdict.resets:
                 self._gap_stamps.clear()
             self._gap_stamps.add(stamp_ns)
+            if verdict is not Verdict.WORKED_IN:
+                self._newest_gaps |= {pair: (stamp_ns, gap) for pair, gap in gaps.items()}
             self._on_gaps(stamp_ns, gaps)
+
+    def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
+        """Tell whether a gap is larger than it can be, or has changed faster since the newest one of its pair."""
+        limits = self._gap_limits
+        if limits is None or not all(map(math.isfinite, gaps.values())):
+            return False  # what is no number has a reason of its own
+        for pair, gap in gaps.items():
+            before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
+            passed_s = (stamp_ns - before_ns) * 1e-9
+            if limits.exceeded((gap,)) or (passed_s > 0.0 and limits.too_fast((before,), (gap,), passed_s)):
+                return True
+        return False
 
     def _judged(
         self, topic: str, intake: Intake, stamp_ns: int, values: tuple[float, ...], history: RecentStamps | None = None
@@ -190,3 +213,9 @@ class Inputs:
         x, y, theta = (float(model) - data for model, data in zip(q, self.measured, strict=True))
         # a quaternion and its negative are the same turn
         return x, y, math.remainder(theta, 2.0 * math.pi)
+
+
+def _filled(pose: tuple[float, float, float], newest: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return a pose with the components that were not measured as in the newest one."""
+    x, y, theta = (before if math.isnan(value) else value for value, before in zip(pose, newest, strict=True))
+    return x, y, theta

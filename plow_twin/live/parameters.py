@@ -95,6 +95,14 @@ class Settings:
         "publish after each sample used, or at publish_rate; in both the stamp is that of the newest sample used",
     )
     publish_rate: float = _number(100.0, "Hz", 0.1, 1000.0, Effect.CONFIGURE, "rate of publish_mode fixed_rate")
+    missed_periods: int = _number(
+        1,
+        "periods",
+        0,
+        1000000,
+        Effect.NOW,
+        "periods of publish_rate or step_rate left out between two reports from which on there is a warning; 0: none",
+    )
     step_rate: float = _number(
         100.0, "Hz", 1.0, 1000.0, Effect.CONFIGURE, "rate of advances under the scene's own loads and the hold policy"
     )
@@ -215,7 +223,21 @@ class Settings:
         0.0, "N m/s", 0.0, 1e300, Effect.NOW, "fastest change of the moment; 0: limit_moment in a millisecond"
     )
     limit_travel: float = _number(10.0, "m/s", 0.0, 1000.0, Effect.NOW, "largest speed along the face that is used")
-    limit_pose: float = _number(1.0, "m", 0.0, 1000.0, Effect.NOW, "largest measured displacement that is used")
+    limit_travel_rate: float = _number(
+        0.0, "m/s^2", 0.0, 1e300, Effect.NOW, "fastest change of that speed; 0: limit_travel in a millisecond"
+    )
+    limit_pose: float = _number(
+        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest measured displacement that is used; 0: half the frame's larger side"
+    )
+    limit_pose_rate: float = _number(
+        0.0, "m/s", 0.0, 1e300, Effect.NOW, "fastest change of a displacement; 0: limit_pose in a millisecond"
+    )
+    limit_gap: float = _number(
+        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest measured gap that is used; 0: half the frame's larger side"
+    )
+    limit_gap_rate: float = _number(
+        0.0, "m/s", 0.0, 1e300, Effect.NOW, "fastest change of a gap; 0: limit_gap in a millisecond"
+    )
     set_wear: tuple[float, ...] = _list(
         (0.0,) * 8,
         "m",

@@ -29,10 +29,10 @@ from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.record.outputs import quality
 from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
-from plow_twin.stream.health import DurationHistogram
+from plow_twin.stream.health import DurationHistogram, Periods
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Snapshot
-from plow_twin.stream.limits import Limits, excitation_limits
+from plow_twin.stream.limits import Limits, excitation_limits, pose_limits, value_limits
 from plow_twin.stream.model_changes import changed_twin
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
@@ -127,6 +127,11 @@ class Runtime:
         self.compile_s = prepared.compile_s
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
+        #: turns of the loop that publishes at a fixed rate, or else follows the clock; None: samples set the pace
+        self.periods = _periods(settings)
+        #: why time stands still, where it does: `waiting` for the first `/clock`, or `paused`
+        self.clock = "running"
+        self._clock_before_ns = 0
         #: publications, and those that were not published because a number was not finite
         self.published = self.withheld = 0
         #: frames computed without a sample, and frames after late samples have been worked in
@@ -171,13 +176,14 @@ class Runtime:
             self._gaps,
         )
         self.inputs.without_clock = lambda: self._start_due and self.without_clock
-        self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
+        self._set_limits(settings)
         if self.recording:
             self.inputs.unused.journal = session.emit
 
     def start(self) -> None:
         """Open the journal; nothing of the front can fail any more. Without a clock the first sample opens it."""
         self._start_due = self.without_clock
+        self.clock = "waiting" if self._start_due else "running"
         if not self._start_due:
             self.driver.session.start()
             self.driver.set_model(self._stamp_ns(), model_changes(self._settings))
@@ -247,6 +253,19 @@ class Runtime:
         end_ns = self.estimation.end_ns if self.estimation else None
         return None if end_ns is None else (self._front.now_ns() - end_ns) * 1e-9
 
+    def look_at_clock(self) -> None:
+        """Find out whether the time of the samples goes on; called at intervals."""
+        now_ns = self._front.now_ns()
+        if self._front.follows_samples:
+            stands = now_ns == self._clock_before_ns
+            self.clock = "waiting" if now_ns == 0 else "paused" if stands else "running"
+        self._clock_before_ns = now_ns
+
+    @property
+    def missed_periods(self) -> int:
+        """Periods left out between two reports from which on there is a warning; 0: none."""
+        return self._settings.missed_periods
+
     def mark(self, text: str = "") -> tuple[bool, str]:
         """Put a text, by default the parameter `mark`, into the journal and have the ring written, if there is one."""
         self.driver.mark(self._stamp_ns(), text or self._settings.mark or "service")
@@ -266,6 +285,8 @@ class Runtime:
     def activate(self) -> None:
         """Start taking samples."""
         self.driver.resume(time.monotonic_ns())
+        if self.periods:
+            self.periods.begin()
         self.inputs.active = True
 
     def deactivate(self) -> None:
@@ -316,7 +337,7 @@ class Runtime:
         self._settings = settings
         self.driver.policy = policy(settings)
         self.driver.intake.limits = limits(settings, self.scene)
-        self.inputs.set_limits(settings.limit_travel, settings.limit_pose)
+        self._set_limits(settings)
         for intake in (self.driver.intake, self.driver.clock):
             intake.jump_back_s, intake.jump_forward_s = settings.jump_back, settings.jump_forward
         if self._start_due:
@@ -326,6 +347,15 @@ class Runtime:
             self._front.changed()
         elif not isinstance(value, tuple):  # a list acts through the service that takes it, and its entry
             self.driver.parameter(name, value)
+
+    def _set_limits(self, settings: Settings) -> None:
+        """Set what of the inputs besides the load is plausible."""
+        pose = pose_limits(self.scene, settings.limit_pose, settings.limit_pose_rate)
+        self.inputs.set_limits(
+            value_limits(settings.limit_travel, settings.limit_travel_rate),
+            pose,
+            value_limits(settings.limit_gap or pose_limits(self.scene).largest[0], settings.limit_gap_rate),
+        )
 
     def samples(self, arrived: list[Arrival]) -> None:
         """Take samples in order of arrival."""
@@ -357,6 +387,8 @@ class Runtime:
 
     def clock_tick(self) -> None:
         """Go on under the scene's own loads."""
+        if self.periods and self._settings.publish_mode != "fixed_rate":
+            self.periods.turn(time.monotonic())
         if self._start_due:
             self.start()
             if self._start_due:
@@ -367,6 +399,8 @@ class Runtime:
 
     def publish_due(self) -> None:
         """Publish all since the last publication."""
+        if self.periods:
+            self.periods.turn(time.monotonic())
         self._publish(self.driver.due())
 
     def reset(self) -> tuple[bool, str]:
@@ -558,6 +592,12 @@ class Runtime:
     def _forces_sent(self) -> None:
         if self._received_ns:
             self.latency.add((time.monotonic_ns() - self._received_ns) * 1e-9)
+
+
+def _periods(settings: Settings) -> Periods | None:
+    if settings.publish_mode == "fixed_rate":
+        return Periods(1.0 / settings.publish_rate)
+    return Periods(1.0 / settings.step_rate) if settings.excitation_source == "scene" else None
 
 
 def policy(settings: Settings) -> Policy:

@@ -240,6 +240,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
             )
         self._reports += 1
         with self._turn():
+            if runtime is not None:
+                runtime.look_at_clock()
             parts = self._health.parts(self.lifecycle, self.reason, self.runtime, time.monotonic_ns())
         array = DiagnosticArray()
         array.header.stamp = self.get_clock().now().to_msg()

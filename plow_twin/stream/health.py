@@ -57,6 +57,39 @@ class DurationHistogram:
         return min(self.largest_s, float(_LOWEST_S * 10.0 ** ((index + 0.5) / _BINS_PER_DECADE)))
 
 
+class Periods:
+    """Times between the turns of a loop: how they scatter, and how many whole periods were left out.
+
+    Parameters
+    ----------
+    period_s
+        What the loop is to keep [s].
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        #: periods left out so far
+        self.missed = 0
+        self._before_s = math.nan
+        self._recent: list[float] = []
+
+    def begin(self) -> None:
+        """Begin anew: the next turn follows none."""
+        self._before_s = math.nan
+
+    def turn(self, now_s: float) -> None:
+        """Take note of a turn at the steady time `now_s` [s]."""
+        passed_s, self._before_s = now_s - self._before_s, now_s
+        if passed_s >= 0.0:
+            self._recent.append(passed_s)
+            self.missed += max(0, round(passed_s / self._period_s) - 1)
+
+    def recent(self) -> tuple[float, float, float]:
+        """Return mean, standard deviation and largest time [s] since the last call; NaN without one."""
+        found, self._recent = np.array(self._recent), []
+        return (float(found.mean()), float(found.std()), float(found.max())) if found.size else (math.nan,) * 3
+
+
 class RealTimeFactor:
     """Model seconds advanced per wall second, since the start and since the last reading."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import gt, sub
@@ -34,6 +35,22 @@ class Limits:
         """Tell whether a value has changed faster than it can."""
         most = [fastest * duration_s for fastest in self.fastest]
         return any(map(gt, map(abs, map(sub, values, before)), most))
+
+
+def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:
+    """Return the limits of x, y [m] and theta [rad] of a measured pose and of their rates; 0: derived from the scene.
+
+    Derived are half the larger side of the frame, which no head in it reaches, and that much within a millisecond; an
+    angle may be half a turn, and change as fast.
+    """
+    displacement = displacement or 0.5 * max(scene.frame.width_m, scene.frame.height_m)
+    rate = rate or displacement / _SHORTEST_S
+    return Limits((displacement, displacement, math.pi), (rate, rate, math.pi / _SHORTEST_S))
+
+
+def value_limits(largest: float, rate: float = 0.0) -> Limits:
+    """Return the limits of one number and of its rate; 0: that much within a millisecond."""
+    return Limits((largest,), (rate or largest / _SHORTEST_S,))
 
 
 def excitation_limits(
