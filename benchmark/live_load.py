@@ -19,6 +19,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
@@ -29,26 +30,31 @@ PERIOD_S = 10.0
 
 
 class Case(NamedTuple):
-    """Publish mode of the node, or `echo`; rate of the samples [Hz]; whether it records."""
+    """Publish mode of the node, or `echo` or `raw_echo`; rate of the samples [Hz]; whether it records."""
 
     mode: str
     rate_hz: float
     recorded: bool = False
 
 
-ECHO = Case("echo", 1000)
+ECHO, RAW_ECHO = Case("echo", 1000), Case("raw_echo", 1000)
 ON_SAMPLE, RECORDED = Case("on_sample", 1000), Case("on_sample", 1000, True)
 FIXED, FIXED_RECORDED = Case("fixed_rate", 1000), Case("fixed_rate", 1000, True)
-CASES = (ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed_rate", 10000))
+CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed_rate", 10000))
 
 
-def echo() -> None:
-    """Answer each sample with three messages of the sizes that the node sends, and nothing else."""
+def echo(raw: bool = False) -> None:
+    """Answer each sample with three messages of the sizes that the node sends, and nothing else.
+
+    `raw`: with bytes that were serialised before, but for the stamp, that of the sample: the least that
+    any node in rclpy does.
+    """
     import rclpy
     from geometry_msgs.msg import WrenchStamped
     from nav_msgs.msg import Odometry
     from rclpy.experimental.events_executor import EventsExecutor
     from rclpy.qos import QoSProfile, ReliabilityPolicy
+    from rclpy.serialization import serialize_message
     from sensor_msgs.msg import JointState
 
     rclpy.init()
@@ -64,8 +70,16 @@ def echo() -> None:
             reply.header.stamp = message.header.stamp
             publisher.publish(reply)
 
+    ready = [(publisher, bytearray(serialize_message(reply))) for publisher, reply in sent]
+
+    def answer_raw(data: bytes) -> None:
+        for publisher, reply in ready:
+            reply[4:12] = data[4:12]
+            publisher.publish(bytes(reply))
+
     profile = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-    node.create_subscription(WrenchStamped, "/live_load/excitation", answer, profile)
+    how = answer_raw if raw else answer
+    node.create_subscription(WrenchStamped, "/live_load/excitation", how, profile, raw=raw)
     executor = EventsExecutor()
     executor.add_node(node)
     while True:
@@ -205,8 +219,8 @@ def compare(seconds: float, repeats: int) -> None:
         for repeat in range(repeats):
             for number, case in enumerate(CASES):
                 path = f"{folder}/{number}_{repeat}" if case.recorded else ""
-                answerer = [sys.executable, __file__, "--role", "echo"]
-                command = answerer if case is ECHO else _twin(case.mode, path)
+                answerer = [sys.executable, __file__, "--role", case.mode]
+                command = answerer if case in (ECHO, RAW_ECHO) else _twin(case.mode, path)
                 runs[case].append(measure(command, case.rate_hz, seconds))
     rows = {case: {key: median(run[key] for run in found) for key in found[0]} for case, found in runs.items()}
     for case, row in rows.items():
@@ -292,7 +306,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.role:
         role, *numbers = options.role
-        {"echo": echo, "send": send}[role](*map(float, numbers))
+        {"echo": echo, "raw_echo": partial(echo, True), "send": send}[role](*map(float, numbers))
         return
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", "91")

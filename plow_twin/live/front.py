@@ -83,12 +83,12 @@ class BridgeFront:
         # 0 would say that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> bool:
-        """Send nothing: the recording holds the messages. False when a number is not finite."""
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
+        """Send nothing: the recording holds the messages. None when a number is not finite."""
         if not publication.finite:
-            return False
+            return None
         forces_sent()
-        return True
+        return {}
 
     def publish_quality(self, marks: JointState) -> None:
         """Send nothing, as `publish`."""

@@ -90,11 +90,11 @@ class Recording:
         """Take a journal entry; a loss is counted by the recorder."""
         self._recorder.journal(entry)
 
-    def publication(self, publication: Publication) -> None:
-        """Take the messages of a publication that has been published."""
+    def publication(self, publication: Publication, sent: Mapping[str, bytes]) -> None:
+        """Take the messages of a publication that has been published; `sent`: their bytes, where there are some."""
         wanted = self._decimation.take(publication)
         if wanted is not None:
-            self._recorder.publication(wanted)
+            self._recorder.publication(wanted, sent if wanted is publication else {})
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
         """Take another message that has been published on the topic of that base name."""

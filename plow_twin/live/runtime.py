@@ -69,10 +69,11 @@ class Front(Protocol):
     def now_ns(self) -> int:
         """Return the time on the clock of the stamps [ns]."""
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> bool:
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
         """Send the messages of a publication; call `forces_sent` right after the forces.
 
-        False, and nothing is sent, when a number is not finite.
+        Returns the bytes that were sent by base name of the topic; None, and nothing is sent, when a number is not
+        finite.
         """
 
     def publish_quality(self, marks: JointState) -> None:
@@ -558,7 +559,8 @@ class Runtime:
     def _publish(self, publication: Publication | None) -> None:
         if publication is None:
             return
-        if not self._front.publish(publication, self._forces_sent):
+        sent = self._front.publish(publication, self._forces_sent)
+        if sent is None:
             self.withheld += 1
             return
         self._q = publication.q
@@ -572,7 +574,7 @@ class Runtime:
         if self._received_ns and not self._front.follows_samples:
             self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
         if self.recording:
-            self.recording.publication(publication)
+            self.recording.publication(publication, sent)
             if marks is not None:
                 self.recording.message(QUALITY, publication.stamp_ns, marks)
         if changed:

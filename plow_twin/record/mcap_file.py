@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import struct
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -21,6 +21,7 @@ from plow_twin.record.follow import claim
 from plow_twin.record.template import Bytes, Indexes, Template, compiled, fill
 from plow_twin.record.words import set_word
 
+_MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 _INDEX_ENTRY: Final = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
 
@@ -37,11 +38,23 @@ class ChunkBuilder:
 
     def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """Add one message."""
-        head = struct.pack("<BQHIQQ", 5, 22 + len(data), channel, sequence, log_time_ns, publish_time_ns)
-        record = np.frombuffer(head + data, np.uint8)
-        place = self.reserve(len(record))
-        self._buffer[place : place + len(record)] = record
-        self._note(np.array([channel]), np.array([log_time_ns]), np.array([place]))
+        self.add_bytes([(channel, sequence, log_time_ns, publish_time_ns, data)])
+
+    def add_bytes(self, messages: Iterable[tuple[int, int, int, int, bytes]]) -> None:
+        """Add messages: channel, sequence, log and publish time [ns], data."""
+        parts: list[bytes] = []
+        heads: list[tuple[int, int, int]] = []
+        for channel, sequence, log_time_ns, publish_time_ns, data in messages:
+            size = len(data)
+            heads.append((channel, log_time_ns, MESSAGE_HEAD + size))
+            parts += (_MESSAGE_HEAD.pack(5, 22 + size, channel, sequence, log_time_ns, publish_time_ns), data)
+        if not heads:
+            return
+        channels, times, sizes = np.array(heads, np.int64).T
+        records = np.frombuffer(b"".join(parts), np.uint8)
+        place = self.reserve(len(records))
+        self._buffer[place : place + len(records)] = records
+        self._note(channels, times, place + np.cumsum(sizes) - sizes)
 
     def add_many(
         self,
@@ -140,7 +153,9 @@ class McapFile:
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
-        self._chunks: list[Any] = []
+        # as it will be written: a live run has some thousand chunks an hour, and objects take ten times the memory
+        self._chunk_index = bytearray()
+        self._chunk_count = 0
         self._metadata: list[Any] = []
         self._counts: Counter[int] = Counter()
         self._times: list[int] = []
@@ -163,11 +178,7 @@ class McapFile:
         return (min(self._times), max(self._times)) if self._times else (0, 0)
 
     def _write(self, record: Any) -> int:
-        from mcap.data_stream import RecordBuilder
-
-        builder = RecordBuilder()
-        record.write(builder)
-        data: bytes = builder.end()  # type: ignore[no-untyped-call]
+        data = _record_bytes(record)
         self._file.write(data)
         return len(data)
 
@@ -236,7 +247,8 @@ class McapFile:
         self._times += [first, last]
         if len(self._times) > 64:
             self._times = [min(self._times), max(self._times)]
-        self._chunks.append(
+        self._chunk_count += 1
+        self._chunk_index += _record_bytes(
             ChunkIndex(
                 chunk_length=len(record),
                 chunk_start_offset=start,
@@ -252,7 +264,6 @@ class McapFile:
 
     def finish(self) -> None:
         """Write the index and the end."""
-        from mcap.data_stream import RecordBuilder
         from mcap.opcode import Opcode
         from mcap.records import DataEnd, Footer, Statistics, SummaryOffset
 
@@ -264,7 +275,7 @@ class McapFile:
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts=dict(self._counts),
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunk_count,
             message_count=self._counts.total(),
             metadata_count=len(self._metadata),
             message_start_time=self.times[0],
@@ -272,26 +283,22 @@ class McapFile:
             schema_count=len(self._schemas),
         )
         groups = (
-            (Opcode.SCHEMA, list(self._schemas.values())),
-            (Opcode.CHANNEL, list(self._channels.values())),
-            (Opcode.STATISTICS, [statistics]),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.METADATA_INDEX, self._metadata),
+            (Opcode.SCHEMA, _records_bytes(self._schemas.values())),
+            (Opcode.CHANNEL, _records_bytes(self._channels.values())),
+            (Opcode.STATISTICS, _records_bytes([statistics])),
+            (Opcode.CHUNK_INDEX, self._chunk_index),
+            (Opcode.METADATA_INDEX, _records_bytes(self._metadata)),
         )
-        builder, offsets = RecordBuilder(), []
-        for opcode, records in groups:
-            begin = builder.count
-            for record in records:
-                record.write(builder)
-            if records:
-                length = builder.count - begin
-                offsets.append(SummaryOffset(group_opcode=opcode, group_start=start + begin, group_length=length))
-        offset_start = start + builder.count
-        for offset in offsets:
-            offset.write(builder)
-        summary = builder.end()  # type: ignore[no-untyped-call]
+        summary, offsets = bytearray(), []
+        for opcode, data in groups:
+            if data:
+                place = start + len(summary)
+                offsets.append(SummaryOffset(group_opcode=opcode, group_start=place, group_length=len(data)))
+                summary += data
+        offset_start = start + len(summary)
+        summary += _records_bytes(offsets)
         crc = crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start), crc32(summary))
-        self._file.write(summary)
+        self._file.write(bytes(summary))
         self._write(Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=crc))
         self._file.write(MAGIC)
 
@@ -306,6 +313,22 @@ class McapFile:
     def close(self) -> None:
         """Close the file as it is."""
         self._file.close()
+
+
+def _record_bytes(record: Any) -> bytes:
+    """Return a record as it stands in a file."""
+    return _records_bytes([record])
+
+
+def _records_bytes(records: Iterable[Any]) -> bytes:
+    """Return records as they stand in a file, one behind the other."""
+    from mcap.data_stream import RecordBuilder
+
+    builder = RecordBuilder()
+    for record in records:
+        record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
 
 
 def _compress(compression: str, content: Bytes) -> bytes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -150,6 +150,19 @@ class RunWriter:
             self._outputs.add_many(
                 channel, template, starts, sequence[row] & _SEQUENCE_MASK, log_time_ns[row], stamps, values
             )
+        self._close_full_chunks()
+
+    def write_sent(self, publications: Iterable[tuple[int, int, int, Mapping[str, bytes]]]) -> None:
+        """Write what was sent of publications: journal entry before, log time, stamp [ns], bytes by base name."""
+        channels = {
+            name: self._channel(self.header.topic(name), template.message_type)
+            for name, template in self._templates.items()
+        }
+        self._outputs.add_bytes(
+            (channels[name], sequence & _SEQUENCE_MASK, max(0, log_time_ns), max(0, stamp_ns), data)
+            for sequence, log_time_ns, stamp_ns, messages in publications
+            for name, data in messages.items()
+        )
         self._close_full_chunks()
 
     def write_output(self, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message) -> None:

@@ -111,7 +111,7 @@ class RosFront:
         """Return the node's time [ns]."""
         return int(self._node.get_clock().now().nanoseconds)
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> bool:
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
         """Publish the messages of a publication, if all its numbers are finite."""
         return self._publishers.publish(publication, forces_sent)
 

@@ -35,19 +35,19 @@ class OutputPublishers:
         }
         self._bytes = PublicationBytes(frame_id, child_frame_id)
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> bool:
+    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> dict[str, bytes] | None:
         """Publish the messages of a publication, forces first; `forces_sent` is called right after them.
 
-        False, and nothing is published, when a number is not finite.
+        Returns their bytes; None, and nothing is published, when a number is not finite.
         """
         publishers, messages = self._publishers, self._bytes.write(publication)
         if messages is None:
-            return False
+            return None
         for topic, data in messages.items():
             publishers[topic].publish(data)
             if topic == "contact_forces":
                 forces_sent()
-        return True
+        return messages
 
     def publish_quality(self, marks: JointState) -> None:
         """Publish the marks of a publication."""

@@ -165,7 +165,7 @@ class Alarms:
         if self._model is not None:
             for at_ns, residual in self._model.add(stamp_ns, *publication.q[:2].tolist()):
                 changed |= self._take("residual", residual, at_ns)
-        changed |= self._take("force", float(publication.peak.max()), stamp_ns)
+        changed |= self._take("force", max(publication.peak.tolist()), stamp_ns)
         if publication.slow is not None:
             clearance = float(publication.slow.clearance[:2].max())
             changed |= self._take("clearance", clearance, stamp_ns)
