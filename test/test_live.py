@@ -33,6 +33,7 @@ from plow_twin.live.bridge.source import BridgeError
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.part import Part
+from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Preparation
 from plow_twin.record.doctor import examine
 from plow_twin.record.mapping import read_map, time_ns
@@ -160,7 +161,7 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
 
     def acknowledge() -> bool:
         if front.runtime.alarms.worst and not acknowledged:
-            acknowledged.append(front.runtime.acknowledge_alarms())
+            acknowledged.append(Services(front.runtime, front.changed).acknowledge_alarms())
         return False
 
     assert front.run(acknowledge) == [] and acknowledged

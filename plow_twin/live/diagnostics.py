@@ -276,12 +276,12 @@ class Health:
 
     def output(self, runtime: Runtime) -> Part:
         """Return how much was published and how fast."""
-        latency, age = runtime.latency, runtime.age
+        latency, age = runtime.publishing.latency, runtime.publishing.age
         values = {
-            "published": str(runtime.published),
-            "withheld": str(runtime.withheld),
-            "held": str(runtime.held_frames),
-            "corrected": str(runtime.corrected_frames),
+            "published": str(runtime.publishing.published),
+            "withheld": str(runtime.publishing.withheld),
+            "held": str(runtime.publishing.held_frames),
+            "corrected": str(runtime.publishing.corrected_frames),
             "latency_p50_ms": _ms(latency.quantile(0.5)),
             "latency_p99_ms": _ms(latency.quantile(0.99)),
             "latency_max_ms": _ms(latency.largest_s) if latency.count else "",
@@ -291,7 +291,7 @@ class Health:
             "recent_age_p99_ms": _ms(age.recent(0.99)),
         }
         missed = self._note_periods(runtime, values)
-        if self._grown({"withheld": runtime.withheld}, ("withheld",)):
+        if self._grown({"withheld": runtime.publishing.withheld}, ("withheld",)):
             return ERROR, "withheld", values
         return (WARN if missed else OK), missed or "publishing", values
 

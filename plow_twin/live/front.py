@@ -13,7 +13,8 @@ from plow_twin.live.bridge.source import Bridge, BridgeError
 from plow_twin.live.load_model import read_load_model
 from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.live.part import Part
-from plow_twin.live.runtime import QUALITY, Runtime
+from plow_twin.live.publishing import QUALITY
+from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
 from plow_twin.record.mapping import Role, read_map

@@ -5,7 +5,6 @@ A front brings samples and takes messages away: the ROS node is one, `plow-twin 
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -13,83 +12,34 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, Final
 
 from plow_twin.errors import ArgumentError
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
+from plow_twin.live.publishing import Front, Publishing
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import WearKeeper
 from plow_twin.model.scene import Scene
-from plow_twin.record.alarms import ACKNOWLEDGED, ALARMS, alarms_message, alarms_of
-from plow_twin.record.messages import DiagnosticStatus, JointState
-from plow_twin.record.outputs import quality
+from plow_twin.record.alarms import alarms_of
+from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
-from plow_twin.stream.health import DurationHistogram, Periods
+from plow_twin.stream.health import Periods
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Snapshot
+from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose
 from plow_twin.stream.limits import Limits, excitation_limits, pose_limits, value_limits
 from plow_twin.stream.model_changes import changed_twin
-from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
     from plow_twin.live.estimation import Estimation
     from plow_twin.live.recording import Recording
 
-#: Topic of the marks.
-QUALITY: Final = "quality"
 _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: What is not used goes into the journal so often [Hz].
 _UNUSED_HZ: Final = 5.0
-
-
-class Front(Protocol):
-    """Where samples come from and messages go.
-
-    Attributes
-    ----------
-    name : str
-        Name of the twin, with its namespace.
-    topics : mapping
-        Resolved names of the outputs by their base names.
-    follows_samples : bool
-        Whether time is that of the samples alone (`/clock`, a file): nothing is held for want of them.
-    """
-
-    name: str
-    topics: Mapping[str, str]
-    follows_samples: bool
-
-    def now_ns(self) -> int:
-        """Return the time on the clock of the stamps [ns]."""
-
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
-        """Send the messages of a publication; call `forces_sent` right after the forces.
-
-        Returns the bytes that were sent by base name of the topic; None, and nothing is sent, when a number is not
-        finite.
-        """
-
-    def publish_quality(self, marks: JointState) -> None:
-        """Send the marks of a publication that has some, or follows one that had."""
-
-    def publish_alarms(self, status: DiagnosticStatus) -> None:
-        """Send the alarms."""
-
-    def publish_estimate(self, topic: str, message: JointState) -> None:
-        """Send an estimate, or what follows from it, on one of `ESTIMATES`."""
-
-    def changed(self) -> None:
-        """Take note that the state of the stream may have changed."""
-
-    def say_error(self, text: str) -> None:
-        """Log an error; may be called from another thread."""
 
 
 class Runtime:
@@ -122,26 +72,17 @@ class Runtime:
         kept_wear: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
     ) -> None:
         self._front = front
-        self._settings = settings
+        self.settings = settings
         self.scene = prepared.scene
         #: seconds that compiling or loading the solver took
         self.compile_s = prepared.compile_s
-        self.latency = DurationHistogram()
-        self.age = DurationHistogram()
         #: turns of the loop that publishes at a fixed rate, or else follows the clock; None: samples set the pace
         self.periods = _periods(settings)
         #: why time stands still, where it does: `waiting` for the first `/clock`, or `paused`
         self.clock = "running"
         self._clock_before_ns = 0
-        #: publications, and those that were not published because a number was not finite
-        self.published = self.withheld = 0
-        #: frames computed without a sample, and frames after late samples have been worked in
-        self.held_frames = self.corrected_frames = 0
-        self._received_ns = 0
-        self._kept: Snapshot | None = None
         self._start_due = True
         self._early: list[Arrival] = []
-        self._q: NDArray[np.float64] | None = None
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
         #: what the wear's identity is
@@ -159,6 +100,7 @@ class Runtime:
                 made.callback(self.recording.close)
             self.estimation = self._estimate()
             made.pop_all()
+        self.publishing = Publishing(front, settings, self.alarms, self.recording, self.mark)
         session = Session(
             prepared.twin,
             on_entry=self._journal(),
@@ -187,7 +129,7 @@ class Runtime:
         self.clock = "waiting" if self._start_due else "running"
         if not self._start_due:
             self.driver.session.start()
-            self.driver.set_model(self._stamp_ns(), model_changes(self._settings))
+            self.driver.set_model(self.stamp_ns, model_changes(self.settings))
 
     def refusals(self, settings: Settings) -> list[str]:
         """Return why parameters cannot be taken while the twin runs."""
@@ -228,21 +170,22 @@ class Runtime:
     @property
     def scene_name(self) -> str:
         """Scene file or preset in use."""
-        return self._settings.scene
+        return self.settings.scene
 
     @property
     def source(self) -> str:
         """Excitation source in use."""
-        return self._settings.excitation_source
+        return self.settings.excitation_source
 
     @property
     def poses_have_covariance(self) -> bool:
         """Whether measured poses bring their covariance."""
-        return self._settings.head_pose_type == "pose_with_covariance"
+        return self.settings.head_pose_type == "pose_with_covariance"
 
     def residual(self) -> tuple[float, float, float] | None:
         """Return model minus newest measured pose: x, y [m], theta [rad], or None without a measurement."""
-        return self.inputs.residual(self._q) if self._q is not None else None
+        q = self.publishing.q
+        return self.inputs.residual(q) if q is not None else None
 
     def newest_sample_age_s(self) -> float | None:
         """Return the present time minus the stamp of the newest sample used [s], or None before one."""
@@ -265,11 +208,11 @@ class Runtime:
     @property
     def missed_periods(self) -> int:
         """Periods left out between two reports from which on there is a warning; 0: none."""
-        return self._settings.missed_periods
+        return self.settings.missed_periods
 
-    def mark(self, text: str = "") -> tuple[bool, str]:
-        """Put a text, by default the parameter `mark`, into the journal and have the ring written, if there is one."""
-        self.driver.mark(self._stamp_ns(), text or self._settings.mark or "service")
+    def mark(self, text: str) -> tuple[bool, str]:
+        """Put a text into the journal and have the ring written, if there is one."""
+        self.driver.mark(self.stamp_ns, text)
         if self.recording is None:
             return False, "nothing is recorded"
         folder = self.recording.mark()
@@ -281,7 +224,7 @@ class Runtime:
     def record_status(self, status: DiagnosticStatus) -> None:
         """Put a published status into the recording."""
         if self.recording and not self._start_due:
-            self.recording.message("status", self._stamp_ns(), status)
+            self.recording.message("status", self.stamp_ns, status)
 
     def activate(self) -> None:
         """Start taking samples."""
@@ -313,7 +256,7 @@ class Runtime:
 
     def periodic(self) -> list[tuple[float, Callable[[], None]]]:
         """Return what the front is to call while the twin is active, each with its rate [Hz] on a steady clock."""
-        settings = self._settings
+        settings = self.settings
         periodic: list[tuple[float, Callable[[], None]]] = []
         if settings.excitation_source == "scene":
             periodic.append((settings.step_rate, self.clock_tick))
@@ -322,7 +265,7 @@ class Runtime:
         if settings.publish_mode == "fixed_rate":
             periodic.append((settings.publish_rate, self.publish_due))
         if self.wear_keeper:
-            periodic.append((1.0 / settings.wear_save_period, self._save_wear))
+            periodic.append((1.0 / settings.wear_save_period, self.save_wear))
         if self.recording:
             periodic.append((_UNUSED_HZ, self._journal_unused))
         if self.without_clock:
@@ -335,7 +278,7 @@ class Runtime:
 
     def parameter(self, name: str, value: Any, settings: Settings) -> None:
         """Take over a parameter that takes effect at once."""
-        self._settings = settings
+        self.settings = settings
         self.driver.policy = policy(settings)
         self.driver.intake.limits = limits(settings, self.scene)
         self._set_limits(settings)
@@ -344,7 +287,7 @@ class Runtime:
         if self._start_due:
             return  # nothing is journaled yet
         if name in MODEL:
-            self.driver.set_model(self._stamp_ns(), model_changes(settings))
+            self.driver.set_model(self.stamp_ns, model_changes(settings))
             self._front.changed()
         elif not isinstance(value, tuple):  # a list acts through the service that takes it, and its entry
             self.driver.parameter(name, value)
@@ -364,16 +307,16 @@ class Runtime:
             self.start()
         if self._start_due:
             # kept until the clock comes: one that plays a recording may hear it a little later
-            room = self._settings.input_depth - len(self._early)
+            room = self.settings.input_depth - len(self._early)
             self._early += arrived[:room]
             for stamp_ns, wrench in arrived[max(room, 0) :]:
                 self.driver.intake.refuse(Verdict.NO_CLOCK, stamp_ns, wrench)
             return
         if self._early:
             arrived, self._early = self._early + arrived, []
-        self._received_ns = now_ns = time.monotonic_ns()
+        self.publishing.received_ns = now_ns = time.monotonic_ns()
         for publication in self.driver.samples(arrived, now_ns):
-            self._publish(publication)
+            self.publishing.publish(publication)
         self._advanced()
 
     def silence(self) -> None:
@@ -382,82 +325,30 @@ class Runtime:
         publication = self.driver.silence(time.monotonic_ns())
         if self.driver.holds != holds:
             # what is published next answers no message
-            self._received_ns = 0
-            self._publish(publication)
+            self.publishing.received_ns = 0
+            self.publishing.publish(publication)
             self._advanced()
 
     def clock_tick(self) -> None:
         """Go on under the scene's own loads."""
-        if self.periods and self._settings.publish_mode != "fixed_rate":
+        if self.periods and self.settings.publish_mode != "fixed_rate":
             self.periods.turn(time.monotonic())
         if self._start_due:
             self.start()
             if self._start_due:
                 return
-        self._received_ns = now_ns = time.monotonic_ns()
-        self._publish(self.driver.clock_tick(self._front.now_ns(), now_ns))
+        self.publishing.received_ns = now_ns = time.monotonic_ns()
+        self.publishing.publish(self.driver.clock_tick(self._front.now_ns(), now_ns))
         self._advanced()
 
     def publish_due(self) -> None:
         """Publish all since the last publication."""
         if self.periods:
             self.periods.turn(time.monotonic())
-        self._publish(self.driver.due())
-
-    def reset(self) -> tuple[bool, str]:
-        """Put the motion back to its initial state; return whether that was done, and a text for who asked."""
-        self.driver.reset(self._stamp_ns(), "service")
-        self._front.changed()
-        return True, "initial motion restored, the wear stays; the next sample starts model time anew"
-
-    def snapshot(self) -> tuple[bool, str]:
-        """Journal the exact state and keep it for `restore`."""
-        self._kept = self.driver.snapshot()
-        return True, f"the state at {self._kept.stamp_ns} ns is kept and stands in the journal"
-
-    def restore(self) -> tuple[bool, str]:
-        """Go back to the motion of the snapshot kept."""
-        if self._kept is None:
-            return False, "no snapshot has been taken since configure"
-        self.driver.restore(self._stamp_ns(), self._kept)
-        self._front.changed()
-        return True, f"the motion is that at {self._kept.stamp_ns} ns; the next sample is that of its time, wear stays"
-
-    def acknowledge_alarms(self) -> tuple[bool, str]:
-        """Let go the alarms that are latched."""
-        left = self.alarms.acknowledge()
-        self.driver.parameter(ACKNOWLEDGED, self._stamp_ns())
-        self._publish_alarms(self._stamp_ns())
-        return True, f"still there: {', '.join(left)}" if left else "no alarm is left"
-
-    def forecast(self) -> tuple[bool, str]:
-        """Return the newest forecast as JSON."""
-        if self.estimation is None or not any(self._settings.forecast_limits):
-            return False, "no forecast is made: estimate is false or forecast_limits are 0"
-        found = self.estimation.forecast
-        return (True, json.dumps(found)) if found is not None else (False, self.estimation.forecast_error)
-
-    def set_wear(self) -> tuple[bool, str]:
-        """Set the wear of the pads to the parameter `set_wear`."""
-        depth = self._settings.set_wear
-        try:
-            self.driver.set_wear(self._stamp_ns(), depth, "service")
-        except ValueError as error:
-            return False, f"parameter set_wear: {error}"
-        self._save_wear()
-        self._front.changed()
-        return True, f"the pads are worn by {list(depth)} m from now on; the motion starts anew"
-
-    def switch_publisher(self) -> tuple[bool, str]:
-        """Follow the other sender of the excitation."""
-        done = self.inputs.senders.switch()
-        self._front.changed()
-        if done:
-            return True, f"the other publisher of {self.source} is followed from now on"
-        return False, f"no other publisher of {self.source} has been heard"
+        self.publishing.publish(self.driver.due())
 
     def _intake(self) -> Intake:
-        settings = self._settings
+        settings = self.settings
         return Intake(
             jump_back_s=settings.jump_back,
             jump_forward_s=settings.jump_forward,
@@ -466,23 +357,23 @@ class Runtime:
         )
 
     def _record(self) -> Recording | None:
-        if not self._settings.record_path:
+        if not self.settings.record_path:
             return None
         from plow_twin.live.recording import Recording
 
         front = self._front
         clock = front.now_ns if front.follows_samples else None
-        return Recording(self._settings, self.scene, front.name, front.topics, clock, front.say_error)
+        return Recording(self.settings, self.scene, front.name, front.topics, clock, front.say_error)
 
     def _estimate(self) -> Estimation | None:
-        if not self._settings.estimate:
+        if not self.settings.estimate:
             return None
         from plow_twin.live.estimation import Estimation, problems
 
-        found = problems(self._settings, self.scene)
+        found = problems(self.settings, self.scene)
         if found:
             raise ParameterError(found)
-        return Estimation(self._settings, self.scene)
+        return Estimation(self.settings, self.scene)
 
     def _journal(self) -> Callable[[Entry], object]:
         """Return who is told of each entry: the recording, the estimate, both or nobody."""
@@ -505,7 +396,7 @@ class Runtime:
             return
         self.driver.session.apply(Pose(stamp_ns, pose, deviation))
         if self.alarms.take_pose(stamp_ns, pose):
-            self._alarms_changed(stamp_ns)
+            self.publishing.alarms_changed(stamp_ns)
 
     def _gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
         self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))
@@ -529,11 +420,13 @@ class Runtime:
         if not self._start_due:
             self.inputs.unused.flush()
 
-    def _save_wear(self) -> None:
+    def save_wear(self) -> None:
+        """Have the wear saved, if it is kept."""
         if self.wear_keeper:
             self.wear_keeper.save(self.driver.session.wear_depth)
 
-    def _stamp_ns(self) -> int:
+    @property
+    def stamp_ns(self) -> int:
         """Return the time that the model has reached, or the present one before the first sample [ns]."""
         stamp_ns = self.driver.session.stamp_ns
         return self._front.now_ns() if stamp_ns is None else stamp_ns
@@ -555,45 +448,6 @@ class Runtime:
         if renewed and self.estimation and self.estimation.entry:
             # no part of a snapshot
             self.recording.journal(self.estimation.entry)
-
-    def _publish(self, publication: Publication | None) -> None:
-        if publication is None:
-            return
-        sent = self._front.publish(publication, self._forces_sent)
-        if sent is None:
-            self.withheld += 1
-            return
-        self._q = publication.q
-        self.held_frames += publication.held
-        self.corrected_frames += publication.corrected
-        marks = quality(publication, self._settings.frame_id) if publication.marked else None
-        if marks is not None:
-            self._front.publish_quality(marks)
-        self.published += 1
-        changed = self.alarms.take(publication)
-        if self._received_ns and not self._front.follows_samples:
-            self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
-        if self.recording:
-            self.recording.publication(publication, sent)
-            if marks is not None:
-                self.recording.message(QUALITY, publication.stamp_ns, marks)
-        if changed:
-            self._alarms_changed(publication.stamp_ns)
-
-    def _alarms_changed(self, stamp_ns: int) -> None:
-        self._publish_alarms(stamp_ns)
-        if self.alarms.raised:
-            self.mark(f"alarm: {', '.join(self.alarms.raised)}")
-
-    def _publish_alarms(self, stamp_ns: int) -> None:
-        status = alarms_message(self.alarms, self._front.name, self._settings.hardware_id)
-        self._front.publish_alarms(status)
-        if self.recording:
-            self.recording.message(ALARMS, stamp_ns, status)
-
-    def _forces_sent(self) -> None:
-        if self._received_ns:
-            self.latency.add((time.monotonic_ns() - self._received_ns) * 1e-9)
 
 
 def _periods(settings: Settings) -> Periods | None:

@@ -15,6 +15,7 @@ from std_srvs.srv import Trigger
 
 from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.live.runtime import Runtime
+from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Prepared
 from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.ros.input_loop import InputLoop, Turns
@@ -24,7 +25,7 @@ from plow_twin.ros.qos import LATCHED
 from plow_twin.ros.subscriptions import Subscriptions
 from plow_twin.stream.outputs import Publication
 
-#: Services by name, each a method of the runtime.
+#: Services by name, each a method of `Services`.
 SERVICES: Final = (
     "reset",
     "switch_publisher",
@@ -101,8 +102,9 @@ class RosFront:
         self.subscriptions = Subscriptions(node, runtime, loop, self.turns, self.changed)
         for rate_hz, do in runtime.periodic():
             loop.every(1.0 / rate_hz, do)
+        services = Services(runtime, self.changed)
         for name in SERVICES:
-            service = node.create_service(Trigger, f"~/{name}", self._answer(getattr(runtime, name)))
+            service = node.create_service(Trigger, f"~/{name}", self._answer(getattr(services, name)))
             made.callback(node.destroy_service, service)
         runtime.start()
         loop.start()

@@ -9,7 +9,7 @@ from nav_msgs.msg import Odometry as RosOdometry
 from rclpy.node import Node
 from sensor_msgs.msg import JointState as RosJointState
 
-from plow_twin.live.runtime import QUALITY
+from plow_twin.live.publishing import QUALITY
 from plow_twin.record.messages import JointState
 from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.record.sending import PublicationBytes

@@ -1,0 +1,82 @@
+"""What an operator may ask of a live twin: each service with its answer, done or not, and a text."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+
+from plow_twin.live.runtime import Runtime
+from plow_twin.record.alarms import ACKNOWLEDGED
+from plow_twin.stream.journal import Snapshot
+
+
+class Services:
+    """The services of a live twin, by the names of its methods.
+
+    Parameters
+    ----------
+    runtime
+        The twin.
+    changed
+        Called when the state of the stream may have changed.
+    """
+
+    def __init__(self, runtime: Runtime, changed: Callable[[], None]) -> None:
+        self._runtime, self._changed = runtime, changed
+        self._kept: Snapshot | None = None
+
+    def mark(self) -> tuple[bool, str]:
+        """Put the text of the parameter `mark` into the journal and have the ring written, if there is one."""
+        return self._runtime.mark(self._runtime.settings.mark or "service")
+
+    def reset(self) -> tuple[bool, str]:
+        """Put the motion back to its initial state; return whether that was done, and a text for who asked."""
+        self._runtime.driver.reset(self._runtime.stamp_ns, "service")
+        self._changed()
+        return True, "initial motion restored, the wear stays; the next sample starts model time anew"
+
+    def snapshot(self) -> tuple[bool, str]:
+        """Journal the exact state and keep it for `restore`."""
+        self._kept = self._runtime.driver.snapshot()
+        return True, f"the state at {self._kept.stamp_ns} ns is kept and stands in the journal"
+
+    def restore(self) -> tuple[bool, str]:
+        """Go back to the motion of the snapshot kept."""
+        if self._kept is None:
+            return False, "no snapshot has been taken since configure"
+        self._runtime.driver.restore(self._runtime.stamp_ns, self._kept)
+        self._changed()
+        return True, f"the motion is that at {self._kept.stamp_ns} ns; the next sample is that of its time, wear stays"
+
+    def acknowledge_alarms(self) -> tuple[bool, str]:
+        """Let go the alarms that are latched."""
+        left = self._runtime.alarms.acknowledge()
+        self._runtime.driver.parameter(ACKNOWLEDGED, self._runtime.stamp_ns)
+        self._runtime.publishing.send_alarms(self._runtime.stamp_ns)
+        return True, f"still there: {', '.join(left)}" if left else "no alarm is left"
+
+    def forecast(self) -> tuple[bool, str]:
+        """Return the newest forecast as JSON."""
+        if self._runtime.estimation is None or not any(self._runtime.settings.forecast_limits):
+            return False, "no forecast is made: estimate is false or forecast_limits are 0"
+        found = self._runtime.estimation.forecast
+        return (True, json.dumps(found)) if found is not None else (False, self._runtime.estimation.forecast_error)
+
+    def set_wear(self) -> tuple[bool, str]:
+        """Set the wear of the pads to the parameter `set_wear`."""
+        depth = self._runtime.settings.set_wear
+        try:
+            self._runtime.driver.set_wear(self._runtime.stamp_ns, depth, "service")
+        except ValueError as error:
+            return False, f"parameter set_wear: {error}"
+        self._runtime.save_wear()
+        self._changed()
+        return True, f"the pads are worn by {list(depth)} m from now on; the motion starts anew"
+
+    def switch_publisher(self) -> tuple[bool, str]:
+        """Follow the other sender of the excitation."""
+        done = self._runtime.inputs.senders.switch()
+        self._changed()
+        if done:
+            return True, f"the other publisher of {self._runtime.source} is followed from now on"
+        return False, f"no other publisher of {self._runtime.source} has been heard"
