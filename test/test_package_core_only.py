@@ -20,18 +20,18 @@ from importlib.metadata import distributions
 from importlib.util import find_spec
 import plow_twin
 from plow_twin import simulate
-from plow_twin import Clearance, Contact, Frame, Gravity, Head, Scene, Twin
+from plow_twin import Clearance, Contact, Frame, Gravity, Harmonic, Head, Scene, Twin
 
 for name in ("yaml", "jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"):
     assert find_spec(name) is None, name
-# a ball of 1 kg falls 1 m onto a table: the paper's head with x and theta held
+# a ball of 1 kg falls 1 m onto a table: the paper's law and kind of load, whose kernels the command takes afterwards
 scene = Scene(
     head=Head(mass_kg=1.0, inertia_kg_m2=1.0),
     frame=Frame(width_m=1.0, height_m=1.0),
     clearance=Clearance(horizontal_m=1.0, vertical_m=2.0),
-    contact=Contact("kelvin_voigt", stiffness=1e6, damping=0.0),
+    contact=Contact("exact_restitution", stiffness=1e6, restitution=0.9),
     gravity=Gravity(9.81),
-    locked=("x", "theta"),
+    loads=(Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),),
 )
 result = simulate(scene, 1.0, 0.1)
 twin = Twin(scene)

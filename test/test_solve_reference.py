@@ -79,9 +79,17 @@ VARIANTS = {
 }
 
 
-@pytest.mark.parametrize("loads", VARIANTS.values(), ids=VARIANTS.keys())
-@pytest.mark.parametrize("offset", [(0.0, 0.0), (0.05, -0.08)], ids=["centred", "offset"])
-def test_loads_and_offset_mass_agree_with_rk4_in_world_axes(loads: tuple, offset: tuple[float, float]) -> None:
+# each compiles kernels of its own: the other pairings are left to the full count
+@pytest.mark.parametrize(
+    ("offset", "loads"),
+    [
+        pytest.param((0.0, 0.0), VARIANTS["table"], id="centred, table"),
+        pytest.param((0.05, -0.08), VARIANTS["two directions"], id="offset, two directions"),
+        pytest.param((0.0, 0.0), VARIANTS["two directions"], id="centred, two directions", marks=pytest.mark.stress),
+        pytest.param((0.05, -0.08), VARIANTS["table"], id="offset, table", marks=pytest.mark.stress),
+    ],
+)
+def test_loads_and_offset_mass_agree_with_rk4_in_world_axes(offset: tuple[float, float], loads: tuple) -> None:
     scene = Scene(
         Head(2000.0, 900.0, "consistent", offset),
         Frame(0.3, 0.25),
