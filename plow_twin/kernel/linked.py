@@ -7,6 +7,9 @@ vain. It takes a quarter of the time of compiling, which is left out here by num
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -100,9 +103,26 @@ class LinkedCompiler(_Compiler):
 
 
 class EntryCompiler(_Compiler):
-    """numba's compiler, but for the library that it lowers into: for what Python calls."""
+    """numba's compiler, but for the library that it lowers into: for what Python calls, with all that it calls."""
 
     choice = _LowerForPython
+
+    def compile_extra(self, func: Any) -> Any:
+        """Compile, as numba's own."""
+        with _garbage_kept():
+            return super().compile_extra(func)
+
+
+@contextmanager
+def _garbage_kept() -> Iterator[None]:
+    """Pause the collection of garbage: compiling makes millions of objects that stay, looked at again and again."""
+    paused = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if paused:
+            gc.enable()
 
 
 def keep_from_python(dispatcher: Any) -> None:
