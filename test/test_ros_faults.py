@@ -6,6 +6,7 @@ import gc
 import json
 import math
 import os
+import random
 import resource
 import shutil
 import signal
@@ -13,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,6 +25,11 @@ import numpy as np
 import psutil
 import pytest
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
@@ -32,9 +39,11 @@ from rclpy.serialization import serialize_message
 from ros_processes import Bench, bench, value
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
 
 from plow_twin.model.scene import Wear
 from plow_twin.record.replay import replay
+from plow_twin.ros.front import SERVICES
 from plow_twin.ros.messages import set_stamp, stamp_ns
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import dump_scene, load_scene
@@ -463,3 +472,42 @@ def test_two_minutes_with_the_recorder_account_for_every_message_and_grow_by_not
     first, last = rows[2], rows[-1]
     assert (last["threads"], last["files"]) == (first["threads"], first["files"])
     assert last["rss_mib"] - first["rss_mib"] < 4.0
+
+
+def test_a_storm_of_requests_loses_nothing_and_the_journal_repeats_it(tmp_path: Path) -> None:
+    run, chance = tmp_path / "run", random.Random(2)
+    asked: Counter[str] = Counter()
+    numbers = {
+        "clearance_horizontal": (-1.0, 0.022, 0.03),
+        "limit_force": (0.0, 5e4, 1e6),
+        "excitation_timeout": (0.02, 0.3),
+        "jump_back": (0.0, 1.0),
+    }
+    settings = {"record_path": run, "wear_state_path": tmp_path / "wear", "alarm_force": "[1000.0, 2000.0]"}
+    with bench(tmp_path, **settings, **RELIABLE_INPUT) as running:
+        probe, name = running.probe, f"{running.namespace}/plow_twin"
+        publisher = running.publisher("--rate", "500", "--seconds", "20")
+        give_up = time.monotonic() + 12.0
+        while time.monotonic() < give_up:
+            what = chance.choice([*SERVICES, *numbers, "stop", "cycle"])
+            asked[what] += 1
+            if what in SERVICES:
+                probe.call(Trigger, f"{name}/{what}", Trigger.Request())
+            elif what in numbers:
+                number = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=chance.choice(numbers[what]))
+                request = SetParameters.Request(parameters=[ParameterMessage(name=what, value=number)])
+                assert probe.call(SetParameters, f"{name}/set_parameters", request).results[0].successful
+            elif what == "stop":
+                publisher.send_signal(signal.SIGSTOP)
+                time.sleep(chance.random())
+                publisher.send_signal(signal.SIGCONT)
+            else:
+                for number in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
+                    change = ChangeState.Request(transition=Transition(id=number))
+                    assert probe.call(ChangeState, f"{name}/change_state", change).success
+        sent = _sent(publisher)
+        _until_accounted(running, sent)
+        assert "[ERROR]" not in running.twin.output() and "Traceback" not in running.twin.output()
+        assert running.twin.stop() == 0
+    assert len(asked) == len(SERVICES) + len(numbers) + 2, asked
+    assert replay(run).exit_code == 0
