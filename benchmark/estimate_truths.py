@@ -6,16 +6,17 @@ shape of its load, its sensor or its machine is another one than the estimate be
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin import Clearance, Contact, Scene, Table, simulate
+from plow_twin import Clearance, Contact, Scene, Table, Wear, simulate
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.model.loads import compile_loads
 from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
 
@@ -51,6 +52,8 @@ class Group:
     shift_m: float = 0.0
     stuck: bool = False
     noisier: float = 1.0
+    #: wear coefficient of the truth; the estimate knows of none
+    wear_m2_n: float = 0.0
     #: whether model, or sensor, are to be found suspect
     model: str = "ok"
     sensor: str = "ok"
@@ -64,6 +67,7 @@ GROUPS = {
     "slow": Group("10 Hz", rate_hz=10.0),
     "stochastic": Group("stochastic load", stochastic=True, load_step=2e-3),
     "coarse_load": Group("stochastic load, sampled at 100 Hz", stochastic=True),
+    "worn": Group("wear of some 0.1 mm in the window", wear_m2_n=5e-13),
     "middle": Group("K 3e7 .. 3e8", stiffness=(3e7, 3e8)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
     "kelvin_voigt": Group("truth: Kelvin-Voigt", law="kelvin_voigt", model="suspect"),
@@ -81,7 +85,7 @@ GROUPS = {
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """What is true, and what the estimate gets."""
+    """What is true, and what the estimate gets; `clearance` is that at the end of the window, shape (2,), in m."""
 
     group: Group
     scene: Scene
@@ -91,12 +95,7 @@ class Truth:
     bias: Array
     delay: float
     gain: Array
-    folder_rows: dict[str, Array] = field(default_factory=dict)
-
-    @property
-    def clearance(self) -> Array:
-        """True clearances, shape (2,), in m."""
-        return np.array([self.scene.clearance.horizontal_m, self.scene.clearance.vertical_m])
+    clearance: Array
 
     def write(self, folder: Path) -> None:
         """Write the folder that `plow-twin estimate` takes."""
@@ -129,18 +128,20 @@ def draw(group: Group, seed: int) -> Truth:
         clearance=Clearance(*rng.uniform(0.018, 0.034, 2)),
         contact=_contact(group, rng),
         loads=(Table("cutting", fine, true_load),),
+        wear=Wear(group.wear_m2_n, 0.015, 2.0) if group.wear_m2_n else None,
     )
     t = np.arange(0.0, end, 1.0 / group.rate_hz)
     delay = group.delay_s * rng.uniform()
     bias = group.bias_m * rng.standard_normal(3) * np.array([1.0, 1.0, 3.0])
-    q = _motion(scene, group, np.maximum(t - delay, 0.0), end) + bias
+    motion, clearance = _motion(scene, group, np.maximum(t - delay, 0.0), end)
+    q = motion + bias
     measured = _sensor(group, rng, t, q)
     keep = _kept(group, rng, t, measured)
     knots = np.arange(0.0, end + group.load_step, group.load_step)
     wrench = np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
     poses, _ = Poses.of(t[keep], measured[keep])
     load, _ = Load.of(knots, wrench)
-    return Truth(group, scene, nominal, load, poses, bias, delay, gain)
+    return Truth(group, scene, nominal, load, poses, bias, delay, gain, clearance)
 
 
 def _contact(group: Group, rng: np.random.Generator) -> Contact:
@@ -163,11 +164,12 @@ def _cutting(rng: np.random.Generator, t: Array) -> Array:
     return out
 
 
-def _motion(scene: Scene, group: Group, times: Array, end: float) -> Array:
-    """Return the true poses at `times`, shape (n, 3)."""
+def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array]:
+    """Return the true poses at `times`, shape (n, 3), and the clearances at the end, shape (2,)."""
     if not group.jam_m:
         run = simulate(scene, end, _FINE, 1e-6)
-        return np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)
+        q = np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)
+        return q, clearances(scene, run.wear_depth)[:2]
     first = simulate(scene, _FROM * end, _FINE, 1e-6)
     table = scene.loads[0]
     assert isinstance(table, Table)
@@ -180,7 +182,8 @@ def _motion(scene: Scene, group: Group, times: Array, end: float) -> Array:
     second = simulate(later, end - _FROM * end, _FINE, 1e-6)
     t = np.concatenate([first.t, second.t[1:] + _FROM * end])
     q = np.concatenate([first.q, second.q[1:]])
-    return np.stack([np.interp(times, t, column) for column in q.T], axis=1)
+    moved = np.stack([np.interp(times, t, column) for column in q.T], axis=1)
+    return moved, clearances(scene, np.zeros(8))[:2]
 
 
 def _sensor(group: Group, rng: np.random.Generator, t: Array, q: Array) -> Array:

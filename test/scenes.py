@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene
+from plow_twin.model.geometry import penetration_rows
 from plow_twin.scene_file import load_scene
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,6 +28,14 @@ def pose_error(scene: Scene, q: np.ndarray, reference_q: np.ndarray) -> float:
     gx, gy = scene.clearance.horizontal_m, scene.clearance.vertical_m
     radius = 0.5 * np.hypot(scene.frame.width_m, scene.frame.height_m)
     return float((np.abs(q - reference_q) / np.array([gx, gy, gx / radius])).max())
+
+
+def gaps_at(scene: Scene, q: np.ndarray) -> np.ndarray:
+    """Return the true gaps of the pairs in m at poses (n, 3), shape (n, 8)."""
+    c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
+    body = [c, s, c * q[:, 0] + s * q[:, 1], -s * q[:, 0] + c * q[:, 1], np.ones(len(q))]
+    gaps: np.ndarray = -np.stack(body, axis=1) @ penetration_rows(scene)
+    return gaps
 
 
 def wall_and_point(

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
-from scenes import ROOT, preset
+from scenes import ROOT, gaps_at, preset
 from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
-from plow_twin import Scene, Table, Twin, simulate
+from plow_twin import Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate.bouncing import _regress
-from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.estimate import _with_gaps, estimate
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
+from plow_twin.estimate.gaps import Gaps, GapsError, tell
 from plow_twin.estimate.measurements import EstimateError, Load, Poses
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.unknowns import GAIN, Spread, Unknowns
@@ -264,6 +265,103 @@ def test_members_that_leave_the_range_are_left_out_and_counted(known: list[tuple
     forces = forces_of(truth.nominal, soft, truth.load.between(0.0, 6.0), 60, 3.2)
     assert forces.left_out > 0 and forces.members + forces.left_out == 60
     assert np.isfinite(forces.force).all()
+
+
+SENSOR_ERROR = 1e-4
+
+
+@pytest.fixture(scope="module")
+def gapped(known: list[tuple[Truth, Estimate]]) -> tuple[Truth, np.ndarray]:
+    """A truth and the gaps that sensors at all pairs measure, each with a constant error, noise and places left out."""
+    truth = known[0][0]
+    still = draw(replace(truth.group, noise_m=0.0), 2).poses.q
+    rng = np.random.default_rng(6)
+    gap = gaps_at(truth.scene, still) + 3e-4 * rng.standard_normal((len(still), 8))
+    return truth, gap + SENSOR_ERROR * rng.standard_normal(8)
+
+
+@pytest.mark.parametrize("pairs", [range(8), (0, 1, 3, 6, 7), (0, 1, 3, 6)])
+def test_gaps_tell_the_clearances_whatever_the_contact_is(
+    gapped: tuple[Truth, np.ndarray], pairs: tuple[int, ...]
+) -> None:
+    truth, gap = gapped
+    some = np.full_like(gap, np.nan)
+    some[:, list(pairs)] = gap[:, list(pairs)]
+    gaps, _ = Gaps.of(truth.poses.t, some)
+    told = tell(truth.nominal, gaps, truth.poses)
+    assert told is not None
+    assert (np.abs(told.clearance - truth.clearance) < 3.0 * told.deviation).all() and (told.deviation < 1.5e-4).all()
+    assert len(told.poses.t) == (len(gap) if len(pairs) > 4 else 0)
+    if len(pairs) > 4:
+        assert np.abs(np.median(told.poses.q - truth.poses.q, axis=0)).max() < 1e-3
+    assert told.groups.keys() == ({"horizontal_top", "vertical_left"} if len(pairs) < 8 else set(told.groups))
+    for name, value in told.groups.items():
+        true = truth.clearance[0 if name.startswith("horizontal") else 1]
+        assert abs(value.mean - true) < 4.0 * SENSOR_ERROR
+
+
+def test_gaps_that_do_not_tell_the_clearance_are_no_measurement_of_it(gapped: tuple[Truth, np.ndarray]) -> None:
+    truth, gap = gapped
+    gap = gap.copy()
+    gap[:, [3, 5]] = np.nan  # none at the right wall
+    gaps, _ = Gaps.of(truth.poses.t, gap)
+    assert tell(truth.nominal, gaps, truth.poses) is None
+    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t[:0], truth.poses.q[:0]), gaps=gaps)
+    assert result.horizontal_state is State.PRIOR
+    with pytest.raises(GapsError, match=r"gap \(4, 3\), expected \(n,\) and \(n, 8\)"):
+        Gaps.of(np.arange(4.0), np.zeros((4, 3)))
+
+
+def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_one_is_found(
+    known: list[tuple[Truth, Estimate]], gapped: tuple[Truth, np.ndarray]
+) -> None:
+    truth, gap = gapped
+    gaps, lost = Gaps.of(truth.poses.t, gap)
+    nothing, _ = Poses.of([], np.zeros((0, 3)))
+    result = estimate(truth.nominal, truth.load, nothing, lost, gaps)
+    assert (result.horizontal_state, result.model, result.sensor) == (State.ESTIMATED, "ok", "ok")
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert abs(value.mean - true) < 1e-4 and value.p95 - value.p05 < 2e-4
+    shifted = gap.copy()
+    shifted[:, 1] += 2e-3
+    told = tell(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)
+    assert told is not None and told.contradiction > 5.0
+    result = _with_gaps(known[0][1], told)
+    assert result.horizontal_state is result.vertical_state is State.WITHDRAWN and result.sensor == "suspect"
+    assert "gaps:" in result.reasons[0]
+
+
+def test_groups_of_pads_are_told_by_the_motion(known: list[tuple[Truth, Estimate]]) -> None:
+    held = 0
+    for truth, result in known:
+        for name, (value, state) in result.groups.items():
+            true = truth.clearance[0 if name.startswith("horizontal") else 1]
+            assert state is State.ESTIMATED and value.p95 - value.p05 < 6e-4
+            held += value.p05 <= true <= value.p95
+    assert held >= 6, "of 8, whose errors go together"
+
+
+def test_walls_worn_askew_are_estimated_and_not_taken_for_another_model() -> None:
+    """Pads as uneven as they are towards the end of a life: a fit of even ones does not hold."""
+    nominal = preset("paper")
+    depth = np.array([2.8, 3.3, 4.5, 2.3, 2.2, 2.2, 3.2, 1.3]) * 1e-3
+    t = np.arange(0.0, 5.0 * np.pi, 0.01)
+    wrench = compile_loads(nominal.loads).at(t)
+    worn = replace(nominal, wear=Wear(0.0, 0.015, 0.0, initial_depth_m=tuple(depth.tolist())))
+    run = simulate(worn, float(t[-1]), 0.02, 1e-6)
+    noise = np.random.default_rng(1).standard_normal(run.q.shape) * [5e-4, 5e-4, 2e-3]
+    result = estimate(nominal, Load.of(t, wrench)[0], Poses.of(run.t, run.q + noise)[0])
+    true = {
+        "horizontal_top": 0.025 + depth[1] + depth[3], "horizontal_bottom": 0.025 + depth[7] + depth[5],
+        "vertical_left": 0.030 + depth[0] + depth[6], "vertical_right": 0.030 + depth[2] + depth[4],
+    }  # fmt: skip
+    assert (result.model, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
+    assert result.horizontal.mean == pytest.approx(0.5 * (true["horizontal_top"] + true["horizontal_bottom"]), abs=3e-4)
+    assert result.vertical.mean == pytest.approx(0.5 * (true["vertical_left"] + true["vertical_right"]), abs=3e-4)
+    for name, (value, state) in result.groups.items():
+        assert state is State.ESTIMATED and abs(value.mean - true[name]) < 1.5 * (value.p95 - value.p05)
+    # told apart: the walls are askew by 2 mm
+    assert result.groups["horizontal_top"][0].p05 > result.groups["horizontal_bottom"][0].p95
 
 
 def test_arrays_of_the_wrong_shape_are_named() -> None:

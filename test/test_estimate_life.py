@@ -15,7 +15,7 @@ from scenes import preset
 from plow_twin import Table, Wear, simulate
 from plow_twin.cli.app import run as cli
 from plow_twin.estimate.coefficient import History, coefficient
-from plow_twin.estimate.forecast import Plan, forecast, with_estimate
+from plow_twin.estimate.forecast import Plan, Scenario, forecast, with_estimate
 from plow_twin.estimate.life import LifeError, mean_forces, period_of, wear_path
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
@@ -60,6 +60,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     file = tmp_path / "scene.yaml"
     file.write_text(dump_scene(scene))
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34", "--horizon", "20000", "--stop", "1000", "--json"]
+    limits += ["--scenario", "hard:coefficient=2"]
     picture = tmp_path / "plots" / "forecast.png"
     command = [sys.executable, "-m", "plow_twin", "forecast", str(file), *limits, "--plot", str(picture)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=110)
@@ -67,12 +68,33 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     facts = json.loads(done.stdout)
     assert facts["p50"]["passes"] == pytest.approx(facts["p50"]["km"] * 1000.0 / 250.0)
     assert 0.0 <= facts["probability_before_stop"] <= 1.0
+    other = facts["scenarios"]["hard"]
+    assert other["p50"]["hours"] < 0.55 * facts["p50"]["hours"]
+    assert other["probability_before_stop"] > facts["probability_before_stop"]
     assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
     # the clearance is at its limit when the limit is reached
     now = life.clearances(np.zeros(1))[1, 0]
     assert now == pytest.approx([0.025, 0.030], abs=1e-9)
     late = life.clearances(np.array([0.99 * p50]))[1, 0]
     assert max(late - [0.028, 0.034]) == pytest.approx(0.0, abs=3e-4)
+
+
+def test_scenarios_are_forecasts_of_their_own_from_the_same_draws() -> None:
+    scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
+    dry, heavy = Scenario.parse("dry: coefficient=0.5"), Scenario.parse("heavy:load=1.3,coefficient=1")
+    plan = Plan(0.0255, 0.0305, 1e5, draws=200, scenarios=(dry, heavy))
+    found = forecast(scene, plan)
+    alone = forecast(scene, replace(plan, scenarios=()))
+    assert np.array_equal(found.hours, alone.hours)
+    assert found.scenarios["dry"].hours == pytest.approx(2.0 * found.hours, rel=1e-2)
+    # the force grows with the load, by what share the contact decides
+    middle, sooner = found.quantile(0.5), found.scenarios["heavy"].quantile(0.5)
+    assert middle is not None and sooner is not None and 0.6 * middle < sooner < 0.95 * middle
+    for text in ("no numbers:load", "a:speed=2", "b:load=0", ":load=2", "c:load=nan"):
+        with pytest.raises(LifeError, match="scenario: got"):
+            Scenario.parse(text)
+    with pytest.raises(LifeError, match="expected each once"):
+        forecast(scene, replace(plan, scenarios=(dry, dry)))
 
 
 def test_a_table_of_enough_periods_is_a_load_to_forecast_under() -> None:

@@ -15,7 +15,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from ros_processes import ROOT, Bench, bench, value
-from scenes import preset
+from scenes import gaps_at, preset
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
@@ -24,6 +24,7 @@ from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.estimation import entry_of, message_of
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.replay import replay
 from plow_twin.ros.messages import set_stamp
 from plow_twin.scene_file import dump_scene
@@ -45,6 +46,7 @@ def _windows(loads: list[tuple[int, tuple[float, ...]]], poses: list[tuple[int, 
     for index, load in enumerate(loads):
         if index < len(poses):
             windows.take_pose(*poses[index])
+            windows.take_gaps(poses[index][0], (1, 3), poses[index][1][:2])
         formed = windows.take_load(*load)
         if formed is not None:
             found.append(formed)
@@ -63,10 +65,12 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
     assert len(ordered) >= 4
     for one, other in zip(ordered, mixed, strict=True):
         assert (one.start_ns, one.samples, one.poses, one.lost) == (other.start_ns, other.samples, other.poses, 0)
+        assert one.gaps is not None and one.poses == len(one.pose.t) + len(one.gaps.t)
         for first, second in (
             (one.load.t, other.load.t),
             (one.load.wrench, other.load.wrench),
             (one.pose.q, other.pose.q),
+            (one.gaps.gap[:, [1, 3]], other.gaps.gap[:, [1, 3]]),  # type: ignore[union-attr]
         ):
             assert np.array_equal(first, second)
 
@@ -85,7 +89,8 @@ def _play(running: Bench, truth: Truth, late: bool) -> None:
     """Send load and poses of a truth, faster than their stamps say; `late`: some poses come 1 s after their stamp."""
     probe = running.probe
     send = probe.excitation()
-    pose = probe.publisher(PoseStamped, "head_pose")
+    pose, gap = probe.publisher(PoseStamped, "head_pose"), probe.publisher(JointState, "gaps")
+    gaps = gaps_at(truth.scene, truth.poses.q)
     rows: list[tuple[float, int, Any]] = [
         (t, 0, wrench) for t, wrench in zip(truth.load.t, truth.load.wrench, strict=True)
     ]
@@ -101,6 +106,11 @@ def _play(running: Bench, truth: Truth, late: bool) -> None:
             message.pose.position.x, message.pose.position.y = x, y
             message.pose.orientation.z, message.pose.orientation.w = np.sin(0.5 * theta), np.cos(0.5 * theta)
             pose.publish(message)
+            place = int(np.searchsorted(truth.poses.t, stamp))
+            if place % 5 == 0:
+                measured = JointState(name=PAIR_NAMES, position=gaps[place].tolist())
+                measured.header.stamp = message.header.stamp
+                gap.publish(measured)
         probe.pace(index)
 
 
@@ -153,6 +163,9 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
     facts = json.loads(done.stdout)
     assert facts["live"]["repeated"] is True and facts["live"]["estimates"] >= 1
     assert facts["horizontal"]["mean_m"] == found["horizontal"]
+    # gaps were measured too: they tell the groups of pads
+    group = facts["groups"]["horizontal_top"]
+    assert group["mean_m"] == pytest.approx(truth.clearance[0], abs=3e-4) and group["p95_m"] - group["p05_m"] > 4e-4
     # what follows from the estimate is the same too
     assert facts["forecast"] == json.loads(answer.message)
     told = dict(zip(forecasts[-1].name, forecasts[-1].position, strict=True))

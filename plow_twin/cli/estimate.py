@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     "--map",
     "mapping",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML that says which topic of a recording is the excitation and which the head_pose.",
+    help="YAML that says which topic of a recording is the excitation, which the head_pose or the gaps.",
 )
 @json_option
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for estimate.json, forces.csv.")
@@ -53,10 +53,11 @@ def estimate(
 ) -> int:
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
 
-    INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed) and pose.csv (t,
-    x, y, theta: the measured pose, a cell left empty was not measured), a run of ours, or another recording (MCAP,
-    rosbag2's sqlite3). Where the node of a run estimated, its newest estimate is made again from the journal and
-    compared, bit for bit; else the measured pose is one recorded beside the run.
+    INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed), pose.csv (t, x,
+    y, theta: the measured pose, a cell left empty was not measured) and, beside or instead of that, gaps.csv (t and
+    columns named after pairs: measured gaps), a run of ours, or another recording (MCAP, rosbag2's sqlite3). Where the
+    node of a run estimated, its newest estimate is made again from the journal and compared, bit for bit; else the
+    measured pose is one recorded beside the run.
     """
     import numpy as np
 
@@ -110,14 +111,17 @@ class _Task:
 def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
     """Return the task of estimating from all that was measured."""
     from plow_twin.estimate.estimate import estimate as run
+    from plow_twin.estimate.gaps import Gaps
     from plow_twin.estimate.measurements import Load, Poses
     from plow_twin.record.measured import read_measured, read_recording
 
     measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
     load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:], measured.load_deviation)
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
-    lost = measured.unreadable + lost_load + lost_poses
-    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost), {}))
+    gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
+    lost = measured.unreadable + lost_load + lost_poses + lost_gaps
+    told = gaps if len(gaps.t) else None
+    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost, told), {}))
 
 
 def _repeated(source: Path) -> _Task | None:
@@ -182,6 +186,7 @@ def _show(result: Estimate) -> None:
         ("bias theta", result.bias_theta, 1e3, "mrad", ""),
         ("delay", result.delay, 1e3, "ms", ""),
     ]
+    rows += [(name.replace("_", ", "), value, 1e3, "mm", state.value) for name, (value, state) in result.groups.items()]
     view = table(f"Estimate from {result.t_start:.2f} s to {result.t_end:.2f} s", "", "mean", "5 %", "95 %", "", "")
     for name, value, factor, unit, state in rows:
         if value is not None:

@@ -39,6 +39,13 @@ if TYPE_CHECKING:
     help="CSV of clearances over time (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm): they tell "
     "the wear coefficient and the clearances now.",
 )
+@click.option(
+    "--scenario",
+    "scenarios",
+    metavar="NAME:load=X,coefficient=Y",
+    multiple=True,
+    help="The same for multiples of load and wear coefficient; may be given again.",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
 @click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="PNG of clearances and probability.")
 @json_option
@@ -52,6 +59,7 @@ def forecast(
     face_length: float,
     estimated: Path | None,
     history: Path | None,
+    scenarios: tuple[str, ...],
     seed: int,
     plot: Path | None,
     as_json: bool,
@@ -62,13 +70,15 @@ def forecast(
     SCENE is a scene file, a preset, or a run of ours: of that the scene, and the newest estimate of its node.
     """
     from plow_twin.estimate.coefficient import coefficient
-    from plow_twin.estimate.forecast import Plan, with_clearances
+    from plow_twin.estimate.forecast import Plan, Scenario, with_clearances
     from plow_twin.estimate.forecast import forecast as run
 
     model, facts_now = _scene(scene)
     if estimated is not None:
         facts_now = json.loads(estimated.read_text(encoding="utf-8"))
-    plan = Plan(1e-3 * limit_horizontal, 1e-3 * limit_vertical, horizon, stop, face_length, seed=seed)
+    limits = 1e-3 * limit_horizontal, 1e-3 * limit_vertical
+    others = tuple(Scenario.parse(text) for text in scenarios)
+    plan = Plan(*limits, horizon, stop, face_length, seed=seed, scenarios=others)
     with busy("forecasting", quiet or as_json):
         if history is None:
             model, deviation = _now(model, facts_now)
@@ -152,9 +162,11 @@ def _now(scene: Scene, facts: dict[str, Any] | None) -> tuple[Scene, tuple[float
 
 def _show(facts: dict[str, Any]) -> None:
     view = table("Time to the limit", "", "hours", "km", "passes", "shifts")
-    for name in ("p10", "p50", "p90"):
-        cells = [facts[name][key] for key in ("hours", "km", "passes", "shifts")]
-        view.add_row(name.upper(), *("not reached" if cell is None else f"{cell:.4g}" for cell in cells))
+    for title, told in (("", facts), *facts["scenarios"].items()):
+        for name in ("p10", "p50", "p90"):
+            cells = [told[name][key] for key in ("hours", "km", "passes", "shifts")]
+            text = ("not reached" if cell is None else f"{cell:.4g}" for cell in cells)
+            view.add_row(f"{title} {name.upper()}".strip(), *text)
     console = output_console()
     console.print(view)
     console.print(f"not reached in {facts['horizon_h']:g} h: {100 * facts['not_reached_in_horizon']:.0f} %")

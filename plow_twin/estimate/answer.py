@@ -52,7 +52,7 @@ class Answer:
 
 def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
     """Estimate from a window, beginning at `guess`, and tell what is asked beside that."""
-    result, following = estimate_window(scene, window.load, window.pose, window.lost, guess)
+    result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
     if asked.members:
         try:

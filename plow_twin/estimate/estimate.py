@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from plow_twin.estimate.bouncing import Bounced, bounces, compare
 from plow_twin.estimate.fit import Fit, Problem
 from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.gaps import Gaps, Told, tell
 from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
+from plow_twin.estimate.pads import by_group, turned
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.start import range_of_motion
@@ -19,13 +22,15 @@ from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor,
 from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
-#: Shared unknowns and noise of the window before, 14 numbers; empty: none.
+#: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: none.
 Guess = tuple[float, ...]
 
 #: Largest standard deviation in m with which a clearance counts as estimated.
 OBSERVED = 1e-3
 #: Longest distance of poses in s: where fewer lie in a flight, its start is guessed wrong and the fit with it.
 SPARSEST = 0.125
+#: The same of a group of pads: there is no other use of it than to see that a wall is worn askew.
+GROUP_OBSERVED = 5e-4
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
 #: Knots of the load in a period that are simulated, about.
@@ -48,11 +53,13 @@ UNFINISHED = 1.3
 MOST_LEFT = 25.0
 #: Most that the freedom of the fit adds to the scatter of few swings.
 _MOST_FREED = 3.0
+#: How far gaps may be from each other, and from what the motion says, in standard deviations of theirs.
+MOST_CONTRADICTION = 5.0
 #: Pairs of the left, right, top and bottom walls of the cavity.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
 
-def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0) -> Estimate:
+def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0, gaps: Gaps | None = None) -> Estimate:
     """Estimate clearances, contact, load gains and the sensor's bias and delay from one window of measurements.
 
     Parameters
@@ -65,18 +72,32 @@ def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0) -> Estimate:
         The measured poses.
     lost : int
         Rows that were left out before.
+    gaps : Gaps, optional
+        Measured gaps: they tell the clearances directly, and the pose where that is not measured.
     """
-    return estimate_window(scene, load, poses, lost)[0]
+    return estimate_window(scene, load, poses, lost, gaps=gaps)[0]
 
 
-def estimate_window(scene: Scene, load: Load, poses: Poses, lost: int = 0, guess: Guess = ()) -> tuple[Estimate, Guess]:
+def estimate_window(
+    scene: Scene, load: Load, poses: Poses, lost: int = 0, guess: Guess = (), gaps: Gaps | None = None
+) -> tuple[Estimate, Guess]:
     """Estimate as `estimate` does, from what the window before told; return the guess for the next one too.
 
     Where the fit from `guess` does not hold, all is searched as without one.
     """
-    unknowns = Unknowns(scene, Spread.stated(load, poses))
-    poses = poses.between(float(load.t[0]), float(load.t[-1]) + 1e-9)
     span = float(load.t[0]), float(load.t[-1])
+    poses = poses.between(span[0], span[1] + 1e-9)
+    told = None if gaps is None else tell(scene, gaps.between(span[0], span[1] + 1e-9), poses)
+    if told is not None and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
+        poses = told.poses
+    result, following = _from_motion(scene, load, poses, lost, guess)
+    return (result, following) if told is None else (_with_gaps(result, told), following)
+
+
+def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess) -> tuple[Estimate, Guess]:
+    """Estimate from the motion alone."""
+    span = float(load.t[0]), float(load.t[-1])
+    unknowns = Unknowns(scene, Spread.stated(load, poses))
     if len(poses.t) < FEWEST_POSES:
         few = f"got {len(poses.t)} poses from {span[0]:g} s to {span[1]:g} s, the load's span, expected {FEWEST_POSES}"
         return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
@@ -90,10 +111,11 @@ def estimate_window(scene: Scene, load: Load, poses: Poses, lost: int = 0, guess
     forward = Forward(scene, felt)
     if guess:
         numbers = np.array(guess)
-        near = refine(forward, unknowns, poses, period, unknowns.within(numbers[:SIZE]), numbers[SIZE:], broad)
+        shared, noise, turns = np.split(numbers, [SIZE, SIZE + 3])
+        near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, broad, turns)
         verdict = judge(*near, period) if near else None
         if near and verdict and not (verdict.model or verdict.sensor) and near[1].gain_left < MOST_LEFT:
-            return summarise(*near, verdict, lost), _next_guess(near[1])
+            return summarise(*near, verdict, lost), _next_guess(*near)
         forward = Forward(scene, felt)
     first = candidate(forward, unknowns, poses, period)
     if first is None:
@@ -106,8 +128,56 @@ def estimate_window(scene: Scene, load: Load, poses: Poses, lost: int = 0, guess
     if found is None:
         return _without_fit(unknowns, poses, lost), ()
     verdict = judge(*found, period)
+    if not verdict.sensor and (verdict.model or found[1].gain_left > MOST_LEFT):
+        again = turned(*found)
+        other = None if again is None else judge(*again, period)
+        if again and other and not (other.model or other.sensor) and again[1].gain_left < MOST_LEFT:
+            found, verdict = again, other
     result = summarise(*found, verdict, lost)
-    return result, () if verdict.model or verdict.sensor else _next_guess(found[1])
+    return result, () if verdict.model or verdict.sensor else _next_guess(*found)
+
+
+def _with_gaps(result: Estimate, told: Told) -> Estimate:
+    """Put together what the motion and what gap sensors tell; where they contradict each other, nothing holds."""
+    found = []
+    if told.contradiction > MOST_CONTRADICTION:
+        found.append(
+            f"gaps: {told.contradiction:.1f} times their stated error from what they tell together, expected at most "
+            f"{MOST_CONTRADICTION:g}"
+        )
+    values, states = [], []
+    for name, value, state, mean, deviation in zip(
+        ("horizontal", "vertical"),
+        (result.horizontal, result.vertical),
+        (result.horizontal_state, result.vertical_state),
+        told.clearance.tolist(),
+        told.deviation.tolist(),
+        strict=True,
+    ):
+        moved = value.deviation
+        off = abs(value.mean - mean) / math.hypot(deviation, moved)
+        if state is State.ESTIMATED and off > MOST_CONTRADICTION:
+            found.append(
+                f"gaps: {name} {mean:.5f} m, by the motion {value.mean:.5f} m: {off:.1f} of their deviations apart"
+            )
+        if state is State.ESTIMATED:
+            mean, deviation = _both((mean, deviation), (value.mean, moved))
+        withdrawn = state is State.WITHDRAWN
+        values.append(value if withdrawn else Interval.normal(mean, deviation).above(0.0))
+        states.append(state if withdrawn else State.ESTIMATED)
+    if found:
+        states = [State.WITHDRAWN] * 2
+    state = State.WITHDRAWN if found else State.ESTIMATED
+    return replace(
+        result,
+        horizontal=values[0],
+        vertical=values[1],
+        horizontal_state=states[0],
+        vertical_state=states[1],
+        groups=result.groups | {name: (value, state) for name, value in told.groups.items()},
+        sensor="suspect" if found else result.sensor,
+        reasons=(*result.reasons, *found),
+    )
 
 
 def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
@@ -154,12 +224,18 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
     )
 
 
+def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
+    """Return mean and deviation of what two independent measurements tell together."""
+    weights = one[1] ** -2, other[1] ** -2
+    return (one[0] * weights[0] + other[0] * weights[1]) / sum(weights), sum(weights) ** -0.5
+
+
 def _state(suspect: bool, observed: bool) -> State:
     return State.WITHDRAWN if suspect else State.ESTIMATED if observed else State.NOT_OBSERVABLE
 
 
-def _next_guess(fit: Fit) -> Guess:
-    return (*fit.shared.tolist(), *fit.noise.tolist())
+def _next_guess(problem: Problem, fit: Fit) -> Guess:
+    return (*fit.shared.tolist(), *fit.noise.tolist(), *problem.turns.tolist())
 
 
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
@@ -234,6 +310,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
+        groups=_groups(problem, fit, covariance, states),
         correlation=_correlation(covariance),
         figures={
             **verdict.figures,
@@ -265,6 +342,18 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
         covariance[GX, GX] += HARD_SCATTER**2
         covariance[GY, GY] += HARD_SCATTER**2
     return covariance
+
+
+def _groups(problem: Problem, fit: Fit, covariance: Array, states: list[State]) -> dict[str, tuple[Interval, State]]:
+    """Return the clearance of each group of pads; not observable where the motion does not tell it."""
+    widened = float(np.sqrt(covariance[GX, GX] / fit.covariance[GX, GX]))
+    out = {}
+    for name, (value, deviation) in by_group(problem, fit, widened).items():
+        state = states[0 if name.startswith("horizontal") else 1]
+        if state is State.ESTIMATED and deviation > GROUP_OBSERVED:
+            state = State.NOT_OBSERVABLE
+        out[name] = value.above(0.0), state
+    return out
 
 
 def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:

@@ -13,6 +13,7 @@ Optimization, ch. 10; Huber, Robust Statistics, ch. 7.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, SIZE, Unknowns
+from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 
@@ -38,6 +40,8 @@ _START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
 #: Standard deviations of the displacements that probe what can be foretold.
 _PROBED_STATE = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
 _PROBED = np.array([5e-5, 5e-5, 2e-3, 5e-3, 2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0])
+#: Walls by their two pads: left, right (top pad first), top, bottom (left pad first).
+WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
 #: Longest step of the iteration in units of the prior's standard deviation.
 _LONGEST_STEP = 1.0
 
@@ -124,21 +128,33 @@ class Fit:
         return deviation
 
 
+def depth_of(turns: Array) -> Array | None:
+    """Return by how much each pad lies further out, shape (8,), in m; None where no wall is turned."""
+    if not turns.any():
+        return None
+    depth = np.zeros(PAIR_COUNT)
+    for (first, second), turn in zip(WALLS, turns, strict=True):
+        depth[first], depth[second] = 0.5 * turn, -0.5 * turn
+    return depth
+
+
 class Problem:
     """A window of measurements, the prior and the forward model together.
 
-    `horizon` limits each swing to its first seconds.
+    `horizon` limits each swing to its first seconds; `turns` (4,) are by how much the first pad of each wall lies
+    further out than the second, in m (`WALLS`).
     """
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, window: Window, prior: tuple[Array, Array] | None = None,
-        horizon: float = np.inf,
+        horizon: float = np.inf, turns: Array | None = None,
     ) -> None:  # fmt: skip
         self.forward, self.unknowns, self.window, self.horizon = forward, unknowns, window, horizon
         self.mean, self.deviation = prior or (unknowns.nominal(), unknowns.deviations())
+        self.turns = np.zeros(len(WALLS)) if turns is None else turns
 
-    def evaluate(self, shared: Array, states: Array) -> Point | None:
-        """Run the model; None where it leaves the model's range."""
+    def evaluate(self, shared: Array, states: Array, turns: Array | None = None) -> Point | None:
+        """Run the model, with other `turns` than the problem's if given; None where it leaves the model's range."""
         window = self.window
         times = window.poses.t - shared[DELAY]
         swing = np.searchsorted(window.starts, times, side="right") - 1
@@ -148,7 +164,8 @@ class Problem:
         # times rise, so a swing's rows lie together
         edges = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
         motions = self.forward.run(
-            self.unknowns.scene_of(shared), shared[GAIN], window.starts[:-1], states, edges, times[rows]
+            self.unknowns.scene_of(shared), shared[GAIN], window.starts[:-1], states, edges, times[rows],
+            depth_of(self.turns if turns is None else turns),
         )  # fmt: skip
         if motions is None:
             return None

@@ -1,10 +1,13 @@
-"""Remaining life: when a clearance reaches its limit, as a distribution over coefficient, clearance now and load."""
+"""Remaining life: when a clearance reaches its limit, as a distribution over coefficient, clearance now and load.
+
+Scenarios tell the same for another load or another wear coefficient, from the same draws.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +17,7 @@ from plow_twin.estimate.coefficient import Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, State
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Clearance, Scene
+from plow_twin.model.scene import Clearance, Scene, Table
 
 Array = NDArray[np.float64]
 
@@ -22,6 +25,37 @@ HOUR_S = 3600.0
 #: Relative standard deviation of the rate beside what a history tells: means over a few periods, a load whose share
 #: differs from pad to pad. Set on lives with seeds below 1000 (benchmark/lives.py).
 PATH_DEVIATION = 0.03
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """What may come otherwise: the load and the wear coefficient, as multiples of those expected."""
+
+    name: str
+    load: float = 1.0
+    coefficient: float = 1.0
+
+    @staticmethod
+    def parse(text: str) -> Scenario:
+        """Return the scenario of a text like `hard coal:load=1.3,coefficient=2`.
+
+        Raises
+        ------
+        LifeError
+            For any other text, or a multiple that is not above 0.
+        """
+        name, _, given = text.partition(":")
+        numbers = {}
+        for part in given.split(","):
+            key, _, value = part.partition("=")
+            try:
+                numbers[key.strip()] = float(value)
+            except ValueError:
+                numbers[key.strip()] = math.nan
+        good = bool(name.strip()) and numbers.keys() <= {"load", "coefficient"}
+        if not good or not all(0.0 < value < math.inf for value in numbers.values()):
+            raise LifeError(f"scenario: got {text!r}, expected NAME:load=X,coefficient=Y, one of them or both, above 0")
+        return Scenario(name.strip(), **numbers)
 
 
 @dataclass(frozen=True)
@@ -38,6 +72,7 @@ class Plan:
     load_deviation: float = 0.05
     draws: int = 2000
     seed: int = 0
+    scenarios: tuple[Scenario, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +83,7 @@ class Forecast:
     path : the wear as it goes on at the clearances believed
     rate : (draws,) exposure in an hour in 1/N
     now : (draws, 2) clearances now in m
+    scenarios : the same for each scenario of the plan, by name
     """
 
     hours: Array
@@ -56,6 +92,7 @@ class Forecast:
     speed_m_s: float
     plan: Plan
     path: Path
+    scenarios: dict[str, Forecast] = field(default_factory=dict)
 
     def quantile(self, share: float) -> float | None:
         """Return the hours by which the limit is reached with this probability; None beyond the horizon."""
@@ -81,6 +118,20 @@ class Forecast:
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON; null stands for `not reached in the horizon`."""
+        plan = self.plan
+        return {
+            **self._times(),
+            "horizon_h": plan.horizon_h,
+            "limit_m": [plan.limit_horizontal_m, plan.limit_vertical_m],
+            "path_steps": len(self.path.exposure),
+            "path_error_m": self.path.error,
+            "scenarios": {
+                one.name: {"load": one.load, "coefficient": one.coefficient, **self.scenarios[one.name]._times()}
+                for one in plan.scenarios
+            },
+        }
+
+    def _times(self) -> dict[str, Any]:
         plan, out = self.plan, {}
         for name, share in (("p10", 0.10), ("p50", 0.50), ("p90", 0.90)):
             hours = self.quantile(share)
@@ -95,10 +146,6 @@ class Forecast:
             **out,
             "not_reached_in_horizon": float(np.mean(~np.isfinite(self.hours))),
             "probability_before_stop": None if plan.stop_h is None else self.probability_before(plan.stop_h),
-            "horizon_h": plan.horizon_h,
-            "limit_m": [plan.limit_horizontal_m, plan.limit_vertical_m],
-            "path_steps": len(self.path.exposure),
-            "path_error_m": self.path.error,
         }
 
 
@@ -125,8 +172,22 @@ def forecast(
     Raises
     ------
     LifeError
-        Where the scene has no wear, does not travel or has no period.
+        Where the scene has no wear, does not travel or has no period; for two scenarios of one name.
     """
+    names = [one.name for one in plan.scenarios]
+    if len(set(names)) < len(names):
+        raise LifeError(f"scenarios: got the names {', '.join(names)}, expected each once")
+    others = {
+        one.name: _forecast(with_load(scene, one.load), plan, deviation_m, known, one.coefficient)
+        for one in plan.scenarios
+    }
+    return replace(_forecast(scene, plan, deviation_m, known), scenarios=others)
+
+
+def _forecast(
+    scene: Scene, plan: Plan, deviation_m: tuple[float, float], known: Coefficient | None, multiple: float = 1.0
+) -> Forecast:
+    """Forecast for a wear coefficient that is a multiple of what is known of it."""
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
         raise LifeError("wear: got none or no travel speed, expected both")
@@ -137,6 +198,7 @@ def forecast(
     load = np.maximum(1.0 + plan.load_deviation * rng.standard_normal(plan.draws), 0.1)
     if known is not None:
         coefficient, load = known.draw(plan.draws, rng), 1.0 + PATH_DEVIATION * rng.standard_normal(plan.draws)
+    coefficient = coefficient * multiple
     now = rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a clearance that is smaller now has further to go: the path must reach that far
@@ -162,6 +224,23 @@ def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:
     rising = np.maximum.accumulate(clearance) + 1e-15 * np.arange(len(clearance))
     at = np.interp(limit, rising, exposure)
     return np.where(limit > rising[-1], np.inf, np.where(limit <= rising[0], 0.0, at))
+
+
+def with_load(scene: Scene, multiple: float) -> Scene:
+    """Return the scene with all of its loads multiplied; gravity stays."""
+
+    def times(values: tuple[float, float]) -> tuple[float, float]:
+        return multiple * values[0], multiple * values[1]
+
+    return replace(
+        scene,
+        loads=tuple(
+            replace(load, wrench=multiple * load.wrench)
+            if isinstance(load, Table)
+            else replace(load, force_n=times(load.force_n), moment_n_m=multiple * load.moment_n_m)
+            for load in scene.loads
+        ),
+    )
 
 
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float) -> Scene:

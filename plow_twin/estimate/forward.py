@@ -55,13 +55,19 @@ class Forward:
         pieces = Pieces.through(load.t, load.wrench)
         self._start, self._slope = pieces.start / inertias(scene), pieces.slope / inertias(scene)
         self._knots = pieces.knots
+        self._scene, self._load = scene, load
         self._work, self._log = new_work(), np.zeros(_LOG_SIZE, EVENT)
         #: work done so far, in steps of the series
         self.work = 0
 
+    def renewed(self) -> Forward:
+        """Return another one for the same motions, with no work done."""
+        return Forward(self._scene, self._load)
+
     def run(
-        self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array
-    ) -> Motions | None:
+        self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array,
+        depth: Array | None = None,
+    ) -> Motions | None:  # fmt: skip
         """Return the motions of `scene` under the load times `gain`, shape (3,), from several states.
 
         Parameters
@@ -72,6 +78,8 @@ class Forward:
             Run m fills the rows edges[m]:edges[m + 1].
         times : ndarray, shape (n,)
             Times of the rows in s, rising within each run and not before its start.
+        depth : ndarray, shape (8,), optional
+            By how much each pad lies further out than the clearances say, in m.
 
         Returns
         -------
@@ -82,6 +90,8 @@ class Forward:
         segments["knot"] = self._knots
         segments["start"], segments["slope"] = self._start * gain, self._slope * gain
         compiled = compile_scene(scene, TOLERANCE, sampled=True)
+        if depth is not None:
+            compiled.params["penetration_rows"][4] -= depth
         records = new_records(state_type(self._terms), len(starts))
         records["y"] = _bodies(states, scene.head.com_offset_m)
         if self._terms.hysteretic is not None:

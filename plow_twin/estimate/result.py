@@ -42,11 +42,16 @@ class Interval:
         half = NORMAL_P95 * float(deviation)
         return Interval(float(mean), float(mean) - half, float(mean) + half)
 
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the normal distribution that has this interval."""
+        return (self.p95 - self.p05) / (2.0 * NORMAL_P95)
+
     def above(self, least: float) -> Interval:
         """Return the interval of the same normal distribution cut off below `least`."""
         from scipy.stats import truncnorm
 
-        deviation = (self.p95 - self.p05) / (2.0 * NORMAL_P95)
+        deviation = self.deviation
         if deviation <= 0.0 or (least - self.mean) < -4.0 * deviation:
             return self
         cut = truncnorm((least - self.mean) / deviation, np.inf, loc=self.mean, scale=deviation)
@@ -79,6 +84,9 @@ class Estimate:
         Rows that could not be used.
     correlation : tuple of tuple of float
         Correlation of `CORRELATED`; stiffness and clearance stand for each other in part.
+    groups : dict of str to (Interval, State)
+        Clearance between the pads that face each other: `horizontal_top`, `horizontal_bottom`, `vertical_left`,
+        `vertical_right`, in m.
     """
 
     t_start: float
@@ -103,6 +111,7 @@ class Estimate:
     lost: int = 0
     correlation: tuple[tuple[float, ...], ...] | None = None
     figures: dict[str, float] = field(default_factory=dict)
+    groups: dict[str, tuple[Interval, State]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON, as `plow-twin estimate --json` prints it."""
@@ -127,4 +136,5 @@ class Estimate:
             if self.correlation is None
             else {"names": list(CORRELATED), "matrix": [list(row) for row in self.correlation]},
             "figures": self.figures,
+            "groups": {name: clearance(value, state) for name, (value, state) in self.groups.items()},
         }

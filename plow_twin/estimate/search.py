@@ -62,21 +62,25 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def refine(
-    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, broad: bool
-) -> tuple[Problem, Fit] | None:
-    """Fit all poses from a good start: the beginning of each swing first; `broad`: the load is broad-band."""
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, broad: bool,
+    turns: Array | None = None,
+) -> tuple[Problem, Fit] | None:  # fmt: skip
+    """Fit all poses from a good start: the beginning of each swing first; `broad`: the load is broad-band.
+
+    `turns` (4,) are those of the walls, in m.
+    """
     hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest, horizon = _SHORT if hard else _BROAD if broad else _LONG
     shortest, horizon = max(shortest * period, rows[1]), max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
-    near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon))
+    near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
     starts = [shared, *([range_of_hard(unknowns, poses, shared)] if hard else [])]
     fits = [fit(near, start, better_states(near, start, states_at(window, start)), noise, 10) for start in starts]
     found = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
     if found is None:
         return None
-    whole = Problem(forward, unknowns, window, horizon=horizon)
+    whole = Problem(forward, unknowns, window, horizon=horizon, turns=turns)
     states = better_states(whole, found.shared, found.point.states)
     found = fit(whole, found.shared, states, found.noise, 12 if hard else 8)
     return None if found is None else (whole, found)

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.gaps import Gaps
 from plow_twin.estimate.measurements import FEWEST_POSES, UNSTATED, Deviation, Load, Poses
+from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
 Row = tuple[int, float, float, float]
@@ -28,8 +30,9 @@ LEAST_SHARE = 0.5
 class Window:
     """What was measured in [start_ns, end_ns); times in s count from `start_ns`.
 
-    samples, poses : numbers of rows as they came, before any is left out
+    samples, poses : numbers of rows as they came, before any is left out, `poses` those of gaps too
     lost : rows left out
+    gaps : None where none were measured
     """
 
     start_ns: int
@@ -39,6 +42,7 @@ class Window:
     samples: int
     poses: int
     lost: int
+    gaps: Gaps | None = None
 
 
 class Windows:
@@ -51,6 +55,8 @@ class Windows:
     poses, load : tuple of 3 float
         Stated deviations of what is measured; that of the load until another one is stated, that of the poses where
         they bring no larger one.
+    gaps : float
+        Stated deviation of a gap sensor in m.
     """
 
     def __init__(
@@ -60,8 +66,9 @@ class Windows:
         wait_s: float,
         poses: Deviation = UNSTATED,
         load: Deviation = UNSTATED,
+        gaps: float = 0.0,
     ) -> None:
-        self._pose_deviation, self._load_deviation = poses, load
+        self._pose_deviation, self._load_deviation, self._gaps_deviation = poses, load, gaps
         self._length_ns, self._interval_ns = round(length_s * 1e9), round(interval_s * 1e9)
         self._wait_ns = round(wait_s * 1e9)
         self.restart()
@@ -71,6 +78,7 @@ class Windows:
         self._loads: list[Row] = []
         self._poses: list[Row] = []
         self._deviations: list[Row] = []
+        self._gaps: list[tuple[int, tuple[int, ...], tuple[float, ...]]] = []
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
 
@@ -83,6 +91,10 @@ class Windows:
         self._poses.append((stamp_ns, *q))  # type: ignore[arg-type]
         if deviation:
             self._deviations.append((stamp_ns, *deviation))  # type: ignore[arg-type]
+
+    def take_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
+        """Take in measured gaps in m of the pairs with these numbers."""
+        self._gaps.append((stamp_ns, pairs, gaps))
 
     def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
         """Take in a sample of the load Fx, Fy [N], M [N m]; return the window that is due now, if one is."""
@@ -104,6 +116,7 @@ class Windows:
         self._loads = [row for row in self._loads if row[0] >= start_ns]
         self._poses = [row for row in self._poses if row[0] >= start_ns]
         self._deviations = [row for row in self._deviations if row[0] >= start_ns]
+        self._gaps = [row for row in self._gaps if row[0] >= start_ns]
         stamps = np.sort(np.array([row[0] for row in self._loads if row[0] < end_ns], dtype=np.int64))
         gaps = np.flatnonzero(np.diff(stamps) > LONGEST_GAP_S * 1e9)
         if len(gaps):
@@ -111,13 +124,28 @@ class Windows:
         elif len(stamps):
             start_ns = max(start_ns, int(stamps[0]))
         poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
-        if end_ns - start_ns < LEAST_SHARE * self._length_ns or len(poses) < FEWEST_POSES or len(stamps) < 2:
+        measured = [row for row in self._gaps if start_ns <= row[0] < end_ns]
+        most = max(len(poses), len(measured))
+        if end_ns - start_ns < LEAST_SHARE * self._length_ns or most < FEWEST_POSES or len(stamps) < 2:
             return None
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
         load, lost_load = Load.of(*_table(rows, start_ns), self._load_deviation)
         own = [row[1:] for row in self._deviations if start_ns <= row[0] < end_ns]
         pose, lost_poses = Poses.of(*_table(poses, start_ns), at_least(self._pose_deviation, own))
-        return Window(start_ns, end_ns, load, pose, len(rows), len(poses), lost_load + lost_poses)
+        tabled, lost_gaps = self._table_of_gaps(measured, start_ns)
+        lost = lost_load + lost_poses + lost_gaps
+        return Window(start_ns, end_ns, load, pose, len(rows), len(poses) + len(measured), lost, tabled)
+
+    def _table_of_gaps(
+        self, rows: list[tuple[int, tuple[int, ...], tuple[float, ...]]], start_ns: int
+    ) -> tuple[Gaps | None, int]:
+        if not rows:
+            return None, 0
+        table = np.full((len(rows), PAIR_COUNT), np.nan)
+        for index, (_, pairs, values) in enumerate(rows):
+            table[index, list(pairs)] = values
+        stamps = np.array([row[0] for row in rows], dtype=np.int64)
+        return Gaps.of(np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), table, self._gaps_deviation)
 
 
 def at_least(stated: Deviation, own: Sequence[tuple[float, ...]]) -> Deviation:
@@ -131,4 +159,5 @@ def at_least(stated: Deviation, own: Sequence[tuple[float, ...]]) -> Deviation:
 def _table(rows: list[Row], start_ns: int) -> tuple[Array, Array]:
     """Return times in s, shape (n,), and values, shape (n, 3)."""
     stamps = np.array([row[0] for row in rows], dtype=np.int64)
-    return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), np.array([row[1:] for row in rows], dtype=np.float64)
+    values = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3)
+    return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), values

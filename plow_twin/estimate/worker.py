@@ -101,20 +101,24 @@ class Worker:
 
     def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> None:
         """Take in a sample of the load."""
-        self._waiting.append((stamp_ns, wrench, True))
+        self._waiting.append(("load", stamp_ns, wrench))
 
     def take_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
         """Take in a measured pose, with its deviations where they are known."""
-        self._waiting.append((stamp_ns, (q, deviation), False))
+        self._waiting.append(("pose", stamp_ns, q, deviation))
+
+    def take_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
+        """Take in measured gaps of the pairs with these numbers."""
+        self._waiting.append(("gaps", stamp_ns, pairs, gaps))
 
     def take_spread(self, deviation: Deviation) -> None:
         """Take in how well the load is known from here on."""
-        self._waiting.append((deviation,))
+        self._waiting.append(("spread", deviation))
 
     def restart(self) -> None:
         """Let the windows begin anew."""
         self._restarts += 1
-        self._waiting.append(())
+        self._waiting.append(("restart",))
 
     def poll(self) -> Found | None:
         """Return what has been found since the last call, if anything; what was before a restart is dropped."""
@@ -165,7 +169,7 @@ def serve(connection: Connection) -> None:
         due: Window | None = None
         while due is None or connection.poll():
             for item in connection.recv():
-                if not item:
+                if item[0] == "restart":
                     windows.restart()
                     due, guess, restarts = None, (), restarts + 1
                     continue
@@ -183,13 +187,15 @@ def serve(connection: Connection) -> None:
 
 def take(windows: Windows, item: tuple[Any, ...]) -> Window | None:
     """Take in one item as `Worker` sends it; return the window that is due, if one is."""
-    if len(item) == 1:
-        windows.take_spread(*item)
-        return None
-    stamp_ns, values, is_load = item
-    if is_load:
-        return windows.take_load(stamp_ns, values)
-    windows.take_pose(stamp_ns, *values)
+    kind, *values = item
+    if kind == "load":
+        return windows.take_load(*values)
+    if kind == "pose":
+        windows.take_pose(*values)
+    elif kind == "gaps":
+        windows.take_gaps(*values)
+    else:
+        windows.take_spread(*values)
     return None
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from plow_twin.errors import Problem
 from plow_twin.estimate.answer import Asked
 from plow_twin.estimate.forces import FEWEST
-from plow_twin.estimate.forecast import HOUR_S, Plan
+from plow_twin.estimate.forecast import HOUR_S, Plan, Scenario
+from plow_twin.estimate.life import LifeError
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.window import Windows
 from plow_twin.estimate.worker import Found, Worker
@@ -19,6 +20,7 @@ from plow_twin.record import messages as plain
 from plow_twin.stream.journal import (
     Entry,
     Estimated,
+    Gaps,
     PartOfPose,
     Pose,
     Reset,
@@ -48,7 +50,7 @@ class Estimation:
     def __init__(self, settings: Settings, scene: Scene) -> None:
         self._frame_id = settings.frame_id
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
-        windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation)
+        windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
         self._worker = Worker(scene, windows, asked_of(settings))
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
@@ -78,6 +80,8 @@ class Estimation:
                 self._worker.take_pose(stamp_ns, pose, deviation)
             case PartOfPose(stamp_ns) as part:
                 self._worker.take_pose(stamp_ns, whole_pose(part))
+            case Gaps(stamp_ns, pairs, gaps):
+                self._worker.take_gaps(stamp_ns, pairs, gaps)
             case Spread(_, deviation):
                 self._worker.take_spread(deviation)
             case SetWear():
@@ -189,8 +193,14 @@ def asked_of(settings: Settings) -> Asked:
     horizontal, vertical = settings.forecast_limits
     plan = None
     if horizontal or vertical:
-        plan = Plan(horizontal, vertical, settings.forecast_horizon / HOUR_S, settings.forecast_stop / HOUR_S or None)
+        stop_h = settings.forecast_stop / HOUR_S or None
+        plan = Plan(horizontal, vertical, settings.forecast_horizon / HOUR_S, stop_h, scenarios=scenarios_of(settings))
     return Asked(settings.estimate_forces, settings.estimate_interval, plan)
+
+
+def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
+    """Return the scenarios that the parameters name; LifeError where they cannot be read."""
+    return tuple(Scenario.parse(text) for text in settings.forecast_scenarios.split(";") if text.strip())
 
 
 def problems(settings: Settings, scene: Scene) -> list[Problem]:
@@ -203,6 +213,10 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
         found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))
     if any(limits) and (scene.wear is None or scene.wear.travel_speed_m_s <= 0.0):
         found.append(Problem("forecast_limits", limits, "0 where the scene has no wear or no travel speed"))
+    try:
+        scenarios_of(settings)
+    except LifeError as error:
+        found.append(Problem("forecast_scenarios", settings.forecast_scenarios, str(error)))
     if 0 < settings.estimate_forces < FEWEST:
         found.append(Problem("estimate_forces", settings.estimate_forces, f"0, or at least {FEWEST}"))
     return found

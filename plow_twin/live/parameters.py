@@ -154,6 +154,12 @@ class Settings:
         Effect.CONFIGURE,
         "time of operation to a planned stop, for the probability of a limit before it; 0: none",
     )
+    forecast_scenarios: str = _plain(
+        "",
+        Effect.CONFIGURE,
+        "what may come otherwise, as multiples of load and wear coefficient: NAME:load=X,coefficient=Y; NAME:...; each "
+        "is forecast too and stands in the answer of ~/forecast",
+    )
     wear_state_path: str = _plain(
         "",
         Effect.CONFIGURE,

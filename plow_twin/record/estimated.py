@@ -9,7 +9,7 @@ from typing import Any
 from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import Estimated, PartOfPose, Pose, Reset, SetWear, Spread, whole_pose
+from plow_twin.stream.journal import Estimated, Gaps, PartOfPose, Pose, Reset, SetWear, Spread, whole_pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
         return
     names = ("estimate_window", "estimate_interval", "rollback_span")
     length_s, interval_s, wait_s = (float(settings[name]) for name in names)
-    windows = Windows(length_s, interval_s, wait_s, *stated(settings))
+    windows = Windows(length_s, interval_s, wait_s, *stated(settings), float(settings.get("gaps_deviation", 0.0)))
     formed: dict[int, Window] = {}
     for batch in reader.batches(outputs=False):
         entries = batch.entries
@@ -46,6 +46,8 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
                     windows.take_pose(stamp_ns, pose, deviation)
                 case PartOfPose(stamp_ns) as part:
                     windows.take_pose(stamp_ns, whole_pose(part))
+                case Gaps(stamp_ns, pairs, gaps):
+                    windows.take_gaps(stamp_ns, pairs, gaps)
                 case Spread(_, deviation):
                     windows.take_spread(deviation)
                 case Reset() | SetWear():

@@ -1,13 +1,14 @@
 """What was measured, for the estimate: from a folder, from a run of ours, or from any recording by a mapping.
 
-A folder holds scene.yaml, load.csv (t, fx, fy, m) and pose.csv (t, x, y, theta).
+A folder holds scene.yaml, load.csv (t, fx, fy, m), pose.csv (t, x, y, theta) and, where gaps were measured, gaps.csv (t
+and columns named after pairs); with it pose.csv may be missing.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import at_least
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.estimated import stated
@@ -25,11 +27,11 @@ from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import PartOfPose, Pose, Spread, whole_pose
+from plow_twin.stream.journal import Gaps, PartOfPose, Pose, Spread, whole_pose
 
 Array = NDArray[np.float64]
 
-SCENE_FILE, LOAD_FILE, POSE_FILE = "scene.yaml", "load.csv", "pose.csv"
+SCENE_FILE, LOAD_FILE, POSE_FILE, GAPS_FILE = "scene.yaml", "load.csv", "pose.csv", "gaps.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 
@@ -39,8 +41,8 @@ class Measured:
     """What a folder holds.
 
     load : (n, 4) t [s], Fx, Fy [N], M [N m] believed; poses : (k, 4) t [s], x, y [m], theta [rad], NaN where a cell is
-    empty; unreadable : rows that are not numbers; pose_deviation, load_deviation : stated standard deviations, 0 where
-    none is.
+    empty; unreadable : rows that are not numbers; pose_deviation, load_deviation, gaps_deviation : stated standard
+    deviations, 0 where none is; gaps : (m, 9) t [s] and the gaps of the eight pairs [m], NaN where there is no sensor.
     """
 
     scene: Scene
@@ -49,6 +51,8 @@ class Measured:
     unreadable: int
     pose_deviation: Deviation = UNSTATED
     load_deviation: Deviation = UNSTATED
+    gaps: Array = field(default_factory=lambda: np.zeros((0, 1 + PAIR_COUNT)))
+    gaps_deviation: float = 0.0
 
 
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
@@ -62,10 +66,14 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
         When the scene cannot be used.
     """
     load, bad_load = _read(folder / LOAD_FILE, _LOAD_COLUMNS)
-    poses, bad_poses = _read(folder / POSE_FILE, _POSE_COLUMNS)
-    return Measured(
-        load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE), load, poses, bad_load + bad_poses
-    )
+    gaps, bad_gaps = np.zeros((0, 1 + PAIR_COUNT)), 0
+    if (folder / GAPS_FILE).is_file():
+        gaps, bad_gaps = _read(folder / GAPS_FILE, ("t",), PAIR_NAMES)
+    poses, bad_poses = np.zeros((0, 4)), 0
+    if not len(gaps) or (folder / POSE_FILE).is_file():
+        poses, bad_poses = _read(folder / POSE_FILE, _POSE_COLUMNS)
+    model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
+    return Measured(model, load, poses, bad_load + bad_poses + bad_gaps, gaps=gaps)
 
 
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
@@ -87,35 +95,37 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         if scene is None and not file.is_file():
             raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
         model = load_scene(scene_path(str(file)))
-        rows, unfit = _collect([path], mapping, ("excitation", "head_pose"), "")
-        loads = rows["excitation"]
+        rows, unfit = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
+        loads, gaps, gaps_deviation = rows["excitation"], rows["gaps"], 0.0
     else:
         given = scene is not None
         model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
-        loads, journalled, spread, own_deviations = _journal(own)
+        loads, journalled, gaps, spread, own_deviations = _journal(own)
+        gaps_deviation = float(own.header.parameters.get("gaps_deviation", 0.0))
         of_poses, of_load = stated(own.header.parameters)
         deviations = at_least(of_poses, own_deviations), tuple(np.maximum(of_load, spread).tolist())
         rows, unfit = {"head_pose": journalled}, 0
-        if mapping is not None or not len(journalled):
+        if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
             rows, unfit = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
         unfit += sum(own.lost.values())
     poses = rows["head_pose"]
-    for name, found in (("load", loads), ("measured pose", poses)):
-        if not len(found):
+    for name, found in (("load", len(loads)), ("measured pose", len(poses) + len(gaps))):
+        if not found:
             raise RecordingError(f"{path}: got no {name}, expected some")
     origin = loads[0, 0]
-    for table in (loads, poses):
+    for table in (loads, poses, gaps):
         table[:, 0] = (table[:, 0] - origin) * 1e-9
-    return Measured(model, loads, poses, unfit, *deviations)
+    return Measured(model, loads, poses, unfit, *deviations, gaps, gaps_deviation)
 
 
-def _journal(reader: RunReader) -> tuple[Array, Array, Array, list[tuple[float, ...]]]:
-    """Return samples and poses of a journal, (n, 4) each, stamps in ns, and what it says of deviations.
+def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, list[tuple[float, ...]]]:
+    """Return samples, poses and gaps of a journal, stamps in ns in front, and what it says of deviations.
 
     Those are the largest of the load, (3,), and those that came with poses.
     """
     loads, poses, spread, deviations = [np.zeros((0, 4))], [], np.zeros(3), []
+    gaps: list[Array] = []
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         loads.append(np.column_stack([entries.stamp_ns, entries.wrench])[entries.sample])
@@ -125,9 +135,14 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, list[tuple[float, 
                 deviations += [entry.deviation] if entry.deviation else []
             elif isinstance(entry, PartOfPose):
                 poses.append((entry.stamp_ns, *whole_pose(entry)))
+            elif isinstance(entry, Gaps):
+                row = np.full(1 + PAIR_COUNT, np.nan)
+                row[0], row[1 + np.array(entry.pairs)] = entry.stamp_ns, entry.gaps
+                gaps.append(row)
             elif isinstance(entry, Spread):
                 spread = np.maximum(spread, entry.deviation)
-    return np.concatenate(loads), np.array(poses, dtype=np.float64).reshape(-1, 4), spread, deviations
+    measured = np.array(poses, dtype=np.float64).reshape(-1, 4)
+    return np.concatenate(loads), measured, np.array(gaps).reshape(-1, 1 + PAIR_COUNT), spread, deviations
 
 
 def _collect(
@@ -147,11 +162,14 @@ def _collect(
                 stamp_ns, values = found
                 rows[name].append([float(stamp_ns), *(values.get(key, math.nan) for key in ROLES[name])])
         unfit += sum(source.losses.counts.values())
-    return {name: np.array(found, dtype=float).reshape(-1, 4) for name, found in rows.items()}, unfit
+    return {name: np.array(found, dtype=float).reshape(-1, 1 + len(ROLES[name])) for name, found in rows.items()}, unfit
 
 
-def _read(path: Path, columns: tuple[str, ...]) -> tuple[Array, int]:
-    """Return the rows of a csv file, NaN for an empty cell, and how many could not be read."""
+def _read(path: Path, columns: tuple[str, ...], some: tuple[str, ...] = ()) -> tuple[Array, int]:
+    """Return the rows of a csv file, NaN for an empty cell, and how many could not be read.
+
+    `columns` must be there; of `some` those that are not are NaN.
+    """
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
@@ -162,7 +180,7 @@ def _read(path: Path, columns: tuple[str, ...]) -> tuple[Array, int]:
     missing = [name for name in columns if name not in header]
     if missing:
         raise RecordingError(f"{path}: got the columns {', '.join(header)}, expected {', '.join(columns)}")
-    places = [header.index(name) for name in columns]
+    places = [header.index(name) if name in header else len(header) for name in (*columns, *some)]
     found, bad = [], 0
     for row in rows[1:]:
         numbers = [_number(row[place]) if place < len(row) else math.nan for place in places]
@@ -170,7 +188,7 @@ def _read(path: Path, columns: tuple[str, ...]) -> tuple[Array, int]:
             bad += 1
         else:
             found.append(numbers)
-    return np.array(found, dtype=float).reshape(-1, len(columns)), bad
+    return np.array(found, dtype=float).reshape(-1, len(places)), bad
 
 
 def _number(cell: str) -> float | None:

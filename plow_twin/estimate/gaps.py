@@ -1,0 +1,188 @@
+"""What gap sensors tell: the clearances directly, whatever the contact is like, and the pose where it is not measured.
+
+A gap is linear in the head's body coordinates and in the clearances (`model/geometry.py`), so each message with sensors
+at enough pairs gives both by least squares: five of them, or four, one at each wall, beside a measured theta. What is
+left is what the sensors' constant errors make of it: these do not average out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.result import Interval
+from plow_twin.model.geometry import penetration_rows
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
+from plow_twin.model.scene import Clearance, Scene
+
+Array = NDArray[np.float64]
+
+#: Constant error of a sensor in m (standard deviation) where none is stated: dirt on a worn skid.
+CONSTANT_ERROR: Final = 1e-4
+#: Fewest messages from which anything is told.
+FEWEST_MESSAGES: Final = 20
+#: Beyond it a number is no gap [m].
+_LARGEST = 1e3
+_ROUNDS = 4
+#: Singular value of the equations below which an unknown does not follow from the sensors.
+_SINGULAR = 1e-6
+#: Clearances between the pads that face each other, by the two pairs.
+GROUPS: Final = {
+    "horizontal_top": (1, 3),
+    "horizontal_bottom": (7, 5),
+    "vertical_left": (0, 6),
+    "vertical_right": (2, 4),
+}
+
+
+class GapsError(PlowTwinError):
+    """The gaps have the wrong shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """Measured gaps: `t` (n,) stamps in s, strictly increasing; `gap` (n, 8) in m, NaN where there is no sensor.
+
+    deviation : stated standard deviation of a sensor in m; 0 where none is
+    """
+
+    t: Array
+    gap: Array
+    deviation: float = 0.0
+
+    @staticmethod
+    def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
+        """Put rows in order of time; return them and how many had to be left out.
+
+        Those are the ones without a finite stamp or any gap, with one beyond 1e3 m, or with a stamp that is there.
+
+        Raises
+        ------
+        GapsError
+            For arrays of the wrong shape.
+        """
+        times, rows = np.asarray(t, dtype=np.float64), np.array(gap, dtype=np.float64)
+        if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):
+            raise GapsError(f"gaps: got t {times.shape} and gap {rows.shape}, expected (n,) and (n, {PAIR_COUNT})")
+        rows[~np.isfinite(rows)] = np.nan
+        absurd = (np.abs(rows) > _LARGEST).any(axis=1)
+        usable = np.flatnonzero(np.isfinite(times) & np.isfinite(rows).any(axis=1) & ~absurd)
+        _, first = np.unique(times[usable], return_index=True)
+        index = usable[first]
+        return Gaps(times[index], rows[index], deviation), len(times) - len(index)
+
+    def between(self, start: float, end: float) -> Gaps:
+        """Return the rows stamped in [start, end)."""
+        inside = (self.t >= start) & (self.t < end)
+        return replace(self, t=self.t[inside], gap=self.gap[inside])
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What gaps tell.
+
+    poses : the poses where pose and clearances follow from each message
+    clearance, deviation : (2,) horizontal and vertical in m; infinite deviation where it does not follow
+    groups : the clearance between the pads that face each other, of those that have sensors
+    used : messages behind it
+    contradiction : how far sensors are from what they tell together, in their constant errors; 0 where none is spare
+    """
+
+    poses: Poses
+    clearance: Array
+    deviation: Array
+    groups: dict[str, Interval]
+    used: int
+    contradiction: float
+
+
+def tell(scene: Scene, gaps: Gaps, poses: Poses) -> Told | None:
+    """Return what gaps tell; theta is that of `poses` where the sensors alone do not give it.
+
+    None where fewer than 20 messages have sensors enough.
+    """
+    error = gaps.deviation or CONSTANT_ERROR
+    rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
+    theta = _theta_at(gaps.t, poses)
+    best: Told | None = None
+    known = np.isfinite(gaps.gap)
+    for pairs in np.unique(known, axis=0):
+        own = (known == pairs).all(axis=1)
+        found = _told(rows, gaps.t[own], gaps.gap[own][:, pairs], np.flatnonzero(pairs), theta[own], error, scene)
+        if found is not None and (best is None or found.used > best.used):
+            best = found
+    return best
+
+
+def _theta_at(t: Array, poses: Poses) -> Array:
+    there = np.isfinite(poses.q[:, 2]) if len(poses.t) else np.zeros(0, bool)
+    if not there.any():
+        return np.full(len(t), np.nan)
+    at = poses.t[there]
+    theta: Array = np.interp(t, at, poses.q[there, 2], left=np.nan, right=np.nan)
+    return theta
+
+
+def _told(
+    rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], theta: Array, error: float, scene: Scene
+) -> Told | None:
+    """Solve the messages of one set of sensors; `gap` (n, k) of `pairs` (k,)."""
+    # gap = half the clearances minus how far a corner reaches
+    half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
+    fixed = np.concatenate([-rows[2:4, pairs].T, half], axis=1)
+    with_turn = np.concatenate([fixed, -rows[1, pairs][:, None]], axis=1)
+    turns = bool(np.linalg.matrix_rank(with_turn, _SINGULAR) == 5)
+    if not turns:
+        if np.linalg.matrix_rank(fixed, _SINGULAR) < 4:
+            return None
+        good = np.isfinite(theta)
+        t, gap, theta = t[good], gap[good], theta[good]
+    if len(t) < FEWEST_MESSAGES:
+        return None
+    unknown = np.zeros((len(t), 5))
+    unknown[:, 4] = 0.0 if turns else theta
+    equations = with_turn if turns else fixed
+    inverse = np.linalg.pinv(equations)
+    left = np.zeros_like(gap)
+    for _ in range(_ROUNDS):
+        # theta is small: the equations at 0 serve all rounds, and what they leave over is worked off
+        c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
+        reach = c[:, None] * rows[0, pairs] + s[:, None] * rows[1, pairs] + rows[4, pairs]
+        left = gap - (unknown[:, :4] @ fixed.T - reach)
+        unknown[:, : equations.shape[1]] += left @ inverse.T
+    x, y = _displacement(unknown, scene)
+    clearance = np.median(unknown[:, 2:4], axis=0)
+    # errors of the sensors stay, noise averages out
+    spread = error * np.sqrt((inverse[2:4] ** 2).sum(axis=1))
+    noise = unknown[:, 2:4].std(axis=0) / np.sqrt(len(t))
+    q = np.stack([x, y, unknown[:, 4]], axis=1)
+    poses = Poses(t, q) if turns else Poses(t[:0], q[:0])
+    groups = {
+        name: Interval.normal(
+            float(np.median(_between(rows, t, gap, pairs, pair, unknown[:, 4]))), np.sqrt(2.0) * error
+        )
+        for name, pair in GROUPS.items()
+        if np.isin(pair, pairs).all()
+    }
+    off = np.abs(left.mean(axis=0)).max() / error if len(pairs) > equations.shape[1] else 0.0
+    return Told(poses, clearance, np.hypot(spread, noise), groups, len(t), float(off))
+
+
+def _displacement(unknown: Array, scene: Scene) -> tuple[Array, Array]:
+    """Return x and y in m, shape (n,) each, from body coordinates."""
+    c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
+    across, up = (unknown[:, :2] - scene.head.com_offset_m).T
+    return c * across - s * up, s * across + c * up
+
+
+def _between(rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], pair: tuple[int, int], theta: Array) -> Array:
+    """Return the clearance between two pads that face each other, shape (n,): where the head is does not matter."""
+    first, second = (gap[:, int(np.flatnonzero(pairs == one)[0])] for one in pair)
+    both = rows[:, list(pair)].sum(axis=1)
+    clearance: Array = first + second + np.cos(theta) * both[0] + np.sin(theta) * both[1] + both[4]
+    return clearance
