@@ -8,6 +8,7 @@ import random
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 import rainflow
+from pyarrow import parquet
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from plow_twin import Wear
 from plow_twin.errors import RecordingError
 from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
-from plow_twin.scene_file import load_scene
+from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry, Pose
 from plow_twin.study.analysis import loads, thinned
@@ -174,7 +177,10 @@ def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_pat
         stream.write("t,fx,fy,m\n")
         stream.writelines(f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion[0], motion[1], strict=True))
     (tmp_path / "travel.csv").write_text("t,speed\n0.5,2.0\n4.0,-2.0\n")
-    loads = analyse(tmp_path, scene=PAPER, out=tmp_path / "out").predictions[0].loads
+    worn = replace(load_scene(PAPER), wear=Wear(1e-12, 0.015, 0.0, pad_length_m=0.3))
+    (scene := tmp_path / "worn.yaml").write_text(dump_scene(worn))
+    prediction = analyse(tmp_path, scene=scene, out=tmp_path / "out").predictions[0]
+    loads = prediction.loads
     assert len(loads.passes) == 2 and sum(item.impacts for item in loads.passes) == loads.impacts.sum()
     assert loads.passes[0].end_m == pytest.approx(7.0, abs=0.01) and loads.passes[1].end_m == pytest.approx(
         -1.0, abs=0.01
@@ -182,6 +188,19 @@ def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_pat
     assert replay(tmp_path / "out" / "run").exit_code == 0
     again = analyse(tmp_path / "out" / "run").predictions[0].loads
     np.testing.assert_array_equal(again.impacts, loads.impacts)
+    # the journal holds the direction: passes and wear are the same
+    assert len(again.passes) == 2
+    assert again.pad_wear == pytest.approx(loads.pad_wear, rel=1e-12)
+    facts = loads.wear_facts()
+    assert facts is not None and loads.pad_wear[0].max() > 0.0 < loads.pad_wear[1].max()
+    # what the pads have gained in both directions is what the model has worn away
+    assert loads.pad_wear.sum(axis=0) == pytest.approx(prediction.clearance.series()[1][-1][2:10], rel=0.03)
+    # the slide as a whole wears as pad length to the way gone, and each place by what passed it
+    whole = np.array(list(facts["slide_mean_m"].values())) * facts["slide_pieces"]
+    assert whole == pytest.approx(0.3 * loads.pad_wear.sum(axis=0), rel=1e-12)
+    assert {backward for backward, _ in loads.slide_wear} == {0, 1}
+    table = parquet.read_table(tmp_path / "out" / "slide_wear.parquet")
+    assert table.num_rows == len(loads.slide_wear)
 
 
 def test_late_repeated_and_non_finite_samples_are_counted_as_live(

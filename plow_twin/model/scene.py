@@ -252,6 +252,7 @@ class Wear:
     prior_m2_n: tuple[float, float] = _quantity(
         "m^2/N", "5 % and 95 % points of what k_s may be", (1e-15, 1e-13), gt=0.0
     )
+    pad_length_m: float | None = _quantity("m", "length of a pad along the face: what the slide wears by", None, gt=0.0)
 
 
 @dataclass(frozen=True)

@@ -265,7 +265,7 @@ class Feed:
                 for walker in self.walkers:
                     walker.speed_m_s = speed
                     # at once: a speed of the future would have to wait for its time
-                    walker.apply(Travel(self._reached_ns or 0, abs(speed)), max(0, log_time_ns))
+                    walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":
             self._sample(stamp_ns, (values["fx"], values["fy"], values["m"]), log_time_ns)
         else:

@@ -196,8 +196,8 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Take over the speed along the face [m/s]; its sign is a direction and does not wear."""
-        self.session.apply(Travel(stamp_ns, abs(speed_m_s)))
+        """Take over the speed along the face [m/s]; its sign is a direction, which wears alike."""
+        self.session.apply(Travel(stamp_ns, speed_m_s))
 
     def parameter(self, name: str, value: ParameterValue) -> None:
         """Journal a parameter that has changed."""

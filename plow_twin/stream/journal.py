@@ -40,7 +40,7 @@ class Unload:
 
 @dataclass(frozen=True)
 class Travel:
-    """Travel at `speed_m_s` along the face from `stamp_ns` on."""
+    """Travel at `speed_m_s` along the face from `stamp_ns` on; the sign is the direction."""
 
     stamp_ns: int
     speed_m_s: float

@@ -79,6 +79,10 @@ class LoadTotals:
     passes: list[Pass] = field(default_factory=list)
     #: largest force in each piece of the face, by pass and piece
     face: dict[tuple[int, int], float] = field(default_factory=dict)
+    #: wear depth that the pads have gained in travel forward and backward [m]
+    pad_wear: Array = field(default_factory=lambda: np.zeros((2, PAIR_COUNT)))
+    #: wear depth of the slide by direction (0 forward, 1 backward) and piece of the face, of each pair [m]
+    slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
     _first_ns: int | None = None
     _last: tuple[int, Array, Array, Array] | None = None
     _place_m: float = 0.0
@@ -155,6 +159,42 @@ class LoadTotals:
             for piece in np.unique(pieces).tolist():
                 key = (len(self.passes) - 1, piece)
                 self.face[key] = max(self.face.get(key, 0.0), float(largest[pieces == piece].max()))
+            self._wear(walked.rows.impulse, speed, pieces)
+
+    def _wear(self, impulse: Array, speed: float, pieces: NDArray[np.int64]) -> None:
+        """Book Archard's wear by direction: the pads', and that of the places of the slide that they pass.
+
+        A pad is engaged all the way, a place of the slide only while the pad passes it: for its length.
+        """
+        wear = self.scene.wear
+        if wear is None or wear.coefficient_m2_n == 0.0:
+            return
+        gained = wear.coefficient_m2_n / wear.pad_area_m2 * abs(speed) * impulse
+        backward = int(speed < 0.0)
+        self.pad_wear[backward] += gained.sum(axis=0)
+        if wear.pad_length_m is None:
+            return
+        share = wear.pad_length_m / FACE_BIN_M
+        for piece in np.unique(pieces).tolist():
+            key = (backward, piece)
+            self.slide_wear[key] = self.slide_wear.get(key, 0.0) + share * gained[pieces == piece].sum(axis=0)
+
+    def wear_facts(self) -> dict[str, Any] | None:
+        """Return the wear for JSON, depths in m; None where nothing wears."""
+        if not self.pad_wear.any():
+            return None
+        pads = {
+            name: dict(zip(PAIR_NAMES, depth.tolist(), strict=True))
+            for name, depth in zip(("forward", "backward"), self.pad_wear, strict=True)
+        }
+        out: dict[str, Any] = {"pads_m": pads}
+        if self.slide_wear:
+            pieces = {piece for _, piece in self.slide_wear}
+            total = np.sum(list(self.slide_wear.values()), axis=0) / len(pieces)
+            # as face length to pad length on the whole
+            out["slide_mean_m"] = dict(zip(PAIR_NAMES, total.tolist(), strict=True))
+            out["slide_pieces"] = len(pieces)
+        return out
 
     def cycles(self) -> dict[str, list[dict[str, float]]]:
         """Return rainflow counts of the contact force by pair (ASTM E1049): upper end of a range [N] and its count."""
@@ -178,6 +218,7 @@ class LoadTotals:
             "duty": dict(zip(PAIR_NAMES, (self.contact_s / max(self.duration_s, 1e-300)).tolist(), strict=True)),
             "contact_loss_j": self.contact_loss_j,
             "passes": [vars(item) for item in self.passes],
+            "wear": self.wear_facts(),
             "cycles": self.cycles(),
             "contact_sets": {
                 "+".join(PAIR_NAMES[pair] for pair in range(PAIR_COUNT) if mask >> pair & 1) or "none": count / total

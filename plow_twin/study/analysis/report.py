@@ -99,6 +99,14 @@ def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
         keys = ("pass", "position_m", "largest_force_n")
         face = {key: list(column) for key, column in zip(keys, zip(*rows, strict=True), strict=True)}
         parquet.write_table(pa.table(face), out / f"face{suffix}.parquet")
+    if prediction.loads.slide_wear:
+        from plow_twin.model.pairs import PAIR_NAMES
+
+        places = sorted(prediction.loads.slide_wear)
+        depth = np.array([prediction.loads.slide_wear[place] for place in places])
+        where = {"backward": [bool(one) for one, _ in places], "position_m": [piece for _, piece in places]}
+        worn = {name: depth[:, index] for index, name in enumerate(PAIR_NAMES)}
+        parquet.write_table(pa.table({**where, **worn}), out / f"slide_wear{suffix}.parquet")
 
 
 def _write_measured(found: Analysis, out: Path) -> None:
