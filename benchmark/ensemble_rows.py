@@ -6,21 +6,24 @@ import dataclasses
 import os
 from collections.abc import Callable, Iterator, Sequence
 
+import heyoka_peer
 import numpy as np
 from bench_scenes import SPARSE, T_END, bench_scene, constants, error_scale
-from cases import Array, Row, pose_error, timed
+from cases import Array, Row, Sample, pose_error, timed
 from lean import rk4
-from work_precision import LEAN_RK4, OURS
+from work_precision import HEYOKA, LEAN_RK4, OURS
 
 from plow_twin import Clearance, Initial, Scene
 from plow_twin.run.ensemble import simulate_many
 
 Notify = Callable[[str], None]
 SECTION = "ensemble"
+BATCH = f"{HEYOKA}, batch"
 COLUMNS, ROWS = 40, 25
 PAIRS = f"kv, {COLUMNS * ROWS} clearance pairs"
 #: From loose to tight; the first at which every pair is within `LISTED` is the one that is timed with care.
 TOLERANCES = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 3e-6, 1e-6)
+_BATCH_TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXACT = 1e-12
 #: Error in clearances beyond which a pair is listed.
 LISTED = 1e-4
@@ -39,7 +42,10 @@ def clearance_pairs(columns: int, rows: int) -> list[Scene]:
 
 
 def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats: int, notify: Notify) -> Iterator[Row]:
-    """Yield one run at each tolerance down to the one that all pairs need, that one timed, plain RK4, and a list."""
+    """Yield one run at each tolerance down to the one that all pairs need, that one timed, peers, and a list.
+
+    Peers with `lean_steps` only.
+    """
     scenes = clearance_pairs(columns, rows)
     name = f"kv, {len(scenes)} clearance pairs"
     notify(f"ensemble at {EXACT:g}")
@@ -57,6 +63,8 @@ def ensemble_rows(columns: int, rows: int, lean_steps: Sequence[float], repeats:
     for dt in lean_steps:
         notify(f"ensemble lean RK4 dt={dt:g}")
         yield _lean_row(name, scenes, exact, dt)
+    if lean_steps:
+        yield from _heyoka_rows(name, scenes, exact, notify)
     notify("ensemble amplification")
     growth = _amplification(scenes, exact)
     for index in sorted({*np.flatnonzero(error > LISTED), *np.argsort(-growth)[:10]}, key=lambda i: -growth[i]):
@@ -67,6 +75,12 @@ def core_row(rows: Sequence[Row]) -> Row | None:
     """Return the row of one core at the tolerance that all pairs need: the last one."""
     own = [row for row in rows if row.section == SECTION and row.solver == OURS and row.setting.endswith(", threads=1")]
     return own[-1] if own else None
+
+
+def batch_row(rows: Sequence[Row]) -> Row | None:
+    """Return the row of heyoka in batches at the tolerance that all pairs need, if it reached one."""
+    found = [row for row in rows if row.section == SECTION and row.solver == BATCH and row.error is not None]
+    return next((row for row in found if (row.error or 0.0) <= LISTED), None)
 
 
 def _own_row(
@@ -107,6 +121,28 @@ def _member_row(scene: Scene, tol: float, error: float, growth: float) -> Row:
     name = f"kv, gx={1e3 * gx:.4g} mm, gy={1e3 * gy:.4g} mm"
     status = f"error beyond {LISTED:g}" if error > LISTED else "ok"
     return Row(SECTION, name, OURS, f"tol={tol:g}", SPARSE, T_END, error=error, amplification=growth, status=status)
+
+
+def _heyoka_rows(name: str, scenes: Sequence[Scene], exact: Array, notify: Notify) -> Iterator[Row]:
+    """Yield heyoka in batches from loose to tight, down to the first tolerance that all pairs need."""
+    pairs = np.array([[scene.clearance.horizontal_m, scene.clearance.vertical_m] for scene in scenes])
+    for tol in _BATCH_TOLERANCES:
+        notify(f"ensemble heyoka in batches tol={tol:g}")
+        row = Row(SECTION, name, BATCH, f"tol={tol:g}, threads=1", SPARSE, T_END)
+        try:
+            run = heyoka_peer.prepare_batch(constants(scenes[0]), pairs, tol, SPARSE)
+            sample: Sample = run()
+        except Exception as problem:
+            row.status = f"{'not run' if isinstance(problem, ImportError) else 'failed'}: {problem}"
+            yield row
+            return
+        assert sample.q is not None
+        error = _member_errors(scenes, np.moveaxis(sample.q, 2, 0), exact)
+        row.wall_ms = row.wall_min_ms = 1e3 * sample.wall_s
+        row.runs, row.error, row.value = 1, float(error.max()), float((error > LISTED).sum())
+        yield row
+        if row.error <= LISTED:
+            return
 
 
 def _lean_row(name: str, scenes: Sequence[Scene], exact: Array, dt: float) -> Row:

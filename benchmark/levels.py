@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from cases import Row
-from work_precision import OURS, OURS_BARE, OURS_CALL, OURS_RK4, SECTION
+from work_precision import LOCATED, OURS, OURS_BARE, OURS_CALL, OURS_RK4, SECTION
 
 LEVELS = (1e-2, 1e-3, 1e-6, 1e-9)
 OUTPUTS = (0.1, 1e-3)
@@ -19,6 +19,7 @@ PEERS: dict[str, Member] = {
     "CVODE from C": lambda solver: solver.startswith("CVODE") and solver.endswith("(C)"),
     "CVODE from C, rootfinding": lambda solver: "rootfinding" in solver,
     "heyoka": lambda solver: solver.startswith("heyoka"),
+    "compiled DOP853, events located": lambda solver: solver == LOCATED,
     "best of SciPy and scikit-sundae": lambda solver: "SciPy" in solver or "scikit-sundae" in solver,
     "best multibody engine": lambda solver: solver.startswith(("MuJoCo", "Exudyn")),
     "lean jitted RK4": lambda solver: solver.startswith("lean"),

@@ -34,6 +34,7 @@ PEERS: dict[str, Callable[[str], Iterator[Case]]] = {
     "cvode": work_precision.cvode_cases,
     "python": work_precision.python_cases,
     "heyoka": work_precision.heyoka_cases,
+    "dop853": work_precision.located_cases,
     "multibody": work_precision.multibody_cases,
 }
 SECTIONS = (

@@ -113,7 +113,7 @@ def _ensemble_table(rows: Sequence[Row]) -> str:
         (row.solver, row.setting, f"{1e-3 * (row.wall_ms or 0.0):.2f}", f"{row.error:.2g}", f"{row.value:g}")
         for row in picked
     ]
-    members = [row for row in rows if row.section == "ensemble" and row.wall_ms is None]
+    members = [row for row in rows if row.section == "ensemble" and row.amplification is not None]
     blocks = [
         _table(
             f"Ensemble: {picked[0].scene if picked else ''}, 20 s",

@@ -9,6 +9,7 @@ from itertools import product
 import cvode
 import exudyn_peer
 import heyoka_peer
+import located_dop853
 import mujoco_peer
 import numpy as np
 import python_peers
@@ -26,7 +27,7 @@ SECTION = "work_precision"
 OURS, OURS_BARE = "plow_twin events", "plow_twin events, poses only"
 OURS_RK4, LEAN_RK4 = "plow_twin RK4", "lean RK4 (numba)"
 OURS_CALL = "plow_twin simulate(), whole call"
-HEYOKA = "heyoka (Taylor, events)"
+HEYOKA, LOCATED = "heyoka (Taylor, events)", "DOP853 (numba, events located)"
 
 
 def _decades(loosest: int, tightest: int, per_decade: int = 2) -> tuple[float, ...]:
@@ -184,12 +185,19 @@ def python_cases(scene_name: str) -> Iterator[Case]:
 
 
 def heyoka_cases(scene_name: str) -> Iterator[Case]:
-    """Yield heyoka, for the scene that it can run."""
-    if scene_name == "kv":
-        p = constants(bench_scene(scene_name))
-        for output_dt, tol in product((SPARSE, DENSE), _LADDER):
-            prepare = partial(heyoka_peer.prepare, p, tol, output_dt)
-            yield _case(scene_name, HEYOKA, f"tol={tol:.3g}", output_dt, prepare)
+    """Yield heyoka."""
+    p = constants(bench_scene(scene_name))
+    for output_dt, tol in product((SPARSE, DENSE), _LADDER):
+        prepare = partial(heyoka_peer.prepare, p, tol, output_dt)
+        yield _case(scene_name, HEYOKA, f"tol={tol:.3g}", output_dt, prepare)
+
+
+def located_cases(scene_name: str) -> Iterator[Case]:
+    """Yield DOP853 compiled by numba with its events located."""
+    p = constants(bench_scene(scene_name))
+    for output_dt, rtol in product((SPARSE, DENSE), _LADDER):
+        prepare = partial(located_dop853.prepare, p, rtol, output_dt)
+        yield _case(scene_name, LOCATED, f"rtol={rtol:.3g}", output_dt, prepare)
 
 
 def multibody_cases(scene_name: str) -> Iterator[Case]:
