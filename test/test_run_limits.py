@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -150,7 +153,7 @@ def test_ctrl_c_ends_the_work_of_a_twin_and_of_an_ensemble() -> None:
     ("scene", "tol"),
     [
         (replace(BENCH, friction=Friction(5.0, 1e-9)), 1e-8),
-        (replace(BENCH, wear=Wear(1.0, 0.015, 2.0)), 1e-8),
+        (replace(preset("bench_hc"), wear=Wear(1.0, 0.015, 2.0)), 1e-8),
         (replace(BENCH, frame=Frame(1e6, 1e6)), 1e-8),
         (replace(BENCH, head=Head(1e-6, 1e-6)), 1e-11),
         (Scene(Head(2430.0, 1265.0), Frame(0.33, 0.27), Clearance(0.0, 0.0), Contact("hertz", 1e13, 1.5)), 1e-12),
@@ -162,3 +165,85 @@ def test_no_scene_works_without_bound(scene: Scene, tol: float) -> None:
         simulate(scene, 10.0, tol=tol, max_steps=200_000)
     except PlowTwinError as error:
         assert "at t = " in str(error)
+
+
+#: A process that tells its steps when the signal arrives, by a thread of its own, and when the call has returned.
+INTERRUPTED = """
+import json, os, signal, threading, time
+from plow_twin import RunInterrupted, load_scene
+from plow_twin.run import simulate as module
+
+kept, start, told = [], module._start, {}
+module._start = lambda *arguments: kept.append(start(*arguments)) or kept[-1]
+receive, send = os.pipe()
+os.set_blocking(send, False)
+signal.set_wakeup_fd(send)
+
+def watch():
+    os.read(receive, 1)
+    told.update(signalled=int(kept[-1].state.steps), at=time.perf_counter())
+
+thread = threading.Thread(target=watch)
+thread.start()
+shares = []
+
+def progress(share):
+    shares.append(int(kept[-1].state.steps))
+    if len(shares) == 20:
+        print("under way", flush=True)
+
+try:
+    module.simulate(load_scene("paper"), 1e7, 1e4, on_progress=progress)
+except RunInterrupted as stop:
+    took = time.perf_counter()
+    thread.join()
+    told.update(returned=stop.result.solver["steps"], rows=len(stop.result.t), slices=shares[-20:])
+    told["took"] = took - told.pop("at")
+print(json.dumps(told))
+"""
+
+
+def test_a_process_that_gets_sigint_returns_within_a_slice_of_work() -> None:
+    with subprocess.Popen([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "under way\n"
+        process.send_signal(signal.SIGINT)
+        told = json.loads(process.communicate(timeout=60)[0])
+    slices = told["slices"]
+    largest = max(after - before for before, after in itertools.pairwise(slices))
+    # the slice under way when the signal came is the last one; it may have grown fourfold
+    assert 0 <= told["returned"] - told["signalled"] <= 4 * largest
+    assert told["rows"] >= 1
+
+
+#: The command line, which tells when the motion itself has begun.
+COMMAND = """
+import sys
+from plow_twin.run import simulate as module
+from plow_twin.cli.app import run
+
+begin = module._run
+
+def begun(*arguments):
+    if len(arguments) == 7:
+        print("under way", file=sys.stderr, flush=True)
+    begin(*arguments)
+
+module._run = begun
+sys.exit(run(["simulate", "paper", "--t-end", "1e7", "--output-dt", "1e3", "--json", "--out", sys.argv[1]]))
+"""
+
+
+def test_the_command_that_gets_sigint_writes_what_has_been_computed(tmp_path: Path) -> None:
+    out = tmp_path / "part.npz"
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMAND, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None and process.stderr.readline() == "under way\n"
+        time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        told, errors = process.communicate(timeout=60)
+    assert process.returncode == 1 and "interrupted at t = " in errors
+    found = json.loads(told)
+    assert 0.0 < found["t_end"] < 1e7 and found["solver"]["steps"] > 0
+    with np.load(out) as file:
+        assert len(file["t"]) >= 1 and np.isfinite(file["q"]).all()

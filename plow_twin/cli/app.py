@@ -84,8 +84,10 @@ def run(arguments: Sequence[str] | None = None) -> int:
         return error.exit_code
     except RunInterrupted as error:
         return _fail(str(error))
-    except (click.Abort, KeyboardInterrupt):
-        return _fail("interrupted")
+    except (click.Abort, KeyboardInterrupt) as error:
+        # click turns every KeyboardInterrupt into an Abort
+        stopped = error.__cause__
+        return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
     except SceneError as error:
         return _fail(str(error), WRONG_INPUT)
     except PlowTwinError as error:
