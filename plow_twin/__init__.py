@@ -30,6 +30,7 @@ from plow_twin.model.scene import Initial as Initial
 from plow_twin.model.scene import Mark as Mark
 from plow_twin.model.scene import Provenance as Provenance
 from plow_twin.model.scene import Scene as Scene
+from plow_twin.model.scene import Support as Support
 from plow_twin.model.scene import Table as Table
 from plow_twin.model.scene import Wear as Wear
 from plow_twin.run.advance import Advance as Advance

@@ -8,7 +8,20 @@ import numpy as np
 import pytest
 from scenes import pose_error, preset, wall_and_point
 
-from plow_twin import Clearance, Contact, Frame, Friction, Gravity, Head, Initial, Scene, Twin, simulate
+from plow_twin import (
+    Clearance,
+    Contact,
+    Frame,
+    Friction,
+    Gravity,
+    Head,
+    Initial,
+    Scene,
+    SceneError,
+    Twin,
+    Wear,
+    simulate,
+)
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.solve import compiled_scene
 from plow_twin.solve.state import Implicit
@@ -117,6 +130,21 @@ def test_the_tolerance_holds_for_a_factor_of_the_force_too(law: str, damping: fl
 def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law: str, damping: float) -> None:
     scene = replace(start, contact=overdamped(law, damping))
     assert_within_the_gate(scene, (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10))
+
+
+@pytest.mark.parametrize("damping", [10.0**k for k in range(10, 14)])
+def test_damping_beyond_what_double_precision_or_the_model_can_tell_is_refused(damping: float) -> None:
+    """The gate's other scenes: a factor of the force, and damping beside a wear that is faster than the head."""
+    with pytest.raises(SceneError, match=r"contact.damping: got \S+, expected at most 1e\+09 s/m for hunt_crossley"):
+        replace(BENCH, contact=overdamped("hunt_crossley", damping))
+    wear = Wear(1e-12, 0.015, 2.0)
+    for law in ("kelvin_voigt", "ramped_damping"):
+        worn = replace(BENCH, wear=wear)
+        if damping * 1e-12 * 2.0 / 0.015 > 1.0:
+            with pytest.raises(SceneError, match=r"expected at most 7.5e\S+ N s/m"):
+                replace(worn, contact=overdamped(law, damping))
+        else:
+            replace(worn, contact=overdamped(law, damping))
 
 
 def test_a_start_inside_a_wall_leaves_as_from_the_middle_of_an_impact() -> None:

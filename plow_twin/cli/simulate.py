@@ -159,6 +159,7 @@ def write_samples(result: Result, path: Path) -> None:
         np.savetxt(path, rows, fmt="%.17g", delimiter=",", header=",".join(names), comments="")
         return
     events = result.events
+    more: dict[str, Any] = {} if result.frame is None else {"frame": result.frame}
     np.savez(
         path,
         t=result.t,
@@ -166,6 +167,7 @@ def write_samples(result: Result, path: Path) -> None:
         v=result.v,
         force=result.force,
         penetration=result.penetration,
+        **more,
         event_time=events["time"],
         event_pair=events["pair"],
         event_from=events["mode_from"],
@@ -222,6 +224,7 @@ def _balance_table(balance: EnergyBalance) -> Table:
         ("work of gravity", balance.gravity_work_j),
         ("- dissipated in contacts", -balance.dissipated_j),
         ("- dissipated by friction", -balance.friction_work_j),
+        ("- taken by the support", -balance.support_work_j),
         ("- stored in contacts at the end, more than at the start", -stored),
         ("= kinetic energy gained", kinetic),
     ):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.measurements import Load
+from plow_twin.estimate.measurements import EstimateError, Load
 from plow_twin.model.loads import Pieces
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import compile_scene, inertias
@@ -44,14 +44,21 @@ class Forward:
         The nominal scene; its loads and its wear are not used.
     load : Load
         The load believed.
+
+    Raises
+    ------
+    EstimateError
+        For a scene whose frame gives way.
     """
 
     def __init__(self, scene: Scene, load: Load) -> None:
+        if scene.support is not None:
+            raise EstimateError(f"scene: got {scene.support}, expected no support: the fit does not know its place")
         nominal = compile_scene(replace(scene, loads=(), wear=None), TOLERANCE, sampled=True)
         self._terms = nominal.parts.terms
         self._implicit = nominal.parts.implicit
         if self._implicit is None and scene.contact.restitution is not None:
-            self._implicit = new_implicit()
+            self._implicit = new_implicit(False)
         pieces = Pieces.through(load.t, load.wrench)
         self._start, self._slope = pieces.start / inertias(scene), pieces.slope / inertias(scene)
         self._knots = pieces.knots

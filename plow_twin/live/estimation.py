@@ -208,6 +208,8 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
     found = []
     if settings.excitation_source == "scene":
         found.append(Problem("estimate", True, "false where excitation_source is scene: no load comes"))
+    if scene.support is not None:
+        found.append(Problem("estimate", True, "false where the scene has a support: the fit does not know its place"))
     limits = settings.forecast_limits
     if any(limits) and not all(limits):
         found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))

@@ -91,7 +91,7 @@ class Head:
 
 @dataclass(frozen=True)
 class Frame:
-    """The slide: a fixed rectangle inside the head's cavity.
+    """The slide: a rectangle inside the head's cavity, fixed unless the scene has a `Support`.
 
     Attributes
     ----------
@@ -158,6 +158,24 @@ class Friction:
     stick_stiffness_n_m: float | None = _quantity("N/m", "tangential stiffness of a corner that sticks", None, gt=0.0)
     stick_damping_n_s_m: float | None = _quantity("N s/m", "its damping, 0 unless given", None, ge=0.0)
     static_coefficient: float | None = _quantity("1", "mu up to which a corner sticks, mu unless given", None, ge=0.0)
+
+
+@dataclass(frozen=True)
+class Support:
+    """What the frame stands on, with a mass of its own: springs and dampers to ground. Without it the frame is fixed.
+
+    The frame's displacement is counted from where its springs are slack, at rest there at the start; its weight is
+    carried there. q is the head's displacement as seen from the frame, as it is without a support.
+    """
+
+    mass_kg: float = _quantity("kg", "mass of the frame and of what moves with it", gt=0.0)
+    inertia_kg_m2: float = _quantity("kg m^2", "its moment of inertia about the frame's centre", gt=0.0)
+    horizontal_stiffness_n_m: float = _quantity("N/m", "horizontal spring, 0 for none", ge=0.0)
+    vertical_stiffness_n_m: float = _quantity("N/m", "vertical spring, 0 for none", ge=0.0)
+    rotational_stiffness_n_m_rad: float = _quantity("N m/rad", "spring against rotation, 0 for none", ge=0.0)
+    horizontal_damping_n_s_m: float = _quantity("N s/m", "horizontal damper", 0.0, ge=0.0)
+    vertical_damping_n_s_m: float = _quantity("N s/m", "vertical damper", 0.0, ge=0.0)
+    rotational_damping_n_m_s_rad: float = _quantity("N m s/rad", "damper of the rotation", 0.0, ge=0.0)
 
 
 @dataclass(frozen=True)
@@ -276,6 +294,8 @@ class Scene:
         The pairs that can touch; all unless given.
     wear : Wear or None
     friction : Friction or None
+    support : Support or None
+        Lets the frame give way; without it the frame is fixed.
     marks : mapping of str to Provenance
         Where numbers come from, by their path; no part of equality.
 
@@ -298,6 +318,7 @@ class Scene:
     )
     wear: Wear | None = None
     friction: Friction | None = None
+    support: Support | None = None
     marks: Mapping[str, Provenance] = field(default_factory=lambda: MappingProxyType({}), compare=False)
 
     def __post_init__(self) -> None:
@@ -315,11 +336,12 @@ _PARTS: Final[Mapping[str, type]] = {
     "initial": Initial,
     "wear": Wear,
     "friction": Friction,
+    "support": Support,
 }
 
 
 #: Parts that a scene may lack.
-OPTIONAL_PARTS: Final[Mapping[str, type]] = {"wear": Wear, "friction": Friction}
+OPTIONAL_PARTS: Final[Mapping[str, type]] = {"wear": Wear, "friction": Friction, "support": Support}
 
 
 def check(scene: Scene) -> Iterator[Problem]:
@@ -338,8 +360,8 @@ def check(scene: Scene) -> Iterator[Problem]:
         for name, rate in zip(DOF_NAMES, scene.initial.v, strict=True):
             if name in scene.locked and rate != 0.0:
                 yield Problem("initial.v", scene.initial.v, f"0 for the locked {name}")
-        if scene.wear is not None and scene.wear.prior_m2_n[0] > scene.wear.prior_m2_n[1]:
-            yield Problem("wear.prior_m2_n", scene.wear.prior_m2_n, "the 5 % point first, then the 95 % point")
+        if scene.wear is not None:
+            yield from _check_wear(scene.wear, scene.contact)
         for key in ("locked", "pairs"):
             names = getattr(scene, key)
             if len(set(names)) != len(names):
@@ -423,6 +445,21 @@ def describe(spec: Field[Any]) -> str:
     return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"
 
 
+#: Largest factor lambda of 1 + lambda d' in s/m.
+MOST_DAMPING_FACTOR: Final = 1e9
+
+
+def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
+    if wear.prior_m2_n[0] > wear.prior_m2_n[1]:
+        yield Problem("wear.prior_m2_n", wear.prior_m2_n, "the 5 % point first, then the 95 % point")
+    rate = wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
+    if LAWS[contact.law].additive and (contact.damping or 0.0) * rate > 1.0:
+        # a force then wears the pad faster than it moves the head: no contact lasts
+        yield Problem(
+            "contact.damping", contact.damping, f"at most {1.0 / rate:.3g} N s/m, A / (k_s v), with this wear"
+        )
+
+
 def _check_contact(contact: Contact) -> Iterator[Problem]:
     law = LAWS[contact.law]
     given = {"damping": contact.damping, "restitution": contact.restitution}
@@ -441,6 +478,10 @@ def _check_contact(contact: Contact) -> Iterator[Problem]:
         yield Problem("contact", given, f"{' or '.join(allowed)} for {contact.law}")
     if law.exponent is not None and contact.exponent != law.exponent:
         yield Problem("contact.exponent", contact.exponent, f"{law.exponent:g} for {contact.law}")
+    if not law.additive and contact.damping is not None and contact.damping > MOST_DAMPING_FACTOR:
+        # it stops a head at a depth of sqrt(2 m / (K lambda)), of which double precision keeps a few digits only
+        expected = f"at most {MOST_DAMPING_FACTOR:g} s/m for {contact.law}; a restitution gives at most 1e6"
+        yield Problem("contact.damping", contact.damping, expected)
     if law.ramped != (contact.ramp_m is not None):
         expected = "a penetration > 0 [m]" if law.ramped else "nothing"
         yield Problem("contact.ramp_m", contact.ramp_m, f"{expected} for {contact.law}")

@@ -269,7 +269,7 @@ class _Worker(NamedTuple):
     @staticmethod
     def of(terms: Terms, compiled: Sequence[CompiledScene], max_wall_s: float) -> _Worker:
         stiff = any(one.parts.implicit is not None for one in compiled)
-        parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit() if stiff else None)
+        parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit(terms.support is not None) if stiff else None)
         work = new_records(WORK, 1)
         work[0] = new_work()
         return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s))
@@ -298,6 +298,11 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
             raise ArgumentError(
                 f"scenes[{index}].friction: got {one.scene.friction}, expected friction with stick in all or in none: "
                 f"scenes[0] has {compiled[0].scene.friction}"
+            )
+        if terms.support != first.support:
+            raise ArgumentError(
+                f"scenes[{index}].support: got {one.scene.support}, expected a support in all or in none: scenes[0] "
+                f"has {compiled[0].scene.support}"
             )
         merged = merged._replace(**{name: 1 for name in _OPTIONAL if getattr(terms, name) is not None})
     if merged.wear is not None or merged.slip is not None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import CompiledScene
-from plow_twin.solve.energy_balance import FRICTION, LOAD_X, LOADS, NORMAL, BalanceSums
+from plow_twin.solve.energy_balance import FRICTION, LOAD_X, LOADS, NORMAL, SUPPORT, BalanceSums
 from plow_twin.solve.state import COS, SIN, THETA, State, X, Y
 
 Array = NDArray[np.float64]
@@ -23,11 +23,14 @@ class EnergyBalance:
     Attributes
     ----------
     kinetic_j, stored_j : tuple of float
-        Kinetic energy, and elastic energy K d^(n+1) / (n+1) of the contacts, at the start and at the end in J.
+        Kinetic energy, of a frame that gives way too, and elastic energy K d^(n+1) / (n+1) of the contacts, at the
+        start and at the end in J.
     load_work_j, gravity_work_j : float
         Work of the loads without gravity, and of gravity with its constant moment, in J.
     contact_work_j, friction_work_j : float
         Energy taken from the head by normal contact forces and by friction in J.
+    support_work_j : float
+        Energy taken by the springs and dampers under a frame that gives way in J.
     dissipated_j : float
         What of `contact_work_j` is not stored at the end, in J.
     turnover_j : float
@@ -48,6 +51,7 @@ class EnergyBalance:
     gravity_work_j: float
     contact_work_j: float
     friction_work_j: float
+    support_work_j: float
     dissipated_j: float
     turnover_j: float
     imbalance_j: float
@@ -74,6 +78,7 @@ def energy_balance_of(compiled: CompiledScene, last: State, summed: BalanceSums)
         gravity_work_j=gravity,
         contact_work_j=contact,
         friction_work_j=float(sums.work[FRICTION]),
+        support_work_j=float(sums.work[SUPPORT]),
         dissipated_j=contact - (stored[1] - stored[0]),
         turnover_j=float(sums.turnover),
         imbalance_j=float(sums.residual),
@@ -85,8 +90,10 @@ def energy_balance_of(compiled: CompiledScene, last: State, summed: BalanceSums)
 
 def _potential(scene: Scene, state: State) -> float:
     """Return the potential energy of gravity and of its constant moment in J."""
-    x, y, theta = state.y[X], state.y[Y], state.y[THETA]
-    height = math.sin(theta) * x + math.cos(theta) * y
+    x, y, theta, lift = state.y[X], state.y[Y], state.y[THETA], 0.0
+    if scene.support is not None:
+        theta, lift = theta + state.frame[2], state.frame[1]
+    height = math.sin(theta) * x + math.cos(theta) * y + lift
     return float(scene.head.mass_kg * scene.gravity.acceleration_m_s2 * (height + scene.gravity.arm_m * theta))
 
 

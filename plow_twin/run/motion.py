@@ -37,6 +37,8 @@ class Motion:
     v: Array
     penetration: Array | None = None
     force: Array | None = None
+    #: place and rate of a frame that gives way, shape (n, 6)
+    frame: Array | None = None
     sums: BalanceSums | None = None
     #: rows written
     first: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
@@ -57,8 +59,10 @@ class Motion:
     def start(compiled: CompiledScene, q: Array, v: Array, outputs: bool = False) -> Motion:
         """Start at the scene's initial state; rows go to q and v, shape (n, 3) each, pair outputs to new arrays."""
         eight = (len(q), PAIR_COUNT)
-        pairs = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
-        return Motion(compiled.initial_state(), new_record(TOTALS), np.zeros(_FIRST_LOG, EVENT), q, v, *pairs)
+        penetration, force = (np.zeros(eight), np.zeros(eight)) if outputs else (None, None)
+        frame = np.zeros((len(q), 6)) if outputs and compiled.scene.support is not None else None
+        state, totals, log = compiled.initial_state(), new_record(TOTALS), np.zeros(_FIRST_LOG, EVENT)
+        return Motion(state, totals, log, q, v, penetration, force, frame)
 
 
 def run_events(
@@ -80,7 +84,7 @@ def run_events(
         allowed = budget if look is None else min(budget, int(motion.state.steps) + size)
         code = loop.integrate(
             compiled.params, compiled.parts, motion.state, work, motion.totals, motion.log, t_end, allowed,
-            motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
+            motion.first, times, motion.q, motion.v, motion.penetration, motion.force, motion.frame, motion.sums,
         )  # fmt: skip
         if code == Status.LOG_FULL:
             motion.log = _grown(motion.log)
@@ -106,14 +110,15 @@ def run_fixed(
     look: Callable[[Motion], None] | None,
 ) -> int:
     """Bring a motion through `steps` fixed steps; return its `Status`."""
-    z, done, size = np.zeros(6), np.zeros(1, np.int64), _FIRST_SLICE
+    z = np.zeros(6 if compiled.parts.terms.support is None else 12)
+    done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
         # the row at the end of a slice is written again by the next one, unless it is due
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,
-            stride, motion.q, motion.v, motion.penetration, motion.force, motion.sums,
+            stride, motion.q, motion.v, motion.penetration, motion.force, motion.frame, motion.sums,
         ))  # fmt: skip
         motion.fixed_time, motion.first[0] = float(done[0]) * dt, int(done[0]) // stride + 1
         if code == Status.LOG_FULL:

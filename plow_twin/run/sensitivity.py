@@ -157,6 +157,12 @@ class ChangedScene:
         return ChangedScene(path, compile_scene(changed, tol), change, ratio)
 
 
+def refuse_support(scene: Scene) -> None:
+    """Raise `ArgumentError` for a scene whose frame gives way: shadows are not displaced in its places and rates."""
+    if scene.support is not None:
+        raise ArgumentError(f"sensitivity: got a scene with {scene.support}, expected one without support")
+
+
 class StretchProduct:
     """What the fundamental matrices of one stretch of a motion after the other come to.
 
@@ -211,10 +217,11 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     Raises
     ------
     ArgumentError
-        For a parameter that the scene does not have.
+        For a parameter that the scene does not have, or a scene whose frame gives way.
     SolverError
         When a shadow could not be followed.
     """
+    refuse_support(scene)
     # finer than the displacement by so much that the difference keeps five digits
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled, known = compile_scene(scene, fine), sensitivity_parameters(scene)

@@ -60,6 +60,9 @@ class Result:
         Energy and momentum, when asked for.
     sensitivity : Sensitivity or None
         How errors grow along the motion, when asked for.
+    frame : ndarray, shape (n, 6), or None
+        Displacement of a frame that gives way (`Support`), x, y [m], theta [rad], and its rate; q and v are as seen
+        from it.
     """
 
     t: Array
@@ -76,6 +79,7 @@ class Result:
     compile_s: float
     energy_balance: EnergyBalance | None = None
     sensitivity: Sensitivity | None = None
+    frame: Array | None = None
 
 
 def simulate(
@@ -282,6 +286,7 @@ def _result(
         contact_sets=contact_sets_of(scene, motion.totals), solver=solver, wear_depth=motion.state.wear_depth.copy(),
         wall_s=wall_s, compile_s=compile_s,
         energy_balance=energy_balance_of(compiled, motion.state, motion.sums) if motion.sums is not None else None,
+        frame=None if motion.frame is None else motion.frame[:rows],
     )  # fmt: skip
 
 

@@ -36,6 +36,7 @@ from plow_twin.solve.state import (
     new_work,
     state_type,
 )
+from plow_twin.solve.support import frame_at
 
 __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
@@ -362,6 +363,19 @@ class Twin:
     def digest(self) -> str:
         """Return 16 hexadecimal digits that stand for the exact state."""
         return _digest(self.snapshot())
+
+    @property
+    def frame(self) -> NDArray[np.float64] | None:
+        """Displacement of a frame that gives way, x, y [m], theta [rad], and its rate, shape (6,); None without one."""
+        state, work = self._state, self._work
+        if self._parts.terms.support is None:
+            return None
+        if state.step_size < 0.0:
+            return np.array(state.frame)
+        # loads of the scene leave a step under way, whose series it is read from; time runs evenly or as a square
+        used, beta = float(state.elapsed), float(state.beta)
+        sigma = 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * beta * used, 0.0)))
+        return frame_at(work.frame, int(state.order), sigma)
 
     @property
     def steps(self) -> int:

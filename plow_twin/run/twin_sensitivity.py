@@ -19,6 +19,7 @@ from plow_twin.run.sensitivity import (
     ChangedScene,
     StretchProduct,
     free_places,
+    refuse_support,
     scale_of,
     sensitivity_parameters,
 )
@@ -59,12 +60,13 @@ class TwinSensitivity:
     Raises
     ------
     ArgumentError
-        For a parameter that the scene does not have, or a twin that is not sampled.
+        For a parameter that the scene does not have, a twin that is not sampled, or a scene whose frame gives way.
     """
 
     def __init__(self, twin: Twin, parameters: Sequence[str] = ()) -> None:
         if twin.excitation != "sampled":
             raise ArgumentError("twin: got excitation='scene', expected excitation='sampled'")
+        refuse_support(twin.scene)
         scene, known = twin.scene, sensitivity_parameters(twin.scene)
         for path in parameters:
             if path not in known or path.startswith("loads."):

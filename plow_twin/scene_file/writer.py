@@ -27,6 +27,7 @@ _ORDER: Final = (
     "pairs",
     "wear",
     "friction",
+    "support",
 )
 
 

@@ -138,7 +138,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
-    for name, value in (values | _slip(scene)).items():
+    for name, value in (values | _slip(scene) | _frame(scene)).items():
         params[name] = value
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
@@ -159,9 +159,11 @@ def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments
     )
     if scene.friction is not None and scene.friction.coefficient != 0.0:
         present["slip" if scene.friction.stick_stiffness_n_m is None else "stick"] = True
+    present["support"] = scene.support is not None
     # with the loads' moment about another point than the centre of mass the flight has no elementary integral
-    present["flight"] = present["harmonics"] and not present["offset"]
-    present["rest"] = not (present["harmonics"] or present["wear"] or {"slip", "stick"} & present.keys())
+    present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
+    creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
+    present["rest"] = not (present["harmonics"] or creeps or present["support"])
     return law._replace(**_flags(present))
 
 
@@ -269,6 +271,7 @@ def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     """Return what implicit steps need, where a contact's damping can outweigh its spring."""
     contact = scene.contact
     mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
+    mobility += float(params.frame_mobility[0] + params.radius**2 * params.frame_mobility[2])
     largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
     y = geometry.body_state(scene.initial.q, scene.initial.v, scene.head.com_offset_m)
     inside = float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ params.penetration_rows).max())
@@ -282,7 +285,10 @@ def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
         damping += largest_force * (contact.damping or params.damping_number / params.speed_floor)
     if terms.slip is not None:
         damping += params.friction * largest_force / params.slip_speed
-    return new_implicit() if damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility) else None
+    overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
+    # or those of a support
+    overdamped |= bool((params.frame_damping > OVERDAMPED_RATIO * np.sqrt(params.frame_stiffness)).any())
+    return new_implicit(scene.support is not None) if overdamped else None
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
@@ -299,6 +305,17 @@ def _slip(scene: Scene) -> dict[str, Any]:
         stick_stiffness=friction.stick_stiffness_n_m or 0.0,
         stick_damping=friction.stick_damping_n_s_m or 0.0,
     )
+
+
+def _frame(scene: Scene) -> dict[str, Any]:
+    """Return the numbers of a frame that gives way."""
+    support = scene.support
+    if support is None:
+        return {}
+    inverse = 1.0 / np.array([support.mass_kg, support.mass_kg, support.inertia_kg_m2])
+    springs = support.horizontal_stiffness_n_m, support.vertical_stiffness_n_m, support.rotational_stiffness_n_m_rad
+    dampers = support.horizontal_damping_n_s_m, support.vertical_damping_n_s_m, support.rotational_damping_n_m_s_rad
+    return {"frame_mobility": inverse, "frame_stiffness": springs * inverse, "frame_damping": dampers * inverse}
 
 
 def wear_rate(wear: Wear, speed: float) -> float:

@@ -12,6 +12,7 @@ from plow_twin.solve.kinematics import row_values
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.modes import any_penetrates
 from plow_twin.solve.state import COS, OMEGA, ON, SIN, VX, VY, X, Y
+from plow_twin.solve.support import see_from_frame
 
 
 @kernel(inline="source")
@@ -32,22 +33,24 @@ def sigma_at(state, used):
 
 
 @kernel(fast=True)
-def sum_series(state, w, sigma, out) -> None:
-    """Write the sum of the state's series at sigma to `out`, shape (8,)."""
+def sum_series(support, state, w, sigma, out) -> None:
+    """Write the sum of the state's series at sigma to `out`, shape (8,), as seen from a frame that gives way."""
     order, series = state.order, w.series
     value = row(series, order)
     for k in range(order - 1, -1, -1):
         value = value * sigma + row(series, k)
     set_row(out, 0, value)
+    if support is not None:
+        see_from_frame(w, order, sigma, out)
 
 
 @kernel(inline="code")
-def evaluate(p, harmonics, flight, state, w, sigma, out) -> None:
+def evaluate(p, harmonics, flight, support, state, w, sigma, out) -> None:
     """Write the body-coordinate state at sigma to `out`, shape (8,)."""
     if state.in_flight == 1:
         fly(p, harmonics, flight, state, w, sigma, out)
     else:
-        sum_series(state, w, sigma, out)
+        sum_series(support, state, w, sigma, out)
 
 
 @kernel(fast=True)

@@ -24,13 +24,14 @@ class Acting(NamedTuple):
     free: int | None
     slip: int | None
     stick: int | None
+    support: int | None
 
 
 @kernel(inline="source")
 def acting(parts):
     """Return what acts in a scene beside its law."""
     terms = parts.terms
-    return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip, terms.stick)
+    return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip, terms.stick, terms.support)
 
 
 @kernel()
@@ -67,20 +68,18 @@ def about_mass(p, c, s, load):
 
 @kernel()
 def accelerate(p, acts, frozen, state, t, z, load, out) -> None:
-    """Write the rate of z = (x, y, theta, vx, vy, omega).
+    """Write the rate of z = (x, y, theta, vx, vy, omega), with a frame that gives way that of `support.to_world_both`.
 
     `acts` is an `Acting`. `frozen`: the pairs that are on act by their law, also where it would pull; else those that
     penetrate push.
     """
     load_at(p, acts.harmonics, acts.segments, t, load)
-    _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, frozen, state, z, load, out)
+    _accelerate(p, acts.offset, acts.free, acts.slip, acts.stick, acts.support, frozen, state, z, load, out)
 
 
 @kernel()
-def _accelerate(p, offset, free, slip, stick, frozen, state, z, load, out) -> None:
-    c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
-    x, y = to_body_axes(c, s, z[0], z[1])
-    vx, vy = to_body_axes(c, s, z[3], z[4])
+def _contacts(p, slip, stick, frozen, state, c, s, om, x, y, vx, vy):
+    """Return force in head axes and moment about the centre of mass of all pairs."""
     fx = fy = torque = 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 0:
@@ -95,6 +94,18 @@ def _accelerate(p, offset, free, slip, stick, frozen, state, z, load, out) -> No
             fx += push_x
             fy += push_y
             torque += moment
+    return fx, fy, torque
+
+
+@kernel()
+def _accelerate(p, offset, free, slip, stick, support, frozen, state, z, load, out) -> None:
+    if support is not None:
+        _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out)
+        return
+    c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
+    x, y = to_body_axes(c, s, z[0], z[1])
+    vx, vy = to_body_axes(c, s, z[3], z[4])
+    fx, fy, torque = _contacts(p, slip, stick, frozen, state, c, s, om, x, y, vx, vy)
     out[0], out[1], out[2] = z[3], z[4], z[5]
     along_x, along_y = to_world_axes(c, s, fx, fy)
     out[3] = load[0] + along_x * p.inverse_mass
@@ -105,3 +116,30 @@ def _accelerate(p, offset, free, slip, stick, frozen, state, z, load, out) -> No
     if free is not None:
         for j in range(3):
             out[3 + j] *= p.free[j]
+
+
+@kernel()
+def _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out) -> None:
+    """Write the rate of head and frame (`support.to_world_both`)."""
+    c, s, om, spin = math.cos(z[2]), math.sin(z[2]), z[8], z[11]
+    # the head as seen from the frame
+    angle = z[2] - z[5]
+    x, y = to_body_axes(c, s, z[0] - z[3], z[1] - z[4])
+    vx, vy = to_body_axes(c, s, z[6] - z[9], z[7] - z[10])
+    fx, fy, torque = _contacts(
+        p, slip, stick, frozen, state, math.cos(angle), math.sin(angle), om - spin, x, y, vx + spin * y, vy - spin * x
+    )
+    along_x, along_y = to_world_axes(c, s, fx, fy)
+    for j in range(6):
+        out[j] = z[6 + j]
+    out[6] = load[0] + along_x * p.inverse_mass
+    out[7] = load[1] + along_y * p.inverse_mass
+    out[8] = load[2] + torque * p.inverse_inertia
+    if offset is not None:
+        out[8] += about_mass(p, c, s, load)
+    if free is not None:
+        for j in range(3):
+            out[6 + j] *= p.free[j]
+    out[9], out[10], out[11] = along_x, along_y, torque + x * fy - y * fx
+    for j in range(3):
+        out[9 + j] = -p.frame_mobility[j] * out[9 + j] - p.frame_stiffness[j] * z[3 + j] - p.frame_damping[j] * z[9 + j]

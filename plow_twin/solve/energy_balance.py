@@ -20,21 +20,22 @@ from plow_twin.solve.dense_output import evaluate, pair_outputs, time_along, wea
 from plow_twin.solve.dynamics import about_mass, push
 from plow_twin.solve.kinematics import to_world_axes
 from plow_twin.solve.loads import load_at
-from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, new_record
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
+from plow_twin.solve.support import to_ground
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
 _NODES = 24
 #: Radians of the fastest harmonic in one panel of a flight.
 _PANEL_PHASE = 8.0
 # indices into the powers and impulses at one instant
-LOADS, NORMAL, FRICTION, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(10)
+LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
 
 #: What is summed over a run.
 SUMS = np.dtype(
     [
         ("work", "f8", (SIZE,)),  # integrals of the powers and forces
         ("turnover", "f8"),  # integral of the powers' magnitudes
-        ("energy", "f8", (2,)),  # kinetic energy at the start and now
+        ("energy", "f8", (2,)),  # kinetic energy of head and frame at the start and now
         ("momentum", "f8", (2, 3)),  # m vx, m vy, I omega in world axes, at the start and now
         ("residual", "f8"),  # largest imbalance of energy so far
         ("momentum_residual", "f8", (3,)),  # largest imbalances of momentum so far
@@ -50,6 +51,7 @@ BALANCE = np.dtype(
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
         ("before", "f8", (SIZE,)),  # the same a step before
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
+        ("ground", "f8", (STATE_SIZE,)),  # the same, not seen from a frame that gives way but absolute
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node
         ("pairs", "f8", (3, PAIR_COUNT)),  # penetration, rate, force
         ("sums", SUMS),
@@ -67,17 +69,41 @@ def new_balance() -> BalanceSums:
 
 
 @kernel()
-def _powers(p, parts, state, wear_depth, y, t, balance, out) -> None:
-    """Write powers and forces at time t in body coordinates y."""
+def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
+    """Write powers and forces at time t in body coordinates y; `frame` is the state of a frame that gives way."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
-    _powers_under(p, terms.offset, terms.free, terms.slip, terms.stick, state, wear_depth, y, load, balance.pairs, out)
+    y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
+    ground = _on_ground(terms.support, y, frame, balance)
+    _powers_under(
+        p, terms.offset, terms.free, terms.slip, terms.stick, state, wear_depth, y, ground, load, balance.pairs, out
+    )
+    out[SUPPORT] = _taken_by_support(p, terms.support, frame)
 
 
 @kernel()
-def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, load, pairs, out) -> None:
-    c, s, om = math.cos(y[THETA]), math.sin(y[THETA]), y[OMEGA]
-    y[COS], y[SIN] = c, s
+def _taken_by_support(p, support, frame):
+    """Return the power in W that the springs and dampers under a frame take."""
+    power = 0.0
+    if support is not None:
+        for j in range(3):
+            held = p.frame_stiffness[j] * frame[j] + p.frame_damping[j] * frame[3 + j]
+            power += held / p.frame_mobility[j] * frame[3 + j]
+    return power
+
+
+@kernel()
+def _on_ground(support, y, frame, balance):
+    """Return the absolute body coordinates."""
+    if support is not None:
+        to_ground(y, frame, balance.ground)
+        return balance.ground
+    return y
+
+
+@kernel()
+def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, load, pairs, out) -> None:
+    c, s = ground[COS], ground[SIN]
     out[LOADS] = out[NORMAL] = out[FRICTION] = 0.0
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
     if offset is not None:
@@ -88,7 +114,7 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, load, pair
     for pair in range(PAIR_COUNT):
         force = pairs[2, pair]
         push_x, push_y, moment, power = push(
-            p, slip, stick, state, True, pair, force, c, s, om, y[0], y[1], y[VX], y[VY]
+            p, slip, stick, state, True, pair, force, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY]
         )
         fx += push_x
         fy += push_y
@@ -101,17 +127,20 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, load, pair
         for j in range(3):
             load[j] *= p.free[j]
             out[CONTACT_X + j] *= p.free[j]
-    vx, vy = to_world_axes(c, s, y[VX], y[VY])
-    out[LOADS] = load[0] * vx + load[1] * vy + load[2] * om
+    vx, vy = to_world_axes(c, s, ground[VX], ground[VY])
+    out[LOADS] = load[0] * vx + load[1] * vy + load[2] * ground[OMEGA]
 
 
 @kernel()
-def _balance(p, y, balance, start) -> None:
+def _balance(p, support, seen, frame, balance, start) -> None:
     """Take energy and momentum from the state; note the largest imbalances."""
-    sums = balance.sums
+    sums, y = balance.sums, _on_ground(support, seen, frame, balance)
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
     c, s = math.cos(y[THETA]), math.sin(y[THETA])
     sums.energy[1] = 0.5 * m * (y[VX] * y[VX] + y[VY] * y[VY]) + 0.5 * inertia * y[OMEGA] * y[OMEGA]
+    if support is not None:
+        for j in range(3):
+            sums.energy[1] += 0.5 * frame[3 + j] * frame[3 + j] / p.frame_mobility[j]
     vx, vy = to_world_axes(c, s, y[VX], y[VY])
     sums.momentum[1, 0], sums.momentum[1, 1] = m * vx, m * vy
     sums.momentum[1, 2] = inertia * y[OMEGA]
@@ -119,7 +148,7 @@ def _balance(p, y, balance, start) -> None:
         sums.energy[0] = sums.energy[1]
         for j in range(3):
             sums.momentum[0, j] = sums.momentum[1, j]
-    gained = sums.work[LOADS] - sums.work[NORMAL] - sums.work[FRICTION]
+    gained = sums.work[LOADS] - sums.work[NORMAL] - sums.work[FRICTION] - sums.work[SUPPORT]
     sums.residual = max(sums.residual, abs(sums.energy[1] - sums.energy[0] - gained))
     for j in range(3):
         pushed = sums.work[LOAD_X + j] + sums.work[CONTACT_X + j]
@@ -128,10 +157,19 @@ def _balance(p, y, balance, start) -> None:
 
 
 @kernel()
+def _frame_of(support, state):
+    """Return the state of a frame that gives way."""
+    if support is not None:
+        return state.frame
+    return None
+
+
+@kernel()
 def start_balance(p, parts, state, y, t, balance) -> None:
     """Take the state that a run starts from."""
-    _balance(p, y, balance, True)
-    _powers(p, parts, state, state.wear_depth, y, t, balance, balance.before)
+    frame = _frame_of(parts.terms.support, state)
+    _balance(p, parts.terms.support, y, frame, balance, True)
+    _powers(p, parts, state, state.wear_depth, y, frame, t, balance, balance.before)
 
 
 @kernel()
@@ -139,13 +177,13 @@ def _add(balance, powers, weight) -> None:
     sums = balance.sums
     for i in range(SIZE):
         sums.work[i] += weight * powers[i]
-    sums.turnover += weight * (abs(powers[LOADS]) + abs(powers[NORMAL]) + abs(powers[FRICTION]))
+    sums.turnover += weight * (abs(powers[LOADS]) + abs(powers[NORMAL]) + abs(powers[FRICTION]) + abs(powers[SUPPORT]))
 
 
 @kernel()
 def balance_step(p, parts, wear, flight, state, w, balance) -> None:
     """Add the step under way, before it is finished."""
-    y, wear_depth, end = balance.body, balance.wear_depth, state.sigma_end
+    y, wear_depth, end, support = balance.body, balance.wear_depth, state.sigma_end, parts.terms.support
     set_row(wear_depth, 0, row(state.wear_depth, 0))
     panels = 1
     if flight is not None and state.in_flight == 1:
@@ -154,22 +192,23 @@ def balance_step(p, parts, wear, flight, state, w, balance) -> None:
     for panel in range(panels):
         for i in range(balance.nodes.size):
             sigma = width * (panel + balance.nodes[i])
-            evaluate(p, parts.harmonics, flight, state, w, sigma, y)
+            evaluate(p, parts.harmonics, flight, support, state, w, sigma, y)
             if wear is not None:
                 wear_depth_at(state, w, sigma, wear_depth)
             t = state.step_start + time_along(state.alpha, state.beta, sigma)
-            _powers(p, parts, state, wear_depth, y, t, balance, balance.now)
+            _powers(p, parts, state, wear_depth, y, w.frame_now, t, balance, balance.now)
             _add(balance, balance.now, balance.weights[i] * width * (state.alpha + state.beta * sigma))
-    evaluate(p, parts.harmonics, flight, state, w, end, y)
-    _balance(p, y, balance, False)
+    evaluate(p, parts.harmonics, flight, support, state, w, end, y)
+    _balance(p, support, y, w.frame_now, balance, False)
 
 
 @kernel()
 def balance_fixed_step(p, parts, state, y, t, dt, balance) -> None:
     """Add a fixed step that ends at body coordinates y and time t."""
-    _powers(p, parts, state, state.wear_depth, y, t, balance, balance.now)
+    frame = _frame_of(parts.terms.support, state)
+    _powers(p, parts, state, state.wear_depth, y, frame, t, balance, balance.now)
     _add(balance, balance.before, 0.5 * dt)
     _add(balance, balance.now, 0.5 * dt)
     for i in range(SIZE):
         balance.before[i] = balance.now[i]
-    _balance(p, y, balance, False)
+    _balance(p, parts.terms.support, y, frame, balance, False)

@@ -17,6 +17,7 @@ from plow_twin.solve.grip import settle_grips
 from plow_twin.solve.kinematics import pose_of, to_body, to_world
 from plow_twin.solve.modes import mode_inside, touch, within_range
 from plow_twin.solve.state import OFF, ON, Status
+from plow_twin.solve.support import to_body_both, to_world_both
 from plow_twin.solve.totals import add_set_times, log_event
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
@@ -55,14 +56,14 @@ def _add_to_totals(force_before, force, dt, totals) -> None:
 
 @kernel()
 def _runge_kutta(p, acts, state, t, dt, z, trial, k, load) -> None:
-    """Take one step of the classical Runge-Kutta method; z (6,) in place, the four stages stay in k (4, 6)."""
+    """Take one step of the classical Runge-Kutta method; z (n,) in place, the four stages stay in k (4, n)."""
     accelerate(p, acts, False, state, t, z, load, k[0])
     for stage in range(1, 4):
         part = dt if stage == 3 else 0.5 * dt
-        for j in range(6):
+        for j in range(z.size):
             trial[j] = z[j] + part * k[stage - 1, j]
         accelerate(p, acts, False, state, t + part, trial, load, k[stage])
-    for j in range(6):
+    for j in range(z.size):
         z[j] += dt / 6.0 * (k[0, j] + 2.0 * k[1, j] + 2.0 * k[2, j] + k[3, j])
     state.evaluations += 4
 
@@ -75,27 +76,29 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     the velocity counted over the time left; and where a pair has touched or parted within a step the impulse in doubt,
     F dt / 2, over the time in which the largest load crosses the clearance.
     """
-    acts, y, z, k = acting(parts), state.y, bound.z[0], bound.z[2:]
+    acts, y, size = acting(parts), state.y, 6 if parts.terms.support is None else 12
+    z, trial, k = bound.z[0, :size], bound.z[1, :size], bound.z[2:, :size]
     pen, rate, now, before = bound.pairs[0], bound.pairs[1], bound.pairs[2], bound.pairs[3]
     start = state.step_start
     dt = (target - start) / bound.steps
-    to_world(y, z)
+    _to_world(parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
         # a pair that was clipped or released is inside all the same
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     state.bounded += 1
     for n in range(bound.steps):
-        _runge_kutta(p, acts, state, start + n * dt, dt, z, bound.z[1], k, bound.load)
+        _runge_kutta(p, acts, state, start + n * dt, dt, z, trial, k, bound.load)
         left = target - start - (n + 1) * dt
         for j in range(3):
             radius = p.radius if j == 2 else 1.0
-            off, drift = abs(k[1, j] - k[2, j]), abs(k[1, 3 + j] - k[2, 3 + j])
+            moving = size // 2 + j
+            off, drift = abs(k[1, j] - k[2, j]), abs(k[1, moving] - k[2, moving])
             bound.error += radius * dt / 3.0 * (off + (left + dt) * drift)
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.steps += 1
-        to_body(z, y)
+        _to_body(parts.terms.support, state, z)
         _wear(p, parts.terms.wear, state, now, dt)
         for pair in range(PAIR_COUNT):
             before[pair] = now[pair]
@@ -121,17 +124,19 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
 
 @kernel(entry=True)
 def integrate_fixed(
-    p, parts, state, totals, log, z, done, steps, dt, euler, stride, q, v, penetration, force, balance
+    p, parts, state, totals, log, z, done, steps, dt, euler, stride, q, v, penetration, force, frame, balance
 ) -> int:
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`.
 
-    z (6,) keeps what is integrated from one call to the next: converted there and back it would lose its last bits.
+    z (6,) or (12,) (`support.to_world_both`) keeps what is integrated from one call to the next: converted there and
+    back it would lose its last bits.
     """
-    trial, k = np.empty(6), np.empty((4, 6))
+    trial, k = np.empty(z.size), np.empty((4, z.size))
     load, y, acts = np.empty(3), state.y, acting(parts)
     pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
+    support, half = parts.terms.support, z.size // 2
     if done[0] == 0:
-        to_world(y, z)
+        _to_world(support, state, z)
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     if balance is not None and done[0] == 0:
         start_balance(p, parts, state, y, 0.0, balance)
@@ -143,6 +148,8 @@ def integrate_fixed(
             # the last row may lie closer than the others
             row = (n + stride - 1) // stride
             pose_of(p, y, parts.terms.offset, q[row], v[row])
+            if frame is not None:
+                frame[row] = state.frame
             if force is not None:
                 pair_outputs(p, state, state.wear_depth, y, penetration[row], rate, force[row])
         if n >= steps:
@@ -152,16 +159,16 @@ def integrate_fixed(
         t = n * dt
         if euler:
             accelerate(p, acts, False, state, t, z, load, k[0])
-            for j in range(3):
-                z[3 + j] += dt * k[0, 3 + j]
-                z[j] += dt * z[3 + j]
+            for j in range(half):
+                z[half + j] += dt * k[0, half + j]
+                z[j] += dt * z[half + j]
             state.evaluations += 1
         else:
             _runge_kutta(p, acts, state, t, dt, z, trial, k, load)
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.steps += 1
-        to_body(z, y)
+        _to_body(support, state, z)
         _wear(p, parts.terms.wear, state, now, dt)
         before[:] = now
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
@@ -172,6 +179,22 @@ def integrate_fixed(
         if balance is not None:
             balance_fixed_step(p, parts, state, y, t + dt, dt, balance)
         done[0] = n + 1
+
+
+@kernel()
+def _to_world(support, state, z) -> None:
+    if support is not None:
+        to_world_both(state.y, state.frame, z)
+    else:
+        to_world(state.y, z)
+
+
+@kernel()
+def _to_body(support, state, z) -> None:
+    if support is not None:
+        to_body_both(z, state.y, state.frame)
+    else:
+        to_body(z, state.y)
 
 
 @kernel()

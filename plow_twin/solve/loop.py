@@ -32,7 +32,9 @@ def _unowned_loads(parts):
 @kernel(inline="source")
 def _end(p, parts, state, w, totals, log) -> None:
     terms = parts.terms
-    complete_step(p, parts.harmonics, terms.flight, state, w, totals, log, terms.wear, terms.fraction, terms.stick)
+    complete_step(
+        p, parts.harmonics, terms.flight, terms.support, state, w, totals, log, terms.wear, terms.fraction, terms.stick
+    )
 
 
 @kernel(inline="source")
@@ -48,12 +50,14 @@ def _next(p, parts, state, w, stop_time, budget) -> int:
 
 
 @kernel()
-def _present(p, harmonics, flight, state, w, y) -> None:
-    """Write the body coordinates at the present time to y, also within a step."""
+def _present(p, harmonics, flight, support, state, w, y) -> None:
+    """Write the body coordinates at the present time to y, also within a step; a frame that gives way to `w`."""
     if state.step_size >= 0.0:
-        evaluate(p, harmonics, flight, state, w, sigma_at(state, state.elapsed), y)
+        evaluate(p, harmonics, flight, support, state, w, sigma_at(state, state.elapsed), y)
     else:
         set_row(y, 0, row(state.y, 0))
+        if support is not None:
+            w.frame_now[:] = state.frame
 
 
 @kernel()
@@ -70,7 +74,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if target < t0 + state.step_size:
             add_to_totals(state, w, low, sigma_at(state, target - t0), totals)
             state.elapsed, state.time = target - t0, target
-            _present(p, parts.harmonics, parts.terms.flight, state, w, w.moved)
+            _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.moved)
             return _OK if within_range(p, state, w.moved) else _RANGE
         add_to_totals(state, w, low, sigma_at(state, state.step_size), totals)
         _end(p, parts, state, w, totals, None)
@@ -104,13 +108,15 @@ def _clear(totals) -> None:
 
 
 @kernel()
-def _undo(state, w, target) -> None:
+def _undo(support, state, w, target) -> None:
     """Let the head stay as it was before an advance, whose record has been put back, while time goes on to `target`.
 
     A step under way ends at the time before the advance: its place and wear there are in `w.saved`.
     """
     set_row(state.y, 0, row(w.saved, 0))
     set_row(state.wear_depth, 0, row(w.saved, 1))
+    if support is not None:
+        state.frame[:] = w.frame_saved
     state.touch_time += target - state.time
     state.step_start, state.step_size, state.elapsed, state.time = target, -1.0, 0.0, target
 
@@ -125,7 +131,9 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
     state = states[index]
     if pace.underway == 0:
         saved[0] = state
-        _present(p, parts.harmonics, parts.terms.flight, state, w, w.saved[0])
+        _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.saved[0])
+        if parts.terms.support is not None:
+            w.frame_saved[:] = w.frame_now
         _worn_now(state, w, parts.terms.wear, w.saved[1])
     before, begin = saved[0].steps, state.steps
     code = _proceed(p, parts, state, w, totals, target, stop_time, min(before + budget, begin + pace.left))
@@ -141,7 +149,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
     steps = state.steps - before
     if code != _OK:
         states[index] = saved[0]
-        _undo(state, w, target)
+        _undo(parts.terms.support, state, w, target)
         _clear(totals)
     return code, steps
 
@@ -150,7 +158,7 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
 def _read_row(p, parts, state, w, totals, out) -> None:
     """Write a `ROW`: the state at the present time and the totals, which are cleared."""
     y = w.moved
-    _present(p, parts.harmonics, parts.terms.flight, state, w, y)
+    _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, y)
     pose_of(p, y, parts.terms.offset, out.q, out.v)
     _worn_now(state, w, parts.terms.wear, out.wear_depth)
     pair_outputs(p, state, out.wear_depth, y, out.penetration, out.rate, out.force)
@@ -325,10 +333,12 @@ def _rows_in_flight(p, harmonics, flight, state, w, t, i, q, v, penetration, for
 
 
 @kernel(entry=True)
-def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force, balance) -> int:
+def integrate(
+    p, parts, state, w, totals, log, t_end, budget, first, t, q, v, penetration, force, frame, balance
+) -> int:
     """Advance to `t_end` and fill the rows of t, q, v, penetration, force from row `first[0]` on. Returns a `Status`.
 
-    `penetration`, `force` and `balance` may be None. The rows' times do not change the steps.
+    `penetration`, `force`, `frame` (n, 6) and `balance` may be None. The rows' times do not change the steps.
     """
     parts, log = _unowned_loads(parts), unowned(log)
     q, v, pair_penetration, pair_force = unowned(q), unowned(v), unowned(penetration), unowned(force)
@@ -352,7 +362,9 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
             )
         while i < t.size and t[i] < end:
             sigma = sigma_at(state, max(t[i] - t0, 0.0))
-            sum_series(state, w, sigma, y)
+            sum_series(parts.terms.support, state, w, sigma, y)
+            if frame is not None:
+                frame[i] = w.frame_now
             pose_of(p, y, parts.terms.offset, q[i], v[i])
             if force is not None:
                 _worn_at(state, w, wear, sigma, wear_depth)
@@ -366,6 +378,8 @@ def integrate(p, parts, state, w, totals, log, t_end, budget, first, t, q, v, pe
     if not within_range(p, state, state.y):
         return _RANGE
     while i < t.size:
+        if frame is not None:
+            frame[i] = state.frame
         pose_of(p, state.y, parts.terms.offset, q[i], v[i])
         if force is not None:
             pair_outputs(p, state, state.wear_depth, state.y, pair_penetration[i], rate, pair_force[i])

@@ -82,7 +82,10 @@ def _start_inside(p, state, pair, energy) -> None:
     if p.damping_number >= 0.0:
         y = state.y
         arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
+        # and of a frame that gives way, whose arm is that about its own centre
+        arm_of_frame = row_value(p.arm_rows, pair, y[COS], y[SIN], 0.0, 0.0)
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
+        mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
         _, rate = penetration_and_rate(p, state, pair)
         speed = _impact_speed(p.damping_number, rate, energy * mobility)
         state.damping_factor[pair] = p.damping_number / max(speed, p.speed_floor)

@@ -137,6 +137,9 @@ PARAMS: Final = _in_lines(
         ("static_friction", "f8"),  # mu up to which a corner sticks
         ("stick_stiffness", "f8"),
         ("stick_damping", "f8"),
+        ("frame_mobility", "f8", (3,)),  # 1/m, 1/m, 1/I of a frame that gives way, else 0
+        ("frame_stiffness", "f8", (3,)),  # of its support, per mass and inertia
+        ("frame_damping", "f8", (3,)),
         ("order", "i8"),
         ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
         ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
@@ -194,15 +197,13 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("implicit_steps", "i8"),
 ]
 STATE: Final = _in_lines(_STATE_FIELDS)
-#: The same for friction with stick, and what the corners' grip remembers. That comes first: numba takes a record with
-#: more at its end for one of the shorter type.
-GRIPPING_STATE: Final = _in_lines(
-    [
-        ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
-        ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
-        *_STATE_FIELDS,
-    ]
-)
+#: What the corners' grip remembers, for friction with stick.
+_GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
+    ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
+    ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
+]
+#: A frame that gives way: x, y, theta from where its springs are slack, and their rates; y is then seen from it.
+_FRAME_FIELDS: Final[list[tuple[Any, ...]]] = [("frame", "f8", (6,))]
 
 #: Scratch space: series of one step. Rows are orders, the eight columns state components or pairs: SIMD lanes. What has
 #: eight columns comes first: each of its rows then fills a cache line.
@@ -222,10 +223,17 @@ WORK: Final = np.dtype(
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
         ("ramp", "f8", (3, *_WIDE)),  # square and cube of the penetration, share of C
         ("slip", "f8", (6, *_WIDE)),  # friction: slip rate r / v_s, k r_k, tanh r, 1 - tanh^2 r, force, arm
+        ("frame", "f8", _WIDE),  # a frame that gives way (`solve.support`)
+        ("frame_left", "f8", (3, *_WIDE)),  # factors of its Cauchy products
+        ("frame_right", "f8", (3, *_WIDE)),
+        ("seen", "f8", _WIDE),  # implicit steps: the head as seen from it
+        ("frame_sum", "f8", (PAIR_COUNT,)),
         ("grip", "f8", (3, PAIR_COUNT)),  # friction with stick: force per normal force, place and slip rate
         ("per_pair", "f8", (9, PAIR_COUNT)),  # masks and sums of the eight pairs
         ("moved", "f8", (STATE_SIZE,)),
         ("saved", "f8", (2, PAIR_COUNT)),  # y and wear depth at the time before an advance
+        ("frame_now", "f8", (6,)),  # state of the frame where the motion was last read
+        ("frame_saved", "f8", (6,)),  # and at the time before an advance
         ("load", "f8", (3, _ROWS)),  # S1, S2, M
         ("world", "f8", (4, _ROWS)),  # forces per mass in head and world axes
         ("column", "f8", (2, _ROWS)),  # one polynomial
@@ -306,6 +314,7 @@ class Terms(NamedTuple):
     free: int | None  #: some degree of freedom is locked
     slip: int | None  #: regularised friction
     stick: int | None  #: friction with stick
+    support: int | None  #: the frame gives way
     flight: int | None  #: free flight in closed form (`solve.method.flight`)
     rest: int | None  #: rest can be recognised (`solve.method.rest`)
 
@@ -324,7 +333,7 @@ BOUND: Final = np.dtype(
     [
         ("steps", "i8"),  # Runge-Kutta steps that are kept for the end
         ("error", "f8"),  # estimate in m of the advance, 0 while the bound does not bite
-        ("z", "f8", (6, 6)),  # state, trial state, four stages
+        ("z", "f8", (6, 12)),  # state, trial state, four stages; of a frame that gives way too
         ("load", "f8", (3,)),
         ("pairs", "f8", (4, PAIR_COUNT)),  # penetration, rate, force, force before
     ]
@@ -350,7 +359,14 @@ Log: TypeAlias = NDArray[np.void]
 
 def state_type(terms: Terms) -> np.dtype[np.void]:
     """Return the record type of a scene's state."""
-    return STATE if terms.stick is None else GRIPPING_STATE
+    return _state_type(terms.stick is not None, terms.support is not None)
+
+
+@cache
+def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
+    # what is more comes first: numba takes a record with more at its end for one of the shorter type
+    more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
+    return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 
 
 def new_record(dtype: np.dtype[np.void]) -> np.record:

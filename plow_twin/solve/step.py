@@ -66,7 +66,18 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
         # no wall can be reached, or none is left
         state.step_size = state.sigma_end
     elif implicit.lay_out(
-        p, parts, parts.implicit, terms.ramp, terms.wear, terms.slip, terms.stick, state, w, span, penetrating
+        p,
+        parts,
+        parts.implicit,
+        terms.ramp,
+        terms.wear,
+        terms.slip,
+        terms.stick,
+        terms.support,
+        state,
+        w,
+        span,
+        penetrating,
     ) or taylor.lay_out(p, parts, terms.slip, terms.ramp, terms.fraction, parts.implicit, state, w, span, penetrating):
         _end_at_event(p, state, w, span, penetrating, law_terms(terms), terms.stick)
         implicit.note_step(parts.implicit, state, w, state.step_size, state.event_pair >= 0)
@@ -96,13 +107,15 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
 
 
 @kernel()
-def complete_step(p, harmonics, flight, state, w, totals, log, wear, fraction, stick) -> None:
+def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fraction, stick) -> None:
     """Move the state to the step's end and switch the mode that its event changes."""
     y = state.y
     sigma = state.sigma_end
     if wear is not None:
         wear_depth_at(state, w, sigma, state.wear_depth)
-    evaluate(p, harmonics, flight, state, w, sigma, y)
+    evaluate(p, harmonics, flight, support, state, w, sigma, y)
+    if support is not None:
+        state.frame[:] = w.frame_now
     y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
     before = state.step_start
     state.step_start = before + state.step_size

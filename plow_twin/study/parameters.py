@@ -31,7 +31,7 @@ Value = float | str
 #: Paths whose values are words.
 WORDS: Final = ("contact.law", "head.rotation", "frame.labels")
 _CORNERS_CCW: Final = ("bottom_right", "top_right", "top_left", "bottom_left")
-_PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction")
+_PARTS: Final = ("head", "frame", "clearance", "contact", "gravity", "initial", "wear", "friction", "support")
 _DERIVED: Final = ("sign", "arm_sign", "scale")
 #: What a study starts from where a scene has no friction: without effect.
 _NO_FRICTION: Final = Friction(0.0)

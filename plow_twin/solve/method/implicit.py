@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +24,19 @@ from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.grip import grip_terms
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
 from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y, new_record
+from plow_twin.solve.support import (
+    FRAME_THETA,
+    FRAME_VX,
+    FRAME_VY,
+    FRAME_X,
+    FRAME_Y,
+    SEEN_COS,
+    SEEN_SIN,
+    SPIN,
+    to_body_both,
+    to_ground,
+    to_world_both,
+)
 
 #: Stages: the polynomials' degree. The order is 2 s - 1.
 STAGES = 9
@@ -72,37 +84,42 @@ def _rule() -> tuple[NDArray[np.float64], ...]:
     return tuple(table.astype(np.float64) for table in (nodes, weights, from_values, from_stages))
 
 
-#: Nodes, weights and scratch space of an implicit step with s stages.
-IMPLICIT: Final = np.dtype(
-    [
-        ("nodes", "f8", (STAGES,)),
-        ("weights", "f8", (STAGES, STAGES)),
-        ("from_values", "f8", (STAGES + 1, STAGES + 1)),  # coefficients from values at the start and at the nodes
-        ("from_stages", "f8", (STAGES, STAGES)),  # the same from values at the nodes
-        ("z", "f8", (STAGES + 1, 6)),  # state at the start and at the nodes
-        ("rate", "f8", (2, 6)),  # rates for a difference
-        ("accelerations", "f8", (STAGES, 3)),
-        ("jacobians", "f8", (STAGES, 2, 3, 3)),  # of the accelerations, by place and by velocity
-        ("matrix", "f8", (3 * STAGES, 3 * STAGES)),
-        ("residual", "f8", (3 * STAGES,)),
-        ("body", "f8", (STAGES + 1, STATE_SIZE)),  # body coordinates
-        ("pairs", "f8", (3, STAGES, PAIR_COUNT)),  # force, the law's force (of clipped pairs too), rate, at the nodes
-        ("wear_depth", "f8", (STAGES + 1, PAIR_COUNT)),  # at the start and at the nodes
-        ("load", "f8", (3,)),
-    ]
-)
+@cache
+def _implicit_type(size: int) -> np.dtype[np.void]:
+    """Return the type of nodes, weights and scratch space of an implicit step of `size` places."""
+    shape = (STAGES + 1, STATE_SIZE)
+    return np.dtype(
+        [
+            ("nodes", "f8", (STAGES,)),
+            ("weights", "f8", (STAGES, STAGES)),
+            ("from_values", "f8", (STAGES + 1, STAGES + 1)),  # coefficients from values at the start and at the nodes
+            ("from_stages", "f8", (STAGES, STAGES)),  # the same from values at the nodes
+            ("z", "f8", (STAGES + 1, 2 * size)),  # state at the start and at the nodes
+            ("rate", "f8", (2, 2 * size)),  # rates for a difference
+            ("accelerations", "f8", (STAGES, size)),
+            ("jacobians", "f8", (STAGES, 2, size, size)),  # of the accelerations, by place and by velocity
+            ("matrix", "f8", (size * STAGES, size * STAGES)),
+            ("residual", "f8", (size * STAGES,)),
+            ("body", "f8", shape),  # body coordinates
+            ("seen", "f8", shape),  # the same as seen from a frame that gives way
+            ("frame", "f8", shape),  # and that frame, in the lanes of `w.frame`
+            ("pairs", "f8", (3, STAGES, PAIR_COUNT)),  # force, law's force (of clipped pairs too), rate, at the nodes
+            ("wear_depth", "f8", shape),  # at the start and at the nodes
+            ("load", "f8", (3,)),
+        ]
+    )
 
 
-def new_implicit() -> Implicit:
-    """Return nodes, weights and scratch space."""
-    implicit = new_record(IMPLICIT)
+def new_implicit(support: bool) -> Implicit:
+    """Return nodes, weights and scratch space; `support` for a frame that gives way."""
+    implicit = new_record(_implicit_type(6 if support else 3))
     for name, table in zip(("nodes", "weights", "from_values", "from_stages"), _rule(), strict=True):
         implicit[name] = table
     return implicit
 
 
 @kernel()
-def decay_rate(p, state, slip, stick) -> float:
+def decay_rate(p, state, slip, stick, support) -> float:
     """Return the sum of the rates in 1/s at which the pairs' dampers stop the head; 0 where their springs matter.
 
     Friction that sticks is a damper too: its slope at the present slip.
@@ -118,6 +135,9 @@ def decay_rate(p, state, slip, stick) -> float:
         slope = p.stiffness if p.exponent == 1.0 else p.exponent * p.stiffness * penetration ** (p.exponent - 1.0)
         arm = row_value(p.arm_rows, pair, c, s, x, yy)
         mobility = p.inverse_mass + arm * arm * p.inverse_inertia
+        if support is not None:
+            arm = row_value(p.arm_rows, pair, c, s, 0.0, 0.0)
+            mobility += p.frame_mobility[0] + arm * arm * p.frame_mobility[2]
         decay += (faster - force) * mobility
         spring += slope * mobility
         if slip is not None:
@@ -130,6 +150,10 @@ def decay_rate(p, state, slip, stick) -> float:
             mobility = p.inverse_mass + arm * arm * p.inverse_inertia
             decay += p.stick_damping * mobility
             spring += p.stick_stiffness * mobility
+    if support is not None:
+        for j in range(3):
+            decay += p.frame_damping[j]
+            spring += p.frame_stiffness[j]
     return decay if decay > OVERDAMPED_RATIO * math.sqrt(spring) else 0.0
 
 
@@ -166,35 +190,36 @@ def note_decay(state, decay, step_size) -> None:
 
 @kernel()
 def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
-    """Write the accelerations at z to `base` (3,), their derivatives by place and by velocity to `out` (2, 3, 3)."""
-    rate, moved = implicit.rate[0], implicit.rate[1]
+    """Write the accelerations at z to `base` (n,), their derivatives by place and by velocity to `out` (2, n, n)."""
+    rate, moved, n = implicit.rate[0], implicit.rate[1], base.size
     accelerate(p, acts, True, state, t, z, implicit.load, rate)
-    for j in range(6):
+    for j in range(2 * n):
         # where the law is linear any difference will do that rounding does not spoil
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
         accelerate(p, acts, True, state, t, z, implicit.load, moved)
         z[j] = saved
-        for i in range(3):
-            out[j // 3, i, j % 3] = (moved[3 + i] - rate[3 + i]) / delta
-    for i in range(3):
-        base[i] = rate[3 + i]
+        for i in range(n):
+            out[j // n, i, j % n] = (moved[n + i] - rate[n + i]) / delta
+    for i in range(n):
+        base[i] = rate[n + i]
 
 
 @kernel()
 def _newton_matrix(implicit, h) -> None:
     """Write d residual / d velocities: places follow from velocities, x_i = x_0 + h sum a_ij v_j."""
     a, jacobians, matrix, s = implicit.weights, implicit.jacobians, implicit.matrix, implicit.nodes.size
+    n = implicit.accelerations.shape[1]
     for i in range(s):
         for j in range(s):
-            for r in range(3):
-                for c in range(3):
+            for r in range(n):
+                for c in range(n):
                     value = 1.0 if i == j and r == c else 0.0
                     value -= h * a[i, j] * jacobians[j, 1, r, c]
                     for k in range(s):
                         value -= h * h * a[i, k] * a[k, j] * jacobians[k, 0, r, c]
-                    matrix[3 * i + r, 3 * j + c] = value
+                    matrix[n * i + r, n * j + c] = value
 
 
 @kernel()
@@ -228,22 +253,45 @@ def _eliminate(matrix, right) -> bool:
 @kernel()
 def _places(implicit, h) -> None:
     """Write the places at the nodes from the velocities there."""
-    z, a, s = implicit.z, implicit.weights, implicit.nodes.size
+    z, a, s, n = implicit.z, implicit.weights, implicit.nodes.size, implicit.accelerations.shape[1]
     for i in range(s):
-        for c in range(3):
+        for c in range(n):
             value = z[0, c]
             for j in range(s):
-                value += h * a[i, j] * z[j + 1, 3 + c]
+                value += h * a[i, j] * z[j + 1, n + c]
             z[i + 1, c] = value
 
 
 @kernel()
-def _measure(p, state, implicit) -> None:
+def _bodies(support, implicit, i) -> None:
+    """Write the body coordinates at the start (i = 0) or at a node, also as seen from a frame that gives way."""
+    z, y = implicit.z[i], implicit.body[i]
+    if support is not None:
+        seen, frame = implicit.seen[i], implicit.frame[i]
+        to_body_both(z, seen, implicit.rate[0, :6])
+        to_ground(seen, implicit.rate[0, :6], y)
+        frame[FRAME_X], frame[FRAME_Y], frame[FRAME_THETA] = z[3], z[4], z[5]
+        frame[FRAME_VX], frame[FRAME_VY], frame[SPIN] = z[9], z[10], z[11]
+        frame[SEEN_COS], frame[SEEN_SIN] = seen[COS], seen[SIN]
+    else:
+        to_body(z, y)
+
+
+@kernel()
+def _seen(support, implicit):
+    """Return the body coordinates at the start and the nodes that the pairs depend on."""
+    if support is not None:
+        return implicit.seen
+    return implicit.body
+
+
+@kernel()
+def _measure(p, support, state, implicit) -> None:
     """Write force, law's force (also of clipped pairs) and rate of penetration of each pair at the nodes."""
-    z, pairs = implicit.z, implicit.pairs
+    pairs, seen = implicit.pairs, _seen(support, implicit)
     for i in range(implicit.nodes.size):
-        y = implicit.body[i + 1]
-        to_body(z[i + 1], y)
+        _bodies(support, implicit, i + 1)
+        y = seen[i + 1]
         for pair in range(PAIR_COUNT):
             r = rate_of(p, pair, y)
             pairs[0, i, pair], pairs[1, i, pair], pairs[2, i, pair] = 0.0, 0.0, r
@@ -255,10 +303,10 @@ def _measure(p, state, implicit) -> None:
 
 
 @kernel()
-def _wear_at_nodes(p, state, h, implicit) -> float:
+def _wear_at_nodes(p, support, state, h, implicit) -> float:
     """Write each pad's wear depth at the nodes from the forces there; return the largest change in m."""
     worn, a, s, change = implicit.wear_depth, implicit.weights, implicit.nodes.size, 0.0
-    _measure(p, state, implicit)
+    _measure(p, support, state, implicit)
     for i in range(s):
         for pair in range(PAIR_COUNT):
             value = worn[0, pair]
@@ -270,7 +318,7 @@ def _wear_at_nodes(p, state, h, implicit) -> float:
 
 
 @kernel()
-def _solve(p, acts, state, t, h, implicit, wear) -> bool:
+def _solve(p, acts, support, state, t, h, implicit, wear) -> bool:
     """Find the velocities at the nodes by Newton's method; return whether it converged.
 
     The derivatives are taken at every node: as the head turns, so does the direction that is damped. Down to rounding:
@@ -278,9 +326,10 @@ def _solve(p, acts, state, t, h, implicit, wear) -> bool:
     the iterate before.
     """
     z, s, a, residual = implicit.z, implicit.nodes.size, implicit.weights, implicit.residual
+    n = implicit.accelerations.shape[1]
     for i in range(s):
-        for c in range(3):
-            z[i + 1, 3 + c] = z[0, 3 + c]
+        for c in range(n):
+            z[i + 1, n + c] = z[0, n + c]
     before = np.inf
     for _ in range(15):
         _places(implicit, h)
@@ -293,23 +342,23 @@ def _solve(p, acts, state, t, h, implicit, wear) -> bool:
                 set_row(state.wear_depth, 0, row(implicit.wear_depth, 0))
         _newton_matrix(implicit, h)
         for i in range(s):
-            for c in range(3):
-                value = z[0, 3 + c] - z[i + 1, 3 + c]
+            for c in range(n):
+                value = z[0, n + c] - z[i + 1, n + c]
                 for j in range(s):
                     value += h * a[i, j] * implicit.accelerations[j, c]
-                residual[3 * i + c] = value
+                residual[n * i + c] = value
         if not _eliminate(implicit.matrix, residual):
             return False
         change = 0.0
-        for i in range(3 * s):
-            z[i // 3 + 1, 3 + i % 3] += residual[i]
+        for i in range(n * s):
+            z[i // n + 1, n + i % n] += residual[i]
             change += abs(residual[i]) * (p.radius if i % 3 == 2 else 1.0)
         if not math.isfinite(change):
             return False
-        state.evaluations += 7 * s
+        state.evaluations += (2 * n + 1) * s
         if wear is not None:
             _places(implicit, h)
-            change += _wear_at_nodes(p, state, h, implicit) * p.velocity_tolerance / p.position_tolerance
+            change += _wear_at_nodes(p, support, state, h, implicit) * p.velocity_tolerance / p.position_tolerance
         # quadratic: one that rounding keeps from falling further is the last
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
@@ -336,25 +385,56 @@ def _interpolate(values, coefficients, h, out) -> None:
 
 
 @kernel()
-def _write_series(p, state, h, w, implicit, ramp, wear, stick) -> float:
+def _series_seen(support, h, w, implicit):
+    """Return the series of the body coordinates that the pairs depend on; write those of a frame that gives way."""
+    if support is not None:
+        frame, s, seen = implicit.frame, implicit.nodes.size, w.seen
+        _interpolate(implicit.seen, implicit.from_values, h, seen)
+        _interpolate(frame, implicit.from_values, h, w.frame)
+        _interpolate(frame[1:], implicit.from_stages, h, w.left)
+        for i in (FRAME_VX, FRAME_VY, SPIN):
+            for k in range(s):
+                w.frame[k, i] = w.left[k, i]
+            w.frame[s, i] = 0.0
+        return seen
+    return w.series
+
+
+@kernel()
+def _frame_terms(p, support, w, implicit, scale):
+    """Return what the frame adds to what is left out at the start and to the last term's size in `_write_series`."""
+    off = size = 0.0
+    if support is not None:
+        s = implicit.nodes.size
+        start, here, last, place = implicit.frame[0], w.frame[0], w.frame[s - 1], w.frame[s]
+        off += abs(here[FRAME_VX] - start[FRAME_VX]) + abs(here[FRAME_VY] - start[FRAME_VY])
+        off += p.radius * abs(here[SPIN] - start[SPIN])
+        size += 4.0 * (abs(last[FRAME_VX]) + abs(last[FRAME_VY]) + p.radius * abs(last[SPIN]))
+        size += scale * (abs(place[FRAME_X]) + abs(place[FRAME_Y]) + p.radius * abs(place[FRAME_THETA]))
+    return off, size
+
+
+@kernel()
+def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float:
     """Write the collocation polynomial of state, penetration, rate and force as series; return its last term's size.
 
     Velocities and forces are those at the nodes, not at the start: what a damper has not yet stopped there, and stops
     at once, would bend the polynomials between the nodes. The size is infinite where that is more than may be left out.
     """
     s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
-    to_body(implicit.z[0], body[0])
-    _measure(p, state, implicit)
+    _bodies(support, implicit, 0)
+    _measure(p, support, state, implicit)
     _interpolate(body, implicit.from_values, h, w.series)
     _interpolate(body[1:], implicit.from_stages, h, scratch)
     for i in (VX, VY, OMEGA):
         for k in range(s):
             w.series[k, i] = scratch[k, i]
         w.series[s, i] = 0.0
+    seen = _series_seen(support, h, w, implicit)
     _interpolate(pairs[0], implicit.from_stages, h, w.force)
     _interpolate(pairs[2], implicit.from_stages, h, w.rate)
     for k in range(s + 1):
-        y = w.series[k]
+        y = seen[k]
         penetration = row_values(p.penetration_rows, y[COS], y[SIN], y[X], y[Y])
         if k == 0:
             penetration = penetration + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
@@ -364,33 +444,35 @@ def _write_series(p, state, h, w, implicit, ramp, wear, stick) -> float:
             penetration = penetration - worn
         set_row(w.penetration, k, penetration)
     if stick is not None:
-        _write_grip(p, state, h, w, implicit)
+        _write_grip(p, state, h, w, implicit, _seen(support, implicit), seen)
     size = 0.0
     if ramp is not None:
         size = _write_ramp(p, h, w, implicit)
     off = abs(w.series[0, VX] - body[0, VX]) + abs(w.series[0, VY] - body[0, VY])
     off += p.radius * abs(w.series[0, OMEGA] - body[0, OMEGA])
+    scale = p.velocity_tolerance / p.position_tolerance * h
+    more_off, more = _frame_terms(p, support, w, implicit, scale)
+    off += more_off
     if not off <= _admissible(p):
         return np.inf
     last, place = w.series[s - 1], w.series[s]
     size += 4.0 * (abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA]))
-    scale = p.velocity_tolerance / p.position_tolerance * h
-    size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA]))
+    size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA])) + more
     # its share on [0, h] that polynomials of lower degree cannot take over
     return size * h ** (s - 1) * 2.0 ** (1 - 2 * s)
 
 
 @kernel()
-def _write_grip(p, state, h, w, implicit) -> None:
+def _write_grip(p, state, h, w, implicit, seen, series) -> None:
     """Write the series of the slip rates and of the tangential forces (`solve.grip`)."""
     s, rates = implicit.nodes.size, w.right
     for i in range(s):
-        y = implicit.body[i + 1]
+        y = seen[i + 1]
         for pair in range(PAIR_COUNT):
             rates[i, pair] = row_rate(p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
     _interpolate(rates, implicit.from_stages, h, w.slip[0])
     for k in range(s):
-        y = w.series[k]
+        y = series[k]
         place = row_values(p.slip_rows, y[COS], y[SIN], y[X], y[Y])
         set_row(w.slip[4], k, grip_terms(p, state, w, k, place, row(w.slip[0], k)))
 
@@ -418,16 +500,18 @@ def _write_ramp(p, h, w, implicit) -> float:
 
 
 @kernel()
-def lay_out(p, parts, implicit, ramp, wear, slip, stick, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, implicit, ramp, wear, slip, stick, support, state, w, span, penetrating) -> bool:
     """Lay out an implicit step, where damping is what bounds explicit ones; `w.decay[0]` keeps its rate of decay."""
     if implicit is None:
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    w.decay[0] = decay_rate(p, state, slip, stick) if penetrating else 0.0
+    # without contact there may be the dampers of a support
+    damped = penetrating or support is not None
+    w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
         return False
-    size = _collocate(p, parts, state, w, span, w.decay[0], implicit, ramp, wear, stick)
+    size = _collocate(p, parts, support, state, w, span, w.decay[0], implicit, ramp, wear, stick)
     state.sigma_end, state.order = size, STAGES
     state.ends_at_stop = 1 if size == span else 0
     return size > 0.0
@@ -452,7 +536,16 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
 
 
 @kernel()
-def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear, stick) -> float:
+def _start(support, state, implicit) -> None:
+    """Write the state at the step's start to `implicit.z[0]`."""
+    if support is not None:
+        to_world_both(state.y, state.frame, implicit.z[0])
+    else:
+        to_world(state.y, implicit.z[0])
+
+
+@kernel()
+def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, stick) -> float:
     """Lay out an implicit step as series of order `STAGES`; return its size, or 0 when explicit ones are better.
 
     `decay` is the `decay_rate`.
@@ -461,13 +554,13 @@ def _collocate(p, parts, state, w, span, decay, implicit, ramp, wear, stick) -> 
     if span < least:
         return 0.0
     h = min(max(state.implicit_size, 10.0 * least), span)
-    to_world(state.y, implicit.z[0])
+    _start(support, state, implicit)
     admissible = _admissible(p)
     while h >= least:
         for i in range(implicit.nodes.size + 1):
             set_row(implicit.wear_depth, i, row(state.wear_depth, 0))
-        if _solve(p, acting(parts), state, state.step_start, h, implicit, wear):
-            size = _write_series(p, state, h, w, implicit, ramp, wear, stick)
+        if _solve(p, acting(parts), support, state, state.step_start, h, implicit, wear):
+            size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:
                 # a step cut short by a sample says nothing against a longer one

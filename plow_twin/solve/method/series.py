@@ -23,6 +23,17 @@ from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.grip import grip_terms
 from plow_twin.solve.kinematics import row_values
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
+from plow_twin.solve.support import (
+    FRAME_THETA,
+    FRAME_VX,
+    FRAME_VY,
+    FRAME_X,
+    FRAME_Y,
+    SEEN_COS,
+    SEEN_SIN,
+    SPIN,
+    start_frame,
+)
 
 #: A term has vanished where it is below this share of what the last order may have.
 _VANISHED = 0.4
@@ -280,11 +291,71 @@ def _wear(p, w, k, alpha, beta) -> None:
 def one_by_one(terms):
     """Return the terms as plain tuples, to be passed on with a star: of the load, of the law, and the others."""
     load = terms.harmonics, terms.second, terms.segments
-    return load, law_terms(terms), terms.wear, terms.offset, terms.free, terms.slip, terms.stick
+    return load, law_terms(terms), terms.wear, terms.offset, terms.free, terms.slip, terms.stick, terms.support
 
 
 @kernel(fast=True)
-def expand(p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, wear, offset, free, slip, stick):
+def _turn_frame(w, k, there, c, s):
+    """Return order k of the frame's displacement and velocity turned into head axes, in four lanes."""
+    u, v, wx, wy = lane(there, FRAME_X), lane(there, FRAME_Y), lane(there, FRAME_VX), lane(there, FRAME_VY)
+    left, right = pack(c, s, c, s, c, s, c, s), pack(u, v, v, -u, wx, wy, wy, -wx)
+    set_row(w.frame_left[0], k, left)
+    set_row(w.frame_right[0], k, right)
+    turned = _join(w.frame_left[0], w.frame_right[0], k, left, right)
+    x, y = lane(turned, 0) + lane(turned, 1), lane(turned, 2) + lane(turned, 3)
+    return pack(x, y, lane(turned, 4) + lane(turned, 5), lane(turned, 6) + lane(turned, 7), 0.0, 0.0, 0.0, 0.0)
+
+
+@kernel(fast=True)
+def _seen_rates(w, k, there, turned, om, turning):
+    """Return order k of the rates of cosine, sine and place of the head as seen from the frame.
+
+    `turned` is what `_turn_frame` returns: R^T u and R^T w, with (R^T u)' = R^T w + omega times R^T u turned by -90
+    degrees; `turning` has the rates of the head's absolute place.
+    """
+    relative = om - lane(there, SPIN)
+    left = pack(om, om, relative, relative, 0.0, 0.0, 0.0, 0.0)
+    right = pack(lane(turned, 1), -lane(turned, 0), -lane(there, SEEN_SIN), lane(there, SEEN_COS), 0.0, 0.0, 0.0, 0.0)
+    set_row(w.frame_left[1], k, left)
+    set_row(w.frame_right[1], k, right)
+    rates = _join(w.frame_left[1], w.frame_right[1], k, left, right)
+    dx = lane(turning, X) - (lane(turned, 2) + lane(rates, 0))
+    dy = lane(turning, Y) - (lane(turned, 3) + lane(rates, 1))
+    return dx, dy, lane(rates, 2), lane(rates, 3)
+
+
+@kernel(fast=True)
+def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
+    """Return order k of the rates of the frame: its springs and dampers, and what pushes the head the other way.
+
+    `pushed` is what the pairs give the head (`_applied`); their moment about the frame's centre is that about the
+    head's and the head's place (x, y) times their force.
+    """
+    fx, fy = lane(pushed, VX) / p.inverse_mass, lane(pushed, VY) / p.inverse_mass
+    left, right = pack(c, s, s, c, x, y, 0.0, 0.0), pack(fx, fy, fx, fy, fy, fx, 0.0, 0.0)
+    set_row(w.frame_left[2], k, left)
+    set_row(w.frame_right[2], k, right)
+    turned = _join(w.frame_left[2], w.frame_right[2], k, left, right)
+    along_x, along_y = lane(turned, 0) - lane(turned, 1), lane(turned, 2) + lane(turned, 3)
+    moment = lane(pushed, OMEGA) / p.inverse_inertia + lane(turned, 4) - lane(turned, 5)
+    wx, wy, spin = lane(there, FRAME_VX), lane(there, FRAME_VY), lane(there, SPIN)
+    springs, dampers, mobility = p.frame_stiffness, p.frame_damping, p.frame_mobility
+    return pack(
+        wx,
+        wy,
+        -springs[0] * lane(there, FRAME_X) - dampers[0] * wx - mobility[0] * along_x,
+        -springs[1] * lane(there, FRAME_Y) - dampers[1] * wy - mobility[1] * along_y,
+        -springs[2] * lane(there, FRAME_THETA) - dampers[2] * spin - mobility[2] * moment,
+        dc,
+        ds,
+        spin,
+    )
+
+
+@kernel(fast=True)
+def expand(
+    p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, wear, offset, free, slip, stick, support
+):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
     Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. Orders whose terms vanish
@@ -293,20 +364,36 @@ def expand(p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, 
     alpha, beta = state.alpha, state.beta
     left, right, load, inverse = w.left, w.right, w.load, w.inverse
     here, before, closing, penetration = row(state.y, 0), splat(0.0), splat(0.0), splat(0.0)
+    there = there_before = pushed = splat(0.0)
+    if support is not None:
+        start_frame(state, w)
+        here, there = row(w.moved, 0), row(w.frame, 0)
     c1 = s1 = c2 = s2 = 0.0
     small, quiet, reach, order = _VANISHED * p.threshold[p.order], 0, 1.0, limit
     for k in range(order + 1):
         set_row(w.series, k, here)
         x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
         om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
+        # as seen from the frame, which is what the pairs depend on
+        seen_c, seen_s, seen_x, seen_y = c, s, x, yy
+        if support is not None:
+            set_row(w.frame, k, there)
+            frame_turned = _turn_frame(w, k, there, c, s)
+            seen_c, seen_s = lane(there, SEEN_COS), lane(there, SEEN_SIN)
+            seen_x, seen_y = x - lane(frame_turned, 0), yy - lane(frame_turned, 1)
         if k == 0:
             penetration = (
-                row_values(p.penetration_rows, c, s, x, yy) + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
+                row_values(p.penetration_rows, seen_c, seen_s, seen_x, seen_y)
+                + row(p.penetration_rows, 4)
+                - row(state.wear_depth, 0)
             )
         else:
             if not penetrating:
-                penetration = row_values(p.penetration_rows, c, s, x, yy)
+                penetration = row_values(p.penetration_rows, seen_c, seen_s, seen_x, seen_y)
             size = abs(vx) + abs(vy) + p.radius * abs(om) + p.weight * (abs(c) + abs(s))
+            if support is not None:
+                size += abs(lane(there, FRAME_VX)) + abs(lane(there, FRAME_VY)) + p.radius * abs(lane(there, SPIN))
+                size += p.weight * (abs(seen_c) + abs(seen_s))
             if wear is not None and penetrating:
                 penetration = penetration - row(w.wear, k)
                 size += p.weight / p.radius * total(magnitude(row(w.wear, k)))
@@ -332,28 +419,38 @@ def expand(p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, 
             moment -= across * p.inverse_inertia / p.inverse_mass
         applied = pack(0.0, 0.0, fx, fy, moment, 0.0, 0.0, 0.0)
         steady, bent = alpha * inverse[k + 1], beta * inverse[k + 1]
+        dx, dy, dc, ds = lane(turning, X), lane(turning, Y), lane(turning, COS), lane(turning, SIN)
+        if support is not None:
+            dx, dy, dc, ds = _seen_rates(w, k, there, frame_turned, om, turning)
+            pushed = splat(0.0)
         if penetrating:
-            dx, dy, dc, ds = lane(turning, X), lane(turning, Y), lane(turning, COS), lane(turning, SIN)
             rate = row_values(p.penetration_rows, dc, ds, dx, dy)
             set_row(w.rate, k, rate)
-            arm = row_values(p.arm_rows, c, s, x, yy)
+            arm = row_values(p.arm_rows, seen_c, seen_s, seen_x, seen_y)
             set_row(w.arm, k, arm)
             force = _push(p, state, w, k, penetration, rate, *law_terms)
             set_row(w.force, k, force)
             # the rows for X and Y are minus the walls' inward normals
             torque = _join(w.arm, w.force, k, arm, force)
-            applied = applied + _applied(
+            pushed = _applied(
                 p, row(p.penetration_rows, 2) * force * -1.0, row(p.penetration_rows, 3) * force * -1.0, torque
             )
+            applied = applied + pushed
             if slip is not None:
-                applied = applied + _drag(p, w, k, c, s, x, yy, dc, ds, dx, dy)
+                dragged = _drag(p, w, k, seen_c, seen_s, seen_x, seen_y, dc, ds, dx, dy)
+                applied, pushed = applied + dragged, pushed + dragged
             if stick is not None:
-                applied = applied + _hold_on(p, state, w, k, c, s, x, yy, dc, ds, dx, dy)
+                dragged = _hold_on(p, state, w, k, seen_c, seen_s, seen_x, seen_y, dc, ds, dx, dy)
+                applied, pushed = applied + dragged, pushed + dragged
             if wear is not None:
                 _wear(p, w, k, alpha, beta)
             # the penetration of the next order needs this order's rates alone: no forces to wait for
             penetration = rate * steady + closing * bent
             closing = rate
+        if support is not None:
+            there_rates = _push_frame(p, w, k, there, c, s, seen_x, seen_y, dc, ds, pushed)
+            there = there_rates * steady + there_before * bent
+            there_before = there_rates
         if free is not None:
             fx, fy = _hold(p, w, k, lane(applied, VX), lane(applied, VY))
             applied = pack(0.0, 0.0, fx, fy, lane(applied, OMEGA) * p.free[2], 0.0, 0.0, 0.0)

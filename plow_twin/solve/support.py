@@ -1,0 +1,107 @@
+"""A frame that gives way: a second body on springs and dampers to ground, which the contacts push the other way.
+
+    m_f u'' = -k_x u - c_x u' - sum F_x      (v likewise)      I_f phi'' = -k_phi phi - c_phi phi' - sum (p x F)
+
+u, v, phi is the frame's displacement in world axes, F the force of a pair on the head, p its place from the frame's
+centre. The head's equations stand as they are, in its absolute place; penetrations, arms and slips are those of its
+place as seen from the frame. That is what `State.y` keeps, so modes, events and outputs need not know of the frame.
+Both bodies are one system, solved together; the series of it is in `solve.method.series`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import row, set_row
+from plow_twin.solve.kinematics import to_body, to_body_axes, to_world
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
+
+#: Lanes of the frame's series `w.frame`: displacement and velocity in world axes, spin, cosine and sine of the head's
+#: angle as seen from the frame, the frame's angle.
+FRAME_X, FRAME_Y, FRAME_VX, FRAME_VY, SPIN, SEEN_COS, SEEN_SIN, FRAME_THETA = range(8)
+
+
+@kernel()
+def to_ground(y, frame, out) -> None:
+    """Write the head's absolute body coordinates from those seen from the frame, whose state is `frame`, shape (6,)."""
+    theta, spin = y[THETA] + frame[2], frame[5]
+    c, s = math.cos(theta), math.sin(theta)
+    bx, by = to_body_axes(c, s, frame[0], frame[1])
+    wx, wy = to_body_axes(c, s, frame[3], frame[4])
+    x, yy = y[X], y[Y]
+    out[VX], out[VY] = y[VX] + wx - spin * yy, y[VY] + wy + spin * x
+    out[X], out[Y], out[OMEGA] = x + bx, yy + by, y[OMEGA] + spin
+    out[COS], out[SIN], out[THETA] = c, s, theta
+
+
+@kernel()
+def from_ground(y, frame, out) -> None:
+    """Write the head's body coordinates as seen from the frame; inverse of `to_ground`, also in place."""
+    theta, spin = y[THETA], frame[5]
+    c, s = math.cos(theta), math.sin(theta)
+    bx, by = to_body_axes(c, s, frame[0], frame[1])
+    wx, wy = to_body_axes(c, s, frame[3], frame[4])
+    x, yy = y[X] - bx, y[Y] - by
+    out[VX], out[VY] = y[VX] - wx + spin * yy, y[VY] - wy - spin * x
+    out[X], out[Y], out[OMEGA], out[THETA] = x, yy, y[OMEGA] - spin, theta - frame[2]
+    out[COS], out[SIN] = math.cos(out[THETA]), math.sin(out[THETA])
+
+
+@kernel()
+def to_world_both(y, frame, z) -> None:
+    """Write z = (x, y, theta, u, v, phi) and its rate, shape (12,), world axes, from what is seen from the frame."""
+    absolute, head = np.empty(8), np.empty(6)
+    to_ground(y, frame, absolute)
+    to_world(absolute, head)
+    for j in range(3):
+        z[j], z[6 + j] = head[j], head[3 + j]
+        z[3 + j], z[9 + j] = frame[j], frame[3 + j]
+
+
+@kernel()
+def to_body_both(z, y, frame) -> None:
+    """Write the head's body coordinates as seen from the frame, and the frame's state; inverse of `to_world_both`."""
+    head = np.empty(6)
+    for j in range(3):
+        head[j], head[3 + j] = z[j], z[6 + j]
+        frame[j], frame[3 + j] = z[3 + j], z[9 + j]
+    to_body(head, y)
+    from_ground(y, frame, y)
+
+
+@kernel()
+def start_frame(state, w) -> None:
+    """Write the rows with which the series of both bodies start: the head's to `w.moved`, the frame's to `w.frame`."""
+    frame, here = state.frame, w.frame[0]
+    to_ground(state.y, frame, w.moved)
+    for j in range(2):
+        here[FRAME_X + j], here[FRAME_VX + j] = frame[j], frame[3 + j]
+    here[SPIN], here[FRAME_THETA] = frame[5], frame[2]
+    here[SEEN_COS], here[SEEN_SIN] = math.cos(state.y[THETA]), math.sin(state.y[THETA])
+
+
+@kernel(fast=True)
+def see_from_frame(w, order, sigma, y) -> None:
+    """Bring the head's absolute body coordinates at sigma of a step to what is seen from the frame.
+
+    The frame's state there is written to `w.frame_now`.
+    """
+    value = row(w.frame, order)
+    for k in range(order - 1, -1, -1):
+        value = value * sigma + row(w.frame, k)
+    set_row(w.frame_sum, 0, value)
+    here, now = w.frame_sum, w.frame_now
+    now[0], now[1], now[2] = here[FRAME_X], here[FRAME_Y], here[FRAME_THETA]
+    now[3], now[4], now[5] = here[FRAME_VX], here[FRAME_VY], here[SPIN]
+    from_ground(y, now, y)
+
+
+def frame_at(series: NDArray[np.float64], order: int, sigma: float) -> NDArray[np.float64]:
+    """Return the frame's place and rate, shape (6,), from its series at sigma."""
+    lanes = np.asarray(np.polynomial.polynomial.polyval(sigma, series[: order + 1]))
+    found: NDArray[np.float64] = lanes[[FRAME_X, FRAME_Y, FRAME_THETA, FRAME_VX, FRAME_VY, SPIN]]
+    return found
