@@ -251,12 +251,13 @@ def _watching() -> Iterator[tuple[Watch, Any]]:
     from diagnostic_msgs.msg import DiagnosticArray
     from rclpy.signals import SignalHandlerOptions
 
+    from plow_twin.ros.connections import WithoutEvents
     from plow_twin.ros.main import make_executor
     from plow_twin.ros.qos import DIAGNOSTICS
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:
-        watch, node, executor = Watch(), rclpy.create_node("plow_twin_demo"), make_executor()
+        watch, node, executor = Watch(), WithoutEvents("plow_twin_demo"), make_executor()
         node.create_subscription(DiagnosticArray, "/diagnostics", watch.take, DIAGNOSTICS)
         executor.add_node(node)
         yield watch, lambda: executor.spin_once(timeout_sec=0.1)
