@@ -149,7 +149,8 @@ def test_a_pose_out_of_range_is_never_handed_out_as_good() -> None:
         rows = [twin.advance(k * dt, (0.0, 0.0, 1e6)) for k in range(1, 100)]
         assert any(row.status is Status.OUT_OF_RANGE for row in rows)
         assert all(abs(row.q[2]) <= np.pi / 4 for row in rows)
-    analytic = Twin(dataclasses.replace(preset("paper"), loads=(Constant("turn", (0.0, 0.0), 1e6),)))
+    loads = (*preset("paper").loads, Constant("turn", (0.0, 0.0), 1e6))
+    analytic = Twin(dataclasses.replace(preset("paper"), loads=loads))
     for t in np.linspace(0.0, 0.1, 57):
         assert abs(analytic.advance(t).q[2]) <= np.pi / 4
     with pytest.raises(SolverError, match="left the model's range"):
@@ -176,7 +177,7 @@ def test_in_free_flight_nothing_of_the_contact_runs() -> None:
 
 
 def test_warm_up_leaves_nothing_to_compile() -> None:
-    twin = Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
+    twin = Twin(dataclasses.replace(preset("bench_hc"), wear=Wear(1e-14, 0.015, 2.0)))
     twin.warm_up()
     before = [len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)]
     assert min(before) > 0 and twin.time == 0.0

@@ -28,9 +28,14 @@ SCENES = {
     "wear": replace(PAPER, wear=Wear(1e-9, 3.0, 0.015)),
     "locked": replace(PAPER, locked=("y",)),
 }
+SCENES["offset, wear"] = replace(SCENES["offset"], wear=SCENES["wear"].wear)
+# each compiles kernels of its own; a ramp is in test_solve_ramp
+FULL_COUNT = ("offset", "ramp", "wear", "locked")
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.stress] if name in FULL_COUNT else []) for name in SCENES]
+)
 def test_the_energy_balances(name: str) -> None:
     balance = simulate(SCENES[name], 5.0, energy_balance=True).energy_balance
     assert balance is not None

@@ -52,7 +52,7 @@ def test_a_push_above_the_limit_accelerates_it_by_what_is_left() -> None:
     assert (result.v[-1, 0] - result.v[-2, 0]) / 0.1 == pytest.approx(0.5 * MU * G, rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["paper", "bench_hc"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("bench_hc", marks=pytest.mark.stress)])
 def test_both_solvers_agree_and_the_energy_balances(name: str) -> None:
     scene = replace(preset(name), friction=Friction(0.3, 0.02))
     events = simulate(scene, 2.0, output_dt=0.1, energy_balance=True)

@@ -69,14 +69,14 @@ def errors(found: Calibration) -> list[float]:
 
 
 def test_known_parameters_are_recovered_from_every_random_start() -> None:
-    found, objective = from_recording(5)
-    assert len(found.starts) == 5 and max(errors(found)) < RECOVERED
-    assert len({start.before_polish for start in found.starts}) == 5  # each start took its own way
+    found, objective = from_recording(3)
+    assert len(found.starts) == 3 and max(errors(found)) < RECOVERED
+    assert len({start.before_polish for start in found.starts}) == 3  # each start took its own way
     known = identifiability(space(), objective, found.best.point)
     assert len(known.singular_values) == 4 and known.singular_values[-1] > 1e-2
     assert sum(value**2 for value in known.weakest.values()) == pytest.approx(1.0)
     clusters = near_optimal(space(), found, excess=1e-6)
-    assert len(clusters) == 1 and clusters[0].members >= 5 and clusters[0].values["loads.fx2.sign"] == -1.0
+    assert len(clusters) == 1 and clusters[0].members >= 3 and clusters[0].values["loads.fx2.sign"] == -1.0
 
 
 @pytest.mark.stress
