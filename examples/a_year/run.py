@@ -62,18 +62,29 @@ def visit(day: float) -> tuple[np.ndarray, Poses]:
 
 stream = rr.RecordingStream("plow_twin_year")
 names = ("horizontal", "vertical")
-views = [
-    rrb.TimeSeriesView(origin=f"clearance/{name}", name=f"{name} clearance [mm]: truth, estimate, 90 %, limit")
-    for name in names
-]
-views.append(rrb.TimeSeriesView(origin="limit_reached", name="day on which the limit is reached: truth, P10, P50, P90"))
-views.append(rrb.TimeSeriesView(origin="coefficient", name="wear coefficient [1e-15 m^2/N]: truth, estimate, 90 %"))
-stream.save(out / "year.rrd", default_blueprint=rrb.Blueprint(rrb.Grid(*views, grid_columns=2), collapse_panels=True))
+titles = {f"clearance/{name}": f"{name} clearance [mm]: truth, estimate, 90 %, limit" for name in names}
+titles |= {
+    "limit_reached": "day on which the limit is reached: truth, P10, P50, P90",
+    "coefficient": "wear coefficient [1e-15 m^2/N]: truth, estimate, 90 %",
+}
+edges = (rr.TimeRangeBoundary.absolute(seq=day) for day in (0, round(DAYS)))
+whole = rrb.archetypes.TimeAxis(view_range=rr.TimeRange(*edges))
+views = [rrb.TimeSeriesView(origin=entity, name=title, axis_x=whole) for entity, title in titles.items()]
+panel = rrb.TimePanel(state="collapsed", timeline="day", play_state="paused")
+blueprint = rrb.Blueprint(rrb.Grid(*views, grid_columns=2), panel, collapse_panels=True)
+stream.save(out / "year.rrd", default_blueprint=blueprint)
+colors = {
+    "truth": (240, 240, 240), "limit": (220, 60, 60), "estimate": (240, 160, 60), "p50": (240, 160, 60),
+    **dict.fromkeys(("p05", "p95", "p10", "p90"), (90, 140, 200)),
+}  # fmt: skip
+for entity in titles:
+    for name, color in colors.items():
+        stream.log(f"{entity}/{name}", rr.SeriesLines(colors=color, names=name), static=True)
 
 
 def show(day: float, entity: str, **values: float | None) -> None:
     """Draw numbers of a day; None: nothing."""
-    stream.set_time("day", duration=day * 86400.0)
+    stream.set_time("day", sequence=round(day))
     for name, value in values.items():
         if value is not None:
             stream.log(f"{entity}/{name}", rr.Scalars(value))
