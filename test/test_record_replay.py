@@ -10,10 +10,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from record_support import BASE_NS, STEP_NS, Run, chunk_spans, paper_entries, paper_sample, record_run, rewrite
+from record_support import (
+    BASE_NS,
+    PAPER_AMPLITUDE,
+    STEP_NS,
+    Run,
+    chunk_spans,
+    paper_entries,
+    paper_sample,
+    record_run,
+    rewrite,
+)
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode
@@ -22,6 +33,9 @@ from plow_twin.record.messages import JointState, WrenchStamped
 from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.record.reader import FileStatus, OutputRecord, RunReader
 from plow_twin.record.replay import replay
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Digest, Sample
 from plow_twin.stream.session import Session
 
@@ -274,3 +288,16 @@ def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.Mon
     assert replay(run.folder).exit_code == 0
     # one call warms up; the others take thousands of samples, not the hundred between two digests
     assert sum(calls) == COUNT + 2 and len(calls) <= 4
+
+
+def test_without_rows_the_motion_is_the_same_and_nothing_is_counted() -> None:
+    scene = load_scene(scene_path("paper"))
+    times, marks = 1e-3 * np.arange(COUNT), np.array([1, 700, COUNT])
+    wrench = np.sin(2.0 * times)[:, None] * np.array(PAPER_AMPLITUDE)
+    digests, in_contact = [], []
+    for rows in (True, False):
+        twin = Twin(scene, excitation="sampled")
+        digests.append(twin.advance_marked(times, wrench, marks, rows=rows).digests)
+        in_contact.append(float(twin._all_totals["time_in_contact"].sum()))
+    assert digests[0] == digests[1]
+    assert in_contact[0] > 1.0 and in_contact[1] == 0.0

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -37,6 +38,7 @@ MESSAGE_HEAD: Final = 31
 _COLUMNS: Final = 6
 #: Chunks below that size [B] are looked through together.
 _SMALL: Final = 2**18
+_of_thread: Final = threading.local()
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ class ChunkReader:
     finished: bool = False
     damaged: int = 0
     position: int = 0
+    _table: Indexes = field(default_factory=lambda: np.empty((_COLUMNS, 0), np.int64), init=False)
 
     def __iter__(self) -> Iterator[Messages]:
         self.finished, self.damaged, self.position = False, 0, 0
@@ -193,9 +196,11 @@ class ChunkReader:
         if not contents:
             return
         content = contents[0] if len(contents) == 1 else np.concatenate(contents)
-        table = np.empty((_COLUMNS, len(content) // MESSAGE_HEAD + 1), np.int64)
+        most = len(content) // MESSAGE_HEAD + 1
+        if self._table.shape[1] < most:
+            self._table = np.empty((_COLUMNS, most), np.int64)
         others = np.empty(256, np.int64)
-        count, other_count, whole = scan(content, table, others)
+        count, other_count, whole = scan(content, self._table, others)
         if not whole and len(contents) > 1:
             for part in contents:
                 yield from self._scan([part], schemas)
@@ -205,7 +210,7 @@ class ChunkReader:
             start = int(place) + _HEAD.size
             self._declare(opcode, content[start : start + length].tobytes(), schemas)
         self.damaged += 0 if whole else 1
-        yield Messages(content, *(column[:count] for column in table))
+        yield Messages(content, *self._table[:, :count].copy())
 
     def _declare(self, opcode: int, record: bytes, schemas: dict[int, tuple[str, bytes]]) -> None:
         from mcap import records
@@ -251,6 +256,16 @@ class ChunkReader:
         for channel in summary.channels.values():
             name, text = schemas.get(channel.schema_id, ("", b""))
             self.channels.setdefault(channel.id, Channel(channel.topic, name, channel.message_encoding, text))
+
+
+def is_begun(path: Path) -> bool:
+    """Tell whether more of an MCAP file is there than its name: a process may be killed before it writes a byte."""
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(len(MAGIC))
+    except OSError:
+        return True  # whoever opens it says why it cannot be read
+    return len(head) == len(MAGIC) or not MAGIC.startswith(head)
 
 
 def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
@@ -308,7 +323,7 @@ def decompress(compression: str, data: memoryview, size: int) -> bytes:
 
         if zstandard.frame_content_size(data) not in (-1, size):
             raise RecordingError(f"chunk: got {zstandard.frame_content_size(data)} bytes, expected {size}")
-        content: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        content: bytes = _zstd().decompress(data, max_output_size=size)
     elif compression == "lz4":
         import lz4.frame
 
@@ -318,6 +333,15 @@ def decompress(compression: str, data: memoryview, size: int) -> bytes:
     else:
         raise RecordingError(f"compression: got {compression!r}, expected zstd, lz4 or none")
     return content
+
+
+def _zstd() -> Any:
+    """Return this thread's decompressor: its tables take as long to make as a small chunk to decompress."""
+    import zstandard
+
+    if not hasattr(_of_thread, "zstd"):
+        _of_thread.zstd = zstandard.ZstdDecompressor()
+    return _of_thread.zstd
 
 
 @compiled

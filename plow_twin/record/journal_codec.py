@@ -65,8 +65,8 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "loss": Loss,
     "dropped": Dropped,
 }
-#: A digest as it is written: it is what most entries of a journal are.
-_DIGEST: Final = re.compile(r'\{"kind": "digest", "stamp_ns": (-?[0-9]{1,19}), "digest": "([0-9a-f]*)"\}')
+#: A digest as it is written, with the zero at its end: it is what most lines of a journal are.
+_DIGEST: Final = re.compile(rb'\{"kind": "digest", "stamp_ns": (-?[0-9]{1,19}), "digest": "([0-9a-f]*)"\}\x00')
 #: Fields that a line may lack.
 _OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
@@ -108,10 +108,15 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
     return _from_json(message.data, source)
 
 
+def digest_in(data: bytes) -> Digest | None:
+    """Return the digest that the CDR bytes of a string hold, or None for anything else."""
+    if data[:2] != b"\x00\x01" or int.from_bytes(data[4:8], "little") != len(data) - 8:
+        return None
+    found = _DIGEST.fullmatch(data, 8)
+    return None if found is None else Digest(int(found[1]), found[2].decode())
+
+
 def _from_json(text: str, source: str) -> Entry | Dropped:
-    digest = _DIGEST.fullmatch(text)
-    if digest is not None:
-        return Digest(int(digest[1]), digest[2])
     try:
         values = json.loads(text)
         kind = values["kind"]

@@ -49,6 +49,7 @@ from plow_twin.record.template import Indexes, Templates, differing, read_number
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
+from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import (
     Digest,
     Gaps,
@@ -148,6 +149,7 @@ class _Replay:
         if excitation == "sampled" and bound is None:  # a bounded one goes sample by sample
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
+        self.rows = np.zeros(0, ROW)  # of the last run of samples
         self.publications: Publications | None = (
             None  # of the last run of samples; its last publication may have messages to come
         )
@@ -236,13 +238,14 @@ class _Replay:
         digests = sorted(index for index, entry in entries.others.items() if isinstance(entry, Digest))
         stamps = entries.stamp_ns[entries.sample]
         before = self.session.snapshot(), self.session.outputs.pending, self.session.origin_ns
+        self.messages, self.publications = None, None
+        rows: bool | NDArray[np.void] = False
+        if not self.digests_only or self.sink is not None:
+            if len(self.rows) < len(stamps):
+                self.rows = np.zeros(len(stamps), ROW)
+            rows = self.rows
         try:
-            found = self.session.advance_marked(
-                stamps,
-                entries.wrench[entries.sample],
-                done[digests],
-                rows=not self.digests_only or self.sink is not None,
-            )
+            found = self.session.advance_marked(stamps, entries.wrench[entries.sample], done[digests], rows=rows)
         except ValueError:  # one by one: the sample that is refused is counted
             return False
         if found.status.any():
@@ -262,7 +265,6 @@ class _Replay:
         ]
         self.report.digests_compared += len(digests)
         self.next_sequence = (int(entries.sequence[-1]) + 1) & _SEQUENCE_MASK
-        self.messages, self.publications = None, None
         if self.sink is not None and found.rows is not None:
             self._write_run(entries, stamps, found.rows)
             self._messages(sent, begin, end)

@@ -103,7 +103,8 @@ class AdvanceSeries(_Rows):
 
     def __getitem__(self, index: int) -> Advance:
         rows = self.__dict__.get("_rows")
-        row = tuple(getattr(self, name)[index] for name in _ROW_NAMES) if rows is None else rows[index].item()
+        # a copy: it does not keep all the rows, nor change with their memory
+        row = tuple(getattr(self, name)[index] for name in _ROW_NAMES) if rows is None else rows[index].copy().item()
         made = Advance.__new__(Advance)  # all at once: a frozen class sets its fields one by one
         made.__dict__.update(zip(_ROW_NAMES, row, strict=True), t=float(self.t[index]))
         made.__dict__.update(steps=int(made.steps), status=_STATUS[made.status])

@@ -62,7 +62,10 @@ def _present(p, harmonics, flight, support, state, w, y) -> None:
 
 @kernel()
 def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
-    """Bring the motion to `target`; steps may reach beyond it, up to `stop_time`. Returns a `Status`."""
+    """Bring the motion to `target`; steps may reach beyond it, up to `stop_time`. Returns a `Status`.
+
+    Without totals nothing is counted; the motion is the same.
+    """
     while True:
         t0 = state.step_start
         if t0 >= target and state.step_size < 0.0:
@@ -72,11 +75,13 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
             return code
         low = sigma_at(state, state.elapsed)
         if target < t0 + state.step_size:
-            add_to_totals(state, w, low, sigma_at(state, target - t0), totals)
+            if totals is not None:
+                add_to_totals(state, w, low, sigma_at(state, target - t0), totals)
             state.elapsed, state.time = target - t0, target
             _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.moved)
             return _OK if within_range(p, state, w.moved) else _RANGE
-        add_to_totals(state, w, low, sigma_at(state, state.step_size), totals)
+        if totals is not None:
+            add_to_totals(state, w, low, sigma_at(state, state.step_size), totals)
         _end(p, parts, state, w, totals, None)
 
 
@@ -101,10 +106,11 @@ def _worn_now(state, w, wear, out) -> None:
 @kernel()
 def _clear(totals) -> None:
     """Begin to count anew what an advance reports."""
-    set_row(totals.peak, 0, splat(0.0))
-    set_row(totals.impulse, 0, splat(0.0))
-    for pair in range(PAIR_COUNT):
-        totals.makes[pair] = 0
+    if totals is not None:
+        set_row(totals.peak, 0, splat(0.0))
+        set_row(totals.impulse, 0, splat(0.0))
+        for pair in range(PAIR_COUNT):
+            totals.makes[pair] = 0
 
 
 @kernel()
@@ -251,12 +257,12 @@ def advance_marked(
 ) -> bool:
     """Advance one twin to each time, as `advance_batch` does, and save its state where `marks` say.
 
-    `marks` are numbers of advances, rising; `snapshots` has room for as many states. `rows` may be None: then nothing
-    is read out. Returns whether all is done, as `advance_times`.
+    `marks` are numbers of advances, rising; `snapshots` has room for as many states. `rows` and `totals` may be None:
+    then nothing is read out, nor counted. Returns whether all is done, as `advance_times`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
-    w, sums, piece = work[0], totals[0], parts.segments[0]
-    p, state = params[0], states[0]
+    sums = None if totals is None else totals[0]
+    w, piece, p, state = work[0], parts.segments[0], params[0], states[0]
     _begin_slice(pace)
     while pace.row < times.size:
         i = pace.row
@@ -270,8 +276,6 @@ def advance_marked(
             return False
         if rows is not None:
             _read_row(p, parts, state, w, sums, rows[i])
-        else:
-            _clear(sums)
         while pace.mark < marks.size and marks[pace.mark] == i + 1:
             snapshots[pace.mark] = states[0]
             pace.mark += 1

@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import below, row, splat
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.grip import grasp, weigh_grips
-from plow_twin.solve.kinematics import penetration_of, rate_of, row_value
+from plow_twin.solve.kinematics import penetration_of, rate_of, row_value, row_values
 from plow_twin.solve.state import (
     ACTS,
     BASE,
@@ -33,6 +34,7 @@ _SHALLOW = 1e-3
 _BISECTIONS = 60
 #: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees.
 LARGEST_ANGLE = 0.25 * math.pi
+_ALL_PAIRS = 2**PAIR_COUNT - 1
 
 
 @kernel()
@@ -166,9 +168,19 @@ def slow_touch(p) -> float:
     return _SHALLOW * math.sqrt(2.0 * acceleration * p.release)
 
 
+@kernel(fast=True)
+def _all_shallow(p, state, y) -> bool:
+    """Tell whether the penetration of each pair, also of those that cannot touch, is less than half the cavity."""
+    penetration = row_values(p.penetration_rows, y[COS], y[SIN], y[X], y[Y])
+    penetration = penetration + (row(p.penetration_rows, 4) - row(state.wear_depth, 0))
+    return bool(below(penetration, splat(p.half_cavity)) == _ALL_PAIRS)
+
+
 @kernel()
 def within_range(p, state, y) -> bool:
     """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
+    if _all_shallow(p, state, y):
+        return abs(y[THETA]) <= LARGEST_ANGLE
     deepest = 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:

@@ -108,7 +108,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
 
 @kernel()
 def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fraction, stick) -> None:
-    """Move the state to the step's end and switch the mode that its event changes."""
+    """Move the state to the step's end and switch the mode that its event changes; totals and log may be None."""
     y = state.y
     sigma = state.sigma_end
     if wear is not None:
@@ -159,7 +159,8 @@ def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
         state.beyond_ramp[pair] = 0
     if old == OFF:
         touch(p, state, pair)
-        totals.makes[pair] += 1
+        if totals is not None:
+            totals.makes[pair] += 1
         if fraction is not None and new == ON:
             if penetration_and_rate(p, state, pair)[1] > slow_touch(p):
                 state.touching |= 1 << pair

@@ -222,7 +222,12 @@ class Session:
         return not self.held and not self._travels
 
     def advance_marked(
-        self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], marks: NDArray[np.int64], *, rows: bool = True
+        self,
+        stamps: NDArray[np.int64],
+        wrench: NDArray[np.float64],
+        marks: NDArray[np.int64],
+        *,
+        rows: bool | NDArray[np.void] = True,
     ) -> MarkedAdvance:
         """Apply many samples at once for a replay: nothing is emitted, and `outputs` is left to the caller.
 
@@ -244,12 +249,11 @@ class Session:
             raise ValueError(f"stamp: expected samples only, with stamps that do not fall, from {reached} ns on")
         origin = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         before = self.snapshot().data
-        done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows or self._wears)
+        done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows)
         self.history.add_snapshot(int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns, before)
         self.history.add_later(stamps, wrench)
         self.origin_ns, self.stamp_ns = origin, int(stamps[-1])
-        if done.rows is not None:
-            self.wear_depth = done.rows.wear_depth[-1].copy()
+        self.wear_depth = done.wear_depth
         self._advances += len(stamps)
         return done
 
