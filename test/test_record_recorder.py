@@ -316,7 +316,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(tmp_path: Path)
     assert loss.complete and marked == [folder, folder.with_name("ring_2")]
     for path in (folder, folder.with_name("ring_2")):
         report = replay(path)
-        assert (report.exit_code, report.divergences) == (0, 0) and report.digests_compared
+        assert (report.exit_code, report.divergences) == (0, 0) and report.messages_compared
         assert 0.1 < report.span_s < 0.7 * index * 1e-3
     # what lies between the two is in neither, or in one
     stamps = [
@@ -384,3 +384,59 @@ def test_a_message_of_another_type_stops_the_recording_with_its_topic(tmp_path: 
     recorder.output(TOPIC, BASE_NS, Text("no joint state"))
     loss = recorder.close()
     assert loss.error is not None and TOPIC in loss.error and not loss.closed
+
+
+#: Says what the disk has been waited for: path and size.
+SYNCS = """
+    import os, time
+    def note(wait):
+        def noted(descriptor):
+            path, size = os.readlink(f"/proc/self/fd/{descriptor}"), os.fstat(descriptor).st_size
+            wait(descriptor)
+            os.write(1, f"synced {size} {path}\\n".encode())  # in one go: the other thread prints too
+        return noted
+    os.fsync, os.fdatasync = note(os.fsync), note(os.fdatasync)
+"""
+
+
+def test_with_sync_what_was_flushed_survives_a_loss_of_power(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    writer = WRITER.replace("on_error=errors.append", "on_error=errors.append, sync=True, flush_period_s=0.2")
+    command = [sys.executable, "-c", textwrap.dedent(SYNCS) + textwrap.dedent(writer), str(folder), "0", str(10**9)]
+    file = folder / "run_0.mcap"
+    synced: list[tuple[str, int]] = []
+    index, before, flushes = -1, -1, 0
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            what, *rest = line.split()
+            if what != "synced":
+                index = int(what)
+            else:
+                synced.append((rest[1], int(rest[0])))
+                flushes += index >= 0
+                before = index if flushes == 3 else before  # waited for by the flush after this one at the latest
+            if flushes == 5:
+                process.kill()
+    # a loss of power may leave no more than that
+    assert {str(folder), str(tmp_path)} <= {path for path, _ in synced}
+    os.truncate(file, max(size for path, size in synced if path == str(file)))
+    reader = RunReader(folder)
+    stamps = [r.entry.stamp_ns for r in reader if isinstance(r, EntryRecord) and isinstance(r.entry, Sample)]
+    assert before > 0 and len(stamps) > before
+    assert stamps == [BASE_NS + index * STEP_NS for index in range(len(stamps))]
+
+
+def test_without_sync_the_disk_is_not_waited_for_and_with_it_a_closed_run_is_whole_there(tmp_path: Path) -> None:
+    waited = []
+    for sync in ("False", "True"):
+        folder = tmp_path / sync
+        writer = WRITER.replace("on_error=errors.append", f"on_error=errors.append, sync={sync}")
+        code = textwrap.dedent(SYNCS) + textwrap.dedent(writer) + "recorder.close()"
+        done = subprocess.run([sys.executable, "-c", code, str(folder), "0", "20"], capture_output=True, text=True)
+        lines = [line.split() for line in done.stdout.splitlines() if line.startswith("synced")]
+        waited.append({path: int(size) for _, size, path in lines})
+    assert not waited[0]
+    folder = tmp_path / "True"
+    assert waited[1][str(folder / "True_0.mcap")] == (folder / "True_0.mcap").stat().st_size
+    assert {str(folder / "metadata.yaml.partial"), str(folder)} <= set(waited[1])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.record.cdr import type_hash
+from plow_twin.record.durable import sync_path
 from plow_twin.record.messages import DiagnosticStatus
 
 METADATA_VERSION: Final = 9
@@ -127,8 +128,12 @@ def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[
     }
 
 
-def write_metadata(folder: Path, metadata: Mapping[str, Any]) -> None:
-    """Write `metadata.yaml` in one step, so that no reader meets half of it."""
+def write_metadata(folder: Path, metadata: Mapping[str, Any], *, sync: bool = False) -> None:
+    """Write `metadata.yaml` in one step, so that no reader meets half of it; with `sync` wait for the disk."""
     partial = folder / "metadata.yaml.partial"
     partial.write_text(dump_yaml(metadata), encoding="utf-8")
+    if sync:
+        sync_path(partial)
     partial.replace(folder / "metadata.yaml")
+    if sync:
+        sync_path(folder)

@@ -98,7 +98,8 @@ class Recorder:
     ring_s
         Nothing is written but the last so many seconds, kept in memory, at each `mark` [s]; 0: everything is written.
     sync
-        Whether each flush waits for the disk (`fdatasync`): for a loss of power.
+        Whether each flush waits for the disk (`fdatasync`), and so does all that makes a part or a ring findable: for a
+        loss of power.
     now_ns
         Receive times [ns], read in the caller's thread.
     on_error
@@ -135,7 +136,7 @@ class Recorder:
         if ring_s:
             from plow_twin.record.ring import PARTS, RingWriter
 
-            self._ring = RingWriter(self._folder, header, chunk_size, min_free_bytes, ring_s)
+            self._ring = RingWriter(self._folder, header, chunk_size, min_free_bytes, ring_s, sync_dumps=sync)
             part_bytes, part_s, keep_bytes = 0, ring_s / PARTS, 0
         self._writer = self._ring or RunWriter(self._folder, header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from plow_twin.errors import RecordingError
+from plow_twin.record.durable import sync_path
 from plow_twin.record.header import RunHeader
 from plow_twin.record.mcap_file import ByteFile
 from plow_twin.record.metadata_yaml import PartFacts, bag_metadata, write_metadata
@@ -26,10 +27,21 @@ class RingWriter(RunWriter):
         Names the recording; nothing is made there.
     ring_s
         Time that is kept at least, once it has passed [s]; up to an eighth more.
+    sync_dumps
+        Whether `dump` waits for the disk.
     """
 
-    def __init__(self, folder: Path, header: RunHeader, chunk_size: int, min_free_bytes: int, ring_s: float) -> None:
-        self._ring_s = ring_s
+    def __init__(
+        self,
+        folder: Path,
+        header: RunHeader,
+        chunk_size: int,
+        min_free_bytes: int,
+        ring_s: float,
+        *,
+        sync_dumps: bool = False,
+    ) -> None:
+        self._ring_s, self._sync_dumps = ring_s, sync_dumps
         self._kept: list[tuple[float, PartFacts, bytes]] = []  # when each began, and what it holds
         self._begun = time.monotonic()
         super().__init__(folder, header, chunk_size, min_free_bytes)
@@ -76,8 +88,13 @@ class RingWriter(RunWriter):
         for _, part, content in self._kept:
             name = f"{folder.name}_{part.name.rpartition('_')[2]}"
             (folder / name).write_bytes(content)
+            if self._sync_dumps:
+                sync_path(folder / name)
             facts.append(PartFacts(name, part.start_ns, part.end_ns, part.topics))
-        write_metadata(folder, bag_metadata(facts, {f"plow_twin_lost {topic}": str(n) for topic, n in loss.items()}))
+        lost = {f"plow_twin_lost {topic}": str(n) for topic, n in loss.items()}
+        write_metadata(folder, bag_metadata(facts, lost), sync=self._sync_dumps)
+        if self._sync_dumps:
+            sync_path(folder.parent)
         self._kept = []
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:

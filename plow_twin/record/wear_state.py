@@ -14,6 +14,7 @@ from typing import Any, Final
 from plow_twin.errors import PlowTwinError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
+from plow_twin.record.durable import sync_path
 
 #: The file in the folder that the user names.
 FILE_NAME: Final = "wear.json"
@@ -99,11 +100,7 @@ def save_wear(folder: Path, state: WearState) -> None:
     except OSError:
         beside.unlink(missing_ok=True)
         raise
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    sync_path(folder)
 
 
 def _parse(text: str, path: Path) -> WearState:

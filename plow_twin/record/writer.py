@@ -15,6 +15,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
 from plow_twin.record.chunks import MESSAGE_HEAD
+from plow_twin.record.durable import sync_path
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.mcap_file import ByteFile, ChunkBuilder, McapFile, UnbufferedFile
@@ -63,7 +64,7 @@ class RunWriter:
     min_free_bytes
         `shortage` speaks up when the disk has less free space [B] than that.
     sync
-        Whether each flush also asks the disk.
+        Whether each flush waits for the disk, and so do parts that begin and end, with their folder.
     """
 
     def __init__(
@@ -95,6 +96,9 @@ class RunWriter:
         path = self.folder / f"{self.folder.name}_{self._number}.mcap"
         file = McapFile(self._make(path), f"plow_twin {self.header.package_version}")
         file.metadata(HEADER_RECORD, {**self.header.to_record(), "part": str(self._number)})
+        if self._sync:
+            file.sync()
+            sync_path(self.folder, self.folder.parent)
         return _Part(path, file)
 
     @property
@@ -241,6 +245,8 @@ class RunWriter:
     def _finish(self, part: _Part, record: Mapping[str, str]) -> None:
         part.file.metadata(LOSS_RECORD, record)
         part.file.finish()
+        if self._sync:
+            part.file.sync()
         part.file.close()
         self._bytes_before += part.file.size
         self._done.append(part.facts())
@@ -254,7 +260,7 @@ class RunWriter:
         self._close_chunks()
         self._finish(self._part, record)
         self._bytes_before -= self._part.file.size
-        write_metadata(self.folder, bag_metadata(self._done, custom))
+        write_metadata(self.folder, bag_metadata(self._done, custom), sync=self._sync)
 
     def abandon(self) -> None:
         """Leave the file as it is, without an index: after an error."""
