@@ -86,9 +86,11 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> FileSta
     _curves(
         axis, force, PAIR_NAMES, "largest force [kN]", [tuple(part / 255 for part in color) for color in PAIR_COLORS]
     )
-    _curves(figure.add_subplot(grid[1, 1:], sharex=axis), load, ("Fx [kN]", "Fy [kN]", "M [kN m]"), "load", None)
+    _curves(
+        figure.add_subplot(grid[1, 1:], sharex=axis), load, ("Fx [kN]", "Fy [kN]", "M [kN m]"), "load [kN, kN m]", None
+    )
     below = figure.add_subplot(grid[2, 1:], sharex=axis)
-    _bands(below, clearance)
+    _bands(below, clearance, (scene.clearance.horizontal_m, scene.clearance.vertical_m))
     below.set_xlabel("time since the first stamp [s]")
     figure.suptitle(f"{reader.path.name}: {reader.status.value}")
     try:
@@ -107,16 +109,26 @@ def _clearance_row(message: JointState) -> NDArray[np.float64]:
 def _draw_section(
     axis: Any, section: Section, pose: tuple[float, float, float], force: NDArray[np.float64], largest: float
 ) -> None:
-    axis.plot(*section.frame_strip().T, color="0.5")
-    for strip in section.head_strips(pose):
-        axis.plot(*strip.T, color="k", lw=1.0)
+    axis.plot(*section.frame_strip().T, color="0.5", label="frame (fixed)")
+    for number, strip in enumerate(section.head_strips(pose)):
+        axis.plot(*strip.T, color="k", lw=1.0, label="" if number else "head")
     if largest > 0.0:
         origins, vectors, pairs = section.arrows(pose[2], force)
         for origin, vector, pair in zip(origins, vectors, pairs, strict=True):
             color = tuple(part / 255 for part in PAIR_COLORS[pair])
             axis.annotate("", origin + vector, origin, arrowprops={"arrowstyle": "->", "color": color, "lw": 2})
+            text = f"{force[pair] / 1e3:.0f} kN"
+            axis.annotate(text, origin + 1.25 * vector, color=color, ha="center", va="center", fontsize=8)
     axis.set(aspect="equal", title=f"Cross-section [mm] at the largest force, {largest / 1e3:.1f} kN")
+    axis.margins(0.1)
+    axis.legend(loc="upper left", fontsize=7)
+    _y_upwards(axis)
+
+
+def _y_upwards(axis: Any) -> None:
+    """Let y count upwards: the section has it downwards, as viewers have."""
     axis.invert_yaxis()
+    axis.yaxis.set_major_formatter(lambda y, _: f"{0.0 - y:g}")
 
 
 def _draw_wide(axis: Any, section: Section, penetration: NDArray[np.float64], factor: float) -> None:
@@ -124,7 +136,9 @@ def _draw_wide(axis: Any, section: Section, penetration: NDArray[np.float64], fa
     walls, touching = section.exaggerated(penetration, factor)
     for wall, touches in zip(walls, touching, strict=True):
         axis.plot(*wall.T, color="tab:orange" if touches else "k")
-    axis.set(aspect="equal", title=f"clearance {factor:g} times as wide")
+    axis.set(
+        aspect="equal", title=f"clearance {factor:g} times as wide, walls that touch in orange", xticks=[], yticks=[]
+    )
     axis.invert_yaxis()
 
 
@@ -135,17 +149,22 @@ def _curves(axis: Any, rows: _Largest, names: Sequence[str], label: str, colors:
             axis.plot(rows.times, values[:, index], lw=0.7, label=name, color=colors[index] if colors else None)
     axis.set_ylabel(label)
     if len(values):
-        axis.legend(loc="upper right", fontsize=7, ncols=2)
+        _legend_beside(axis)
 
 
-def _bands(axis: Any, rows: _Largest) -> None:
+def _bands(axis: Any, rows: _Largest, new_m: Sequence[float]) -> None:
+    """Draw the growth of both clearances with its interval: beside millimetres of clearance it would not be seen."""
     values = np.array(rows.rows).reshape(-1, 6)
     for index, name in enumerate(("horizontal", "vertical")):
         if len(values):
-            line = axis.plot(rows.times, values[:, 3 * index], label=name)[0]
-            axis.fill_between(
-                rows.times, values[:, 3 * index + 1], values[:, 3 * index + 2], alpha=0.25, color=line.get_color()
-            )
-    axis.set_ylabel("clearance, 5..95 % [mm]")
+            value, low, high = 1e3 * (values[:, 3 * index : 3 * index + 3].T - 1e3 * new_m[index])
+            line = axis.plot(rows.times, value, label=f"{name},\n{values[-1, 3 * index]:.3f} mm at the end")[0]
+            axis.fill_between(rows.times, low, high, alpha=0.25, color=line.get_color())
+    axis.set_ylabel("growth of the clearance,\n5..95 % [um]")
     if len(values):
-        axis.legend(loc="upper right", fontsize=7)
+        _legend_beside(axis)
+
+
+def _legend_beside(axis: Any) -> None:
+    """Name the curves beside the axis, where no curve is."""
+    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7)
