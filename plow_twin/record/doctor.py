@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
-from plow_twin.record.chunks import ChunkReader, Messages
+from plow_twin.record.chunks import ChunkReader, Messages, is_begun
 from plow_twin.record.follow import is_claimed
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
 from plow_twin.record.journal_codec import Dropped
@@ -142,6 +142,8 @@ def _layout(reader: RunReader) -> str:
 
 
 def _part(path: Path) -> PartReport:
+    if not is_begun(path):
+        return PartReport(path, path.stat().st_size, finished=False, damaged_chunks=0, messages={})
     reader = ChunkReader(path)
     counts: Counter[str] = Counter()
     for messages in reader:
@@ -175,7 +177,7 @@ def repair(path: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The parts that were rewritten; the old ones stay beside them as `<name>.damaged`.
+        The parts that were rewritten; the old ones stay beside them as `<name>.damaged`, those that hold nothing too.
 
     Raises
     ------
@@ -189,6 +191,10 @@ def repair(path: Path) -> list[Path]:
     rewritten, facts = [], []
     for part in reader.parts:
         report = _part(part)
+        if not is_begun(part):
+            part.replace(part.with_name(f"{part.name}.damaged"))
+            rewritten.append(part)
+            continue
         if not report.healthy:
             _rewrite(part)
             rewritten.append(part)

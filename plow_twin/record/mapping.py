@@ -299,6 +299,7 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str] | None) -
     fields = entry.get("fields") or _default_fields(role, kind)
     if not fields:
         raise RecordingError(f"{path}: {role}: fields are missing, and there are no default ones for {kind}")
+    _check_columns(path, role, kind, fields)
     return Role(
         topic,
         kind,
@@ -312,6 +313,16 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str] | None) -
         round(_clock_offset(path, role, entry.get("clock_offset", 0.0)) * 1e9),
         str(entry.get("sequence", "")),
     )
+
+
+def _check_columns(path: Path, role: str, kind: str, fields: Any) -> None:
+    """Raise a `RecordingError` for fields that are no columns of a CSV file."""
+    if not kind.startswith("csv:") or not isinstance(fields, dict):
+        return
+    columns = kind.removeprefix("csv:").split(",")
+    for name in fields.values():
+        if name not in columns:
+            raise RecordingError(f"{path}: {role}: fields: got {name!r}, expected a column of {', '.join(columns)}")
 
 
 def _topic(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, str] | None) -> tuple[str, str]:

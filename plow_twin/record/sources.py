@@ -13,16 +13,19 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import IO, Any, Final, Protocol
+from urllib.parse import quote
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.chunks import MAGIC, ChunkReader
+from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun
 from plow_twin.record.reader import run_parts
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 #: CSV has no clock; a stamp of 0 would count as missing: it starts there [ns].
 CSV_ORIGIN_NS: Final = 1_000_000_000
 _ROWS: Final = 1000
+#: Characters of a CSV file that are looked at for what parts its columns.
+_LONGEST_HEADER: Final = 65_536
 #: What a damaged file makes of sqlite3: its own errors, texts of them that are no UTF-8, cells of impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
@@ -108,6 +111,13 @@ class Decoder:
         self._losses.unknown_types[topic] = message_type
         return False
 
+    def reads(self, channel: Channel) -> bool:
+        """Tell whether a channel of MCAP can be decoded; one that cannot is noted, with its encoding."""
+        if channel.encoding != "cdr":
+            self._losses.unknown_types[channel.topic] = f"{channel.message_type} encoded as {channel.encoding}"
+            return False
+        return self.knows(channel.topic, channel.message_type, channel.schema.decode(errors="replace"))
+
     def decode(self, data: bytes, message_type: str) -> Any | None:
         """Return a message, or None (counted) when the bytes do not hold one."""
         for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes behind a last empty float64[]
@@ -130,6 +140,8 @@ class McapSource:
         """Return types by topic, from the first chunks of each part."""
         found: dict[str, str] = {}
         for part in self.parts:
+            if len(self.parts) > 1 and not is_begun(part):
+                continue
             reader = ChunkReader(part)
             for number, _ in enumerate(reader):
                 if number >= 8:
@@ -141,6 +153,9 @@ class McapSource:
         """Yield the messages on wanted topics."""
         decoder = Decoder(self.losses)
         for part in self.parts:
+            if len(self.parts) > 1 and not is_begun(part):
+                self.losses.counts["truncated_files"] += 1
+                continue
             reader = ChunkReader(part)
             known: dict[int, bool] = {}
             for messages in reader:
@@ -150,13 +165,7 @@ class McapSource:
                         self.losses.counts["undeclared"] += 1
                         continue
                     if number not in known:
-                        known[number] = (
-                            wanted(channel.topic)
-                            and channel.encoding == "cdr"
-                            and decoder.knows(
-                                channel.topic, channel.message_type, channel.schema.decode(errors="replace")
-                            )
-                        )
+                        known[number] = wanted(channel.topic) and decoder.reads(channel)
                     if not known[number]:
                         continue
                     content = decoder.decode(messages.data(index), channel.message_type)
@@ -175,9 +184,21 @@ class SqliteSource:
     def __init__(self, parts: list[Path]) -> None:
         self.parts = sorted(parts, key=lambda path: (len(path.name), path.name))
         self.losses = Losses()
+        self._unread: set[Path] = set()
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        connection = sqlite3.connect(f"file:{path.resolve().as_posix()}?mode=ro&immutable=1", uri=True)
+        log = path.with_name(path.name + "-wal")  # of a recorder that was killed: what it wrote last
+        kept = log.is_file() and log.stat().st_size > 0
+        place = quote(path.resolve().as_posix())
+        connection = sqlite3.connect(f"file:{place}?mode=ro" + ("" if kept else "&immutable=1"), uri=True)
+        if kept:
+            try:
+                connection.execute("SELECT 1 FROM sqlite_master")
+            except sqlite3.OperationalError:  # its place takes no file to share the log by
+                connection.close()
+                connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
+                self.losses.counts["unread_logs"] = len({*self._unread, path})
+                self._unread.add(path)
         connection.text_factory = lambda data: data.decode(errors="replace")
         return connection
 
@@ -230,7 +251,11 @@ class SqliteSource:
 
 
 class CsvSource:
-    """CSV files with a header line, each a topic under its name without `.csv`; times in s."""
+    """CSV files with a header line, each a topic under its name without `.csv`; times in s.
+
+    Columns are parted by commas, or by semicolons or tabs where the header has more of these; numbers may have decimal
+    commas then, as spreadsheets write them in many countries.
+    """
 
     def __init__(self, parts: list[Path]) -> None:
         self.parts = parts
@@ -239,11 +264,21 @@ class CsvSource:
         self.origin_ns = CSV_ORIGIN_NS
 
     def topics(self) -> dict[str, str]:
-        """Return `csv` with its columns, by topic."""
+        """Return `csv` with its columns, by topic.
+
+        Raises
+        ------
+        RecordingError
+            A column's name stands twice.
+        """
         found = {}
         for part in self.parts:
-            with part.open(newline="", encoding="utf-8", errors="replace") as stream:
-                found[part.stem] = "csv:" + ",".join(name.strip() for name in next(csv.reader(stream), []))
+            with _open_csv(part) as stream:
+                names = [name.strip() for name in next(csv.reader(stream, delimiter=_delimiter(stream)), [])]
+            twice = [name for name, count in Counter(names).items() if name and count > 1]
+            if twice:
+                raise RecordingError(f"{part}: column {twice[0]!r} stands there more than once, expected one of a name")
+            found[part.stem] = "csv:" + ",".join(names)
         return found
 
     def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
@@ -256,9 +291,13 @@ class CsvSource:
 
     def _rows(self, part: Path) -> Iterator[Arrived]:
         try:
-            with part.open(newline="", encoding="utf-8", errors="replace") as stream:
-                for row in csv.DictReader(stream):
-                    content = {str(key).strip(): _number(value) for key, value in row.items() if key is not None}
+            with _open_csv(part) as stream:
+                delimiter = _delimiter(stream)
+                decimal = "." if delimiter == "," else ","
+                for row in csv.DictReader(stream, delimiter=delimiter):
+                    content = {
+                        str(key).strip(): _number(value, decimal) for key, value in row.items() if key is not None
+                    }
                     time = next(iter(content.values()), math.nan)
                     time = content.get("t", content.get("time", time))
                     if not math.isfinite(time) or abs(time) > 4e9:
@@ -269,8 +308,20 @@ class CsvSource:
             self.losses.counts["truncated_files"] += 1
 
 
-def _number(text: Any) -> float:
+def _open_csv(path: Path) -> IO[str]:
+    """Open a text; a mark of the byte order at its beginning, as spreadsheets write it, is no part of it."""
+    return path.open(newline="", encoding="utf-8-sig", errors="replace")
+
+
+def _delimiter(stream: IO[str]) -> str:
+    """Return what parts the columns, by the header line, which is read again after that."""
+    header = stream.readline(_LONGEST_HEADER)
+    stream.seek(0)
+    return max(",;\t", key=header.count)
+
+
+def _number(text: Any, decimal: str = ".") -> float:
     try:
-        return float(text)
-    except (TypeError, ValueError):
+        return float(text if decimal == "." else text.replace(decimal, "."))
+    except (AttributeError, TypeError, ValueError):
         return math.nan

@@ -1,0 +1,150 @@
+"""Files that others hand over: cut off, half written, exported by a spreadsheet, in encodings that are not ROS 2's."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+from record_support import BASE_NS, STEP_NS, paper_sample, record_run
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
+from test_study_analysis import MAP, PAPER, STORE, wrench_message
+
+from plow_twin.errors import RecordingError
+from plow_twin.record.doctor import examine, repair
+from plow_twin.record.reader import FileStatus
+from plow_twin.record.replay import replay
+from plow_twin.record.sources import open_source
+from plow_twin.study.analysis.analyse import Analysis, analyse
+
+COUNT = 300
+TYPE = "geometry_msgs/msg/WrenchStamped"
+
+
+def sqlite_bag(folder: Path) -> Path:
+    """A bag with the load, of which the last third stands in the log that a killed recorder leaves behind."""
+    with BagWriter(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/load", TYPE, typestore=STORE)
+        for index in range(2 * COUNT // 3):
+            time_ns = BASE_NS + index * STEP_NS
+            writer.write(connection, time_ns, wrench_message(time_ns, paper_sample(index).wrench))
+    file = next(folder.glob("*.db3"))
+    live, killed = sqlite3.connect(file), folder / "killed"
+    live.execute("PRAGMA journal_mode=WAL")
+    for index in range(2 * COUNT // 3, COUNT):
+        time_ns = BASE_NS + index * STEP_NS
+        data = wrench_message(time_ns, paper_sample(index).wrench)
+        live.execute("INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?, ?)", (time_ns, data))
+    live.commit()
+    killed.mkdir()
+    for item in folder.glob("*.db3*"):  # as it stands on the disk, without a clean end
+        if not item.name.endswith("-shm"):
+            shutil.copy(item, killed)
+    live.close()
+    return killed
+
+
+def test_a_bag_without_its_metadata_and_with_an_open_log_is_read_to_its_end(tmp_path: Path) -> None:
+    killed = sqlite_bag(tmp_path / "bag")
+    assert not (killed / "metadata.yaml").exists() and list(killed.glob("*-wal"))
+    found = [arrived.log_time_ns for arrived in open_source(killed).messages(lambda topic: True)]
+    assert found == [BASE_NS + index * STEP_NS for index in range(COUNT)]
+
+
+def mcap(path: Path, encoding: str, schema: tuple[str, str, bytes], messages: list[tuple[int, bytes]]) -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        known = writer.register_schema(*schema) if schema[0] else 0
+        channel = writer.register_channel("/load", encoding, known)
+        for time_ns, data in messages:
+            writer.add_message(channel, max(time_ns, 0) % 2**64, data, max(time_ns, 0) % 2**64)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("encoding", "schema"),
+    [
+        ("json", (TYPE, "jsonschema", b"{}")),
+        ("ros1", ("geometry_msgs/WrenchStamped", "ros1msg", b"Header header\nWrench wrench\n")),
+        ("protobuf", ("Wrench", "protobuf", b"\x00\xff\x01")),
+        ("cdr", ("", "", b"")),
+        ("cdr", ("other_msgs/msg/Thing", "ros2msg", b"")),
+        ("cdr", ("other_msgs/msg/Thing", "ros2msg", b"\xff\xfe no text")),
+    ],
+)
+def test_what_is_not_ros_2_is_named_and_not_guessed_at(
+    encoding: str, schema: tuple[str, str, bytes], tmp_path: Path
+) -> None:
+    file = mcap(tmp_path / "odd.mcap", encoding, schema, [(BASE_NS, json.dumps({"fx": 1.0}).encode())])
+    with pytest.raises(RecordingError, match="excitation") as error:
+        analyse(file, scene=PAPER)
+    assert "/load" in str(error.value)
+    source = open_source(file)
+    assert not list(source.messages(lambda topic: True))
+    assert list(source.losses.unknown_types) == ["/load"]
+    assert encoding == "cdr" or encoding in source.losses.unknown_types["/load"]
+
+
+def test_stamps_of_any_size_are_counted_and_move_nothing(tmp_path: Path) -> None:
+    good = [(BASE_NS + i * STEP_NS, paper_sample(i).wrench) for i in range(COUNT)]
+    odd = [0, -(2**31) * 10**9, (2**31 - 1) * 10**9, -1]
+    messages = [(time_ns, wrench_message(time_ns, wrench)) for time_ns, wrench in good]
+    for place, stamp_ns in enumerate(odd):
+        messages.insert(50 * (place + 1), (BASE_NS, wrench_message(stamp_ns, (1e9, 0.0, 0.0))))
+    (tmp_path / "map.yaml").write_text(MAP.split("\nhead_pose")[0].replace("1000", "1"))
+    schema = STORE.generate_msgdef(TYPE, ros_version=2)[0].encode()
+    file = mcap(tmp_path / "odd.mcap", "cdr", (TYPE, "ros2msg", schema), messages)
+    found = analyse(file, scene=PAPER, mapping=tmp_path / "map.yaml")
+    dropped = sum(count for name, count in found.input.items() if name.startswith("dropped_"))
+    assert found.input["samples_in"] == COUNT + len(odd) == found.input["samples_used"] + dropped
+    assert found.lossy and found.predictions[0].loads.largest.max() < 1e6
+
+
+def sheet(
+    path: Path, delimiter: str, comma: bool, mark: bool, header: tuple[str, ...] = ("t", "fx", "fy", "m")
+) -> Path:
+    lines = [delimiter.join(header)]
+    for index in range(COUNT):
+        cells = [f"{value:.6f}" for value in (index * 1e-3, *paper_sample(index).wrench)]
+        lines.append(delimiter.join(cell.replace(".", ",") if comma else cell for cell in cells[: len(header)]))
+    path.write_text("\r\n".join(lines), encoding="utf-8-sig" if mark else "utf-8")
+    return path
+
+
+def test_a_spreadsheet_s_csv_gives_the_numbers_of_a_plain_one(tmp_path: Path) -> None:
+    def peaks(found: Analysis) -> list[float]:
+        assert found.input == {"samples_in": COUNT, "samples_used": COUNT}
+        return list(found.predictions[0].loads.largest)
+
+    plain = peaks(analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER))
+    assert max(plain) > 0.0
+    for delimiter in ";\t":
+        assert peaks(analyse(sheet(tmp_path / "load.csv", delimiter, comma=True, mark=True), scene=PAPER)) == plain
+
+
+def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> None:
+    twice = sheet(tmp_path / "load.csv", ",", comma=False, mark=True, header=("t", "fx", "fx", "m"))
+    with pytest.raises(RecordingError, match="'fx' stands there more than once"):
+        analyse(twice, scene=PAPER)
+    short = sheet(tmp_path / "load.csv", ",", comma=False, mark=True, header=("t", "fx", "fy"))
+    with pytest.raises(RecordingError, match="excitation: got load"):
+        analyse(short, scene=PAPER)
+    (tmp_path / "map.yaml").write_text("excitation: {topic: load, fields: {fx: fx, fy: fy, m: moment}}")
+    with pytest.raises(RecordingError, match="'moment', expected a column of t, fx, fy"):
+        analyse(short, scene=PAPER, mapping=tmp_path / "map.yaml")
+
+
+def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)))
+    (run.folder / "run_1.mcap").touch()
+    report = replay(run.folder)
+    assert (report.status, report.exit_code, report.samples) == (FileStatus.TRUNCATED, 3, COUNT)
+    assert examine(run.folder).problems == ["run_1.mcap: cut off: it has no end"]
+    repair(run.folder)
+    assert replay(run.folder).exit_code == 0 and (run.folder / "run_1.mcap.damaged").exists()
