@@ -242,7 +242,7 @@ class Twin:
             Rising numbers from 1 to n: a digest is wanted after so many samples.
         rows : bool or ndarray of `ROW`, shape (k,)
             Whether the rows are wanted; without them the motion is the same, but no forces are looked at for it.
-            Memory for at least n rows is written over: to make it anew for each call costs a tenth of its time.
+            Memory for at least n rows is written over: to make it anew for each call costs some 5 % of its time.
 
         Returns
         -------
