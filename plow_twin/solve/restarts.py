@@ -31,7 +31,7 @@ def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> i
             totals[m].logged = 0
             code = integrate(
                 p, parts, states[m], w, totals[m], log, t[high - 1], budgets[m], first, t[low:high], q[low:high],
-                v[low:high], None, None, None,
+                v[low:high], None, None, None, None,
             )  # fmt: skip
         if code != _OK:
             return code
