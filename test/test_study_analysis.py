@@ -32,6 +32,7 @@ from plow_twin.stream.journal import Entry, Pose
 from plow_twin.study.analysis import loads, thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
 from plow_twin.study.analysis.loads import reversals
+from plow_twin.study.analysis.report import _write_tables
 
 COUNT = 8000
 LAG_S = 0.037
@@ -199,7 +200,8 @@ def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_pat
     whole = np.array(list(facts["slide_mean_m"].values())) * facts["slide_pieces"]
     assert whole == pytest.approx(0.3 * loads.pad_wear.sum(axis=0), rel=1e-12)
     assert {backward for backward, _ in loads.slide_wear} == {0, 1}
-    table = parquet.read_table(tmp_path / "out" / "slide_wear.parquet")
+    _write_tables(prediction, tmp_path, "")
+    table = parquet.read_table(tmp_path / "slide_wear.parquet")
     assert table.num_rows == len(loads.slide_wear)
 
 
