@@ -16,7 +16,7 @@ from __future__ import annotations
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.contact_force import pair_force
+from plow_twin.solve.contact_force import law_force, pair_force
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value
 from plow_twin.solve.state import COS, OMEGA, ON, SIN, SLIPS_BACKWARD, SLIPS_FORWARD, STICKS, VX, VY, X, Y
 
@@ -62,7 +62,8 @@ def _anchor(p, state, pair, force, place, rate) -> None:
 def grasp(p, state, pair) -> None:
     """Let the corner of a pair that begins to push hold its wall by a slack spring, or slip where that is too much."""
     place, rate = _along(p, pair, state.y)
-    normal = pair_force(p, state, pair, penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y))
+    # at a touch rounding decides whether the corner is inside, and Kelvin-Voigt's force is there at once
+    normal = max(law_force(p, state, pair, penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y)), 0.0)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
     # without a force yet it is their rates that decide: the guard of a slip looks at them
