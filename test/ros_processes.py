@@ -109,6 +109,7 @@ class Probe:
         heard: list[Any] = []
         subscription = self.node.create_subscription(kind, topic, heard.append, QoSProfile(depth=20000))
         self.until(lambda: subscription.get_publisher_count() > 0, f"a publisher of {topic}")
+        self.pause(0.1)
         return heard
 
     def until(self, reached: Callable[[], Any], what: str, timeout_s: float = WAIT_S) -> None:

@@ -162,9 +162,9 @@ def test_a_scene_compiles_only_what_it_needs() -> None:
     twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
     twin.advance(0.01)
     compiled = [str(signature[1]) for signature in loop.advance_times.signatures]  # type: ignore[attr-defined]
-    # harmonics, second, segments, viscous, factor, integer, fraction, ramp, wear, offset, free, slip, stick, flight,
-    # rest
-    terms = "Terms(none, none, none, int64, none, none, none, none, none, none, int64, none, none, none, int64)"
+    # harmonics, second, segments, viscous, hysteretic, integer, fraction, ramp, wear, offset, free, slip, stick,
+    # support, flight, rest
+    terms = "Terms(none, none, none, int64, none, none, none, none, none, none, int64, none, none, none, none, int64)"
     bare = f"Parts({terms}, none, none, none)"
     assert bare in compiled, compiled
 

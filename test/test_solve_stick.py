@@ -187,6 +187,16 @@ def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
     assert pose_error(scene, loose.q, tight.q) < 1e-4 and loose.solver["steps"] < 3000
 
 
+def test_a_corner_holds_or_slips_from_its_touch_on_whatever_the_rounding() -> None:
+    """Kelvin-Voigt's force is there at once, so a slack grip holds; thrown at a wall from several heights."""
+    load = Harmonic("pull", (0.1 * MU * MASS * G, 0.0), omega_rad_s=9.0)
+    scene = replace(block(0.0, 0.0), friction=Friction(MU, stick_stiffness_n_m=1e7), loads=(load,))
+    for height in np.linspace(1e-3, 2e-3, 8):
+        thrown = replace(scene, initial=Initial((0.0, -0.005 + height, 0.0), (0.02, -0.1, 0.0)))
+        tight, loose = (simulate(thrown, 0.1, output_dt=0.1, tol=tol) for tol in (1e-11, 1e-7))
+        assert len(tight.events) > 0 and pose_error(scene, loose.q, tight.q) < 1e-7
+
+
 def test_painleves_case_is_an_impact_without_collision() -> None:
     """A corner that its own friction presses into the wall: the force grows as cosh, stops the slip, and throws."""
     mass, inertia, stiffness, mu = 1.0, 0.002, 1e8, 0.5

@@ -316,12 +316,12 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str] | None) -
 
 
 def _check_columns(path: Path, role: str, kind: str, fields: Any) -> None:
-    """Raise a `RecordingError` for fields that are no columns of a CSV file."""
+    """Raise a `RecordingError` for fields that are neither columns of a file of lines nor lie in one (`load.f[0]`)."""
     if not kind.startswith("csv:") or not isinstance(fields, dict):
         return
     columns = kind.removeprefix("csv:").split(",")
     for name in fields.values():
-        if name not in columns:
+        if name not in columns and re.split(r"[.\[]", name, maxsplit=1)[0] not in columns:
             raise RecordingError(f"{path}: {role}: fields: got {name!r}, expected a column of {', '.join(columns)}")
 
 
