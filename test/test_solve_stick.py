@@ -187,14 +187,11 @@ def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
     assert pose_error(scene, loose.q, tight.q) < 1e-4 and loose.solver["steps"] < 3000
 
 
-def test_a_corner_holds_or_slips_from_its_touch_on_whatever_the_rounding() -> None:
-    """Kelvin-Voigt's force is there at once, so a slack grip holds; thrown at a wall from several heights."""
-    load = Harmonic("pull", (0.1 * MU * MASS * G, 0.0), omega_rad_s=9.0)
-    scene = replace(block(0.0, 0.0), friction=Friction(MU, stick_stiffness_n_m=1e7), loads=(load,))
-    for height in np.linspace(1e-3, 2e-3, 8):
-        thrown = replace(scene, initial=Initial((0.0, -0.005 + height, 0.0), (0.02, -0.1, 0.0)))
-        tight, loose = (simulate(thrown, 0.1, output_dt=0.1, tol=tol) for tol in (1e-11, 1e-7))
-        assert len(tight.events) > 0 and pose_error(scene, loose.q, tight.q) < 1e-7
+def test_whether_a_corner_holds_from_its_touch_on_is_not_decided_by_rounding() -> None:
+    """Kelvin-Voigt's force is there at once, so a slack grip holds."""
+    scene = replace(preset("bench_kv"), friction=Friction(0.3, stick_stiffness_n_m=5e7))
+    loose, tight = (simulate(scene, 1.0, output_dt=0.1, tol=tol) for tol in (1e-6, 1e-10))
+    assert pose_error(scene, loose.q, tight.q) < 1e-8
 
 
 def test_painleves_case_is_an_impact_without_collision() -> None:
