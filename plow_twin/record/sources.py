@@ -197,8 +197,8 @@ class SqliteSource:
             except sqlite3.OperationalError:  # its place takes no file to share the log by
                 connection.close()
                 connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
-                self.losses.counts["unread_logs"] = len({*self._unread, path})
                 self._unread.add(path)
+                self.losses.counts["unread_logs"] = len(self._unread)
         connection.text_factory = lambda data: data.decode(errors="replace")
         return connection
 
