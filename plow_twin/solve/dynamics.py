@@ -108,14 +108,20 @@ def _accelerate(p, offset, free, slip, stick, support, frozen, state, z, load, o
     fx, fy, torque = _contacts(p, slip, stick, frozen, state, c, s, om, x, y, vx, vy)
     out[0], out[1], out[2] = z[3], z[4], z[5]
     along_x, along_y = to_world_axes(c, s, fx, fy)
-    out[3] = load[0] + along_x * p.inverse_mass
-    out[4] = load[1] + along_y * p.inverse_mass
-    out[5] = load[2] + torque * p.inverse_inertia
+    _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, 3, out)
+
+
+@kernel()
+def _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, first, out) -> None:
+    """Write the head's three accelerations under the contacts' force in world axes to `out` from index `first` on."""
+    out[first] = load[0] + along_x * p.inverse_mass
+    out[first + 1] = load[1] + along_y * p.inverse_mass
+    out[first + 2] = load[2] + torque * p.inverse_inertia
     if offset is not None:
-        out[5] += about_mass(p, c, s, load)
+        out[first + 2] += about_mass(p, c, s, load)
     if free is not None:
         for j in range(3):
-            out[3 + j] *= p.free[j]
+            out[first + j] *= p.free[j]
 
 
 @kernel()
@@ -132,14 +138,7 @@ def _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out) 
     along_x, along_y = to_world_axes(c, s, fx, fy)
     for j in range(6):
         out[j] = z[6 + j]
-    out[6] = load[0] + along_x * p.inverse_mass
-    out[7] = load[1] + along_y * p.inverse_mass
-    out[8] = load[2] + torque * p.inverse_inertia
-    if offset is not None:
-        out[8] += about_mass(p, c, s, load)
-    if free is not None:
-        for j in range(3):
-            out[6 + j] *= p.free[j]
+    _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, 6, out)
     out[9], out[10], out[11] = along_x, along_y, torque + x * fy - y * fx
     for j in range(3):
         out[9 + j] = -p.frame_mobility[j] * out[9 + j] - p.frame_stiffness[j] * z[3 + j] - p.frame_damping[j] * z[9 + j]
