@@ -57,7 +57,17 @@ def test_a_run_stops_at_its_limits_and_says_where_it_stood() -> None:
         simulate(scene, 1e4, max_wall_s=1e-9)
     with pytest.raises(LimitError, match=r"max_steps = 30 reached at t = 0\.003 s"):
         simulate(scene, 0.1, method="rk4", dt=1e-4, max_steps=30)
-    for bad in ({"max_steps": 0}, {"max_wall_s": 0.0}, {"max_wall_s": np.nan}, {"tol": 1.0}):
+    for bad in (
+        {"max_steps": 0},
+        {"max_steps": 1.5},
+        {"output_dt": 1e-300},
+        {"max_wall_s": 0.0},
+        {"max_wall_s": np.nan},
+        {"tol": 1.0},
+        {"tol": "1e-9"},
+        {"output_dt": "0.1"},
+        {"sensitivity": "contact.stiffness"},
+    ):
         with pytest.raises(ArgumentError, match=next(iter(bad))) as refused:
             simulate(scene, 1.0, **bad)
         assert isinstance(refused.value, PlowTwinError) and isinstance(refused.value, ValueError)

@@ -73,7 +73,7 @@ def test_asking_in_between_does_not_change_the_motion(times: list[float]) -> Non
 
 @pytest.mark.parametrize("excitation", ["scene", "sampled"])
 def test_a_restored_twin_goes_on_with_the_same_bits(excitation: str) -> None:
-    scene = dataclasses.replace(preset("bench_hc"), wear=Wear(1e-12, 0.015, 2.0))
+    scene = dataclasses.replace(preset("paper"), wear=Wear(1e-12, 0.015, 2.0))
     first, second = (Twin(scene, excitation=excitation) for _ in range(2))  # type: ignore[arg-type]
 
     def go(twin: Twin, t: float) -> np.ndarray:
@@ -177,7 +177,7 @@ def test_in_free_flight_nothing_of_the_contact_runs() -> None:
 
 
 def test_warm_up_leaves_nothing_to_compile() -> None:
-    twin = Twin(dataclasses.replace(preset("bench_hc"), wear=Wear(1e-14, 0.015, 2.0)))
+    twin = Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
     twin.warm_up()
     before = [len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)]
     assert min(before) > 0 and twin.time == 0.0

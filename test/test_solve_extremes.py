@@ -65,7 +65,7 @@ def test_mass_and_restitution_over_their_range(mass: float, e: float) -> None:
 @pytest.mark.parametrize("n", [1.0, 1.5])
 @pytest.mark.parametrize("gap", [1.0, 1e-9])
 def test_clearance_from_nothing_to_a_metre(gap: float, n: float) -> None:
-    contact = Contact("exact_restitution", 1e8, n, restitution=0.3, impact_speed_floor_m_s=1e-2)
+    contact = Contact("exact_restitution", 1e8, n, restitution=0.3 if n == 1.0 else 0.7, impact_speed_floor_m_s=1e-2)
     scene = dataclasses.replace(preset("paper"), clearance=Clearance(gap, gap), contact=contact)
     scene = dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, width_m=3.3, height_m=2.7))
     result = simulate(scene, 5.0, tol=1e-8)
@@ -108,7 +108,7 @@ def test_ten_hours_of_driven_motion_do_not_drift() -> None:
     [
         (Contact("kelvin_voigt", 4e7, damping=2.5e4), -1e-5),
         (Contact("exact_restitution", 4e7, 1.0, restitution=0.2), -1e-5),
-        (Contact("exact_restitution", 4e9, 1.5, restitution=0.2), -1e-5),
+        pytest.param(Contact("exact_restitution", 4e9, 1.5, restitution=0.2), -1e-5, marks=pytest.mark.stress),
     ],
     ids=["viscous", "n = 1", "n = 1.5"],
 )
@@ -129,7 +129,7 @@ def test_a_start_exactly_on_the_wall_is_solved(speed: float) -> None:
         Head(10.0, 0.1), Frame(1.0, 0.4), Clearance(0.0, 0.0), contact, loads=(Constant("f", (3.0, 1.0)),),
         initial=Initial(v=(0.0, -speed, 0.0)),
     )  # fmt: skip
-    result = simulate(scene, 0.1)
+    result = simulate(scene, 0.1, energy_balance=True)
     assert np.isfinite(result.q).all() and result.force[-1].max() > 0.0
 
 
@@ -138,7 +138,8 @@ def test_rows_within_a_step_show_the_wear_of_their_time() -> None:
     stiffness, depth, k_s, area, speed = 1e7, 1e-4, 2e-9, 0.015, 2.0
     scene = Scene(
         Head(2000.0, 1000.0), Frame(0.3, 0.3), Clearance(0.02, -2.0 * depth),
-        Contact("kelvin_voigt", stiffness, damping=1e5), Gravity(0.0), PRESETS_TERMS, wear=Wear(k_s, area, speed),
+        Contact("exact_restitution", stiffness, restitution=0.7), Gravity(0.0), PRESETS_TERMS,
+        wear=Wear(k_s, area, speed),
     )  # fmt: skip
     result = simulate(scene, 0.2, output_dt=0.01, tol=1e-10)
     expected = stiffness * depth * np.exp(-stiffness * k_s * speed / area * result.t)

@@ -18,6 +18,7 @@ from plow_twin import (
     Initial,
     Scene,
     SceneError,
+    ToleranceWarning,
     Twin,
     Wear,
     simulate,
@@ -63,14 +64,14 @@ def test_the_work_hardly_grows_with_the_damping() -> None:
 
 
 def test_a_damped_slide_has_its_closed_form() -> None:
-    """C d' + K d = F far above the mass's own time: d = F / K (1 - exp(-K t / C))."""
+    """C d' + K d = F far above the mass's own time: d = F / K (1 - exp(-K t / C)), at both of two corners."""
     stiffness, damping, mass, g = 1e7, 1e9, 2.0, 9.81
-    scene = wall_and_point(
-        Contact("kelvin_voigt", stiffness, damping=damping), speed=0.0, mass=mass, gravity=g, gap=0.0
-    )
+    contact, corners = Contact("kelvin_voigt", stiffness, damping=damping), ("top_left_top", "top_right_top")
+    scene = wall_and_point(contact, speed=0.0, mass=mass, gravity=g, gap=0.0, pairs=corners)
+    scene = replace(scene, locked=())
     result = simulate(scene, 200.0, output_dt=10.0, tol=1e-6)
-    expected = mass * g / stiffness * (1.0 - np.exp(-stiffness / damping * result.t))
-    assert result.penetration[:, 0] == pytest.approx(expected, rel=1e-5, abs=1e-12)
+    expected = 0.5 * mass * g / stiffness * (1.0 - np.exp(-stiffness / damping * result.t))
+    assert result.penetration[:, [0, 2]] == pytest.approx(np.stack([expected] * 2, axis=1), rel=1e-5, abs=1e-12)
     assert result.solver["steps"] < 2000
 
 
@@ -112,6 +113,16 @@ def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
     assert_within_the_gate(scene, (1e-2, 1e-4, 1e-6, 1e-8, 1e-10))
     for other in (THROWN, CLAMPED):
         assert_within_the_gate(replace(other, contact=scene.contact), (1e-4,))
+
+
+def test_growth_while_dampers_hold_the_head_is_told() -> None:
+    """A rest on two corners 1e-8 m deep amplifies what rounding leaves, for less time than the rest lasts."""
+    scene = replace(BENCH, contact=overdamped("kelvin_voigt", 1e11), friction=Friction(0.2, 0.02))
+    with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times"):
+        found = simulate(scene, 1.77, output_dt=0.01, sensitivity=True)
+    assert found.sensitivity is not None and 1e4 < found.sensitivity.growth[-1] < 1e6
+    exact = simulate(scene, 1.77, output_dt=0.01, tol=1e-12)
+    assert 10.0 < pose_error(scene, found.q, exact.q) / 1e-9 < found.sensitivity.growth[-1]
 
 
 @pytest.mark.parametrize(("law", "damping"), [("exact_restitution", 0.05), ("hunt_crossley", 1e8)])

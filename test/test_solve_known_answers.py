@@ -87,7 +87,7 @@ def test_leaving_the_model_s_range_is_a_named_error() -> None:
         Head(10.0, 1.0),
         Frame(0.3, 0.3),
         Clearance(0.02, 0.02),
-        Contact("hertz", 1e3),
+        Contact("kelvin_voigt", 1e3, damping=1.0),
         Gravity(0.0),
         (Constant("f", (5e4, 0.0)),),
     )

@@ -21,7 +21,7 @@ from plow_twin import Clearance, Constant, Contact, Frame, Gravity, Harmonic, He
 from plow_twin.model.geometry import length_scale
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.run import twin as twin_module
+from plow_twin.run.advance import Advance
 
 #: Steps that one request may take; what needs more says so.
 BUDGET = 20_000
@@ -52,11 +52,11 @@ def a_contact(draw: Draw, law: str, exponent: float, weight: float, size: float,
     depth = size * draw(decades(1e-8, 1e-2))
     stiffness = min(weight / depth**exponent, 1e13)
     if law == "kelvin_voigt":
-        ratio = draw(st.one_of(st.just(0.0), decades(1e-4, 1e2)))
+        ratio = draw(decades(1e-4, 1e2))
         return Contact(law, stiffness, damping=2.0 * ratio * math.sqrt(stiffness * mass))
     if law == "hertz":
         return Contact(law, stiffness, exponent)
-    restitution = draw(st.floats(0.0, 1.0))
+    restitution = draw(st.floats(0.0, 0.999))
     return Contact(law, stiffness, exponent, restitution=restitution, impact_speed_floor_m_s=draw(decades(1e-3, 1e-1)))
 
 
@@ -88,8 +88,8 @@ def cases(draw: Draw, structure: str) -> Case:
     loads: tuple[Harmonic | Constant, ...] = ()
     if "harmonic" in structure:
         omega = draw(decades(0.1, 1e3))
-        parts = (force * draw(UNIT), force * draw(UNIT)), omega, draw(st.floats(0.0, 6.3)), force * size * draw(UNIT)
-        loads = (Harmonic("load", *parts),)
+        along = force * draw(SIGN) * draw(st.floats(1e-3, 1.0)), force * draw(UNIT)
+        loads = (Harmonic("load", along, omega, draw(st.floats(0.0, 6.3)), force * size * draw(UNIT)),)
     elif "offset" in structure:
         loads = (Constant("load", (force * draw(UNIT), force * draw(UNIT)), force * size * draw(UNIT)),)
     offset = "offset" in structure
@@ -165,8 +165,9 @@ def work_of_loads(case: Case, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> tu
     return done, np.concatenate([[0.0], np.cumsum((travel * abs(np.diff(load, axis=0))).sum(axis=1))])
 
 
-def advance(case: Case) -> tuple[Status, list[twin_module.Advance]]:
-    twin = Twin(case.scene, tol=case.tol, excitation="scene" if case.wrench is None else "sampled")
+def advance(case: Case) -> tuple[Status, list[Advance]]:
+    excitation = "scene" if case.wrench is None else "sampled"
+    twin = Twin(case.scene, tol=case.tol, excitation=excitation, max_steps=BUDGET)
     rows = []
     for index, t in enumerate(case.times.tolist()):
         row = twin.advance(t) if case.wrench is None else twin.advance(t, case.wrench[index])
@@ -229,9 +230,8 @@ def check_energy(
         assert (abs(gain) <= slack).all(), (abs(gain).max() / scale, case.tol)
 
 
-def search(structure: str, examples: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def search(structure: str, examples: int) -> None:
     """Check many scenes of one structure; most of them must really have been solved."""
-    monkeypatch.setattr(twin_module, "DEFAULT_BUDGET", BUDGET)
     ended: Counter[Status] = Counter()
 
     # a scene that fails is shrunk where there is time for it
@@ -252,12 +252,12 @@ def search(structure: str, examples: int, monkeypatch: pytest.MonkeyPatch) -> No
 
 # each structure compiles all kernels anew: the others are left to the full count
 @pytest.mark.parametrize("structure", ["viscous, harmonic", "factor, n = 1.5, harmonic", "factor, sampled"])
-def test_random_scenes_keep_the_energy_balance(structure: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    search(structure, 12, monkeypatch)
+def test_random_scenes_keep_the_energy_balance(structure: str) -> None:
+    search(structure, 12)
 
 
 @pytest.mark.stress
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("structure", STRUCTURES)
-def test_many_random_scenes_keep_the_energy_balance(structure: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    search(structure, 300, monkeypatch)
+def test_many_random_scenes_keep_the_energy_balance(structure: str) -> None:
+    search(structure, 300)

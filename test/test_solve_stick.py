@@ -24,7 +24,6 @@ from plow_twin import (
     Initial,
     Scene,
     SceneError,
-    Table,
     Twin,
     TwinBatch,
     simulate,
@@ -124,24 +123,27 @@ def test_a_block_pulled_back_and_forth_sticks_and_slips_as_in_closed_form() -> N
     assert np.abs(result.q[:, 0] - expected[:, 0]).max() < 1e-9 * np.abs(expected[:, 0]).max()
 
 
-def belt(speed: float, seconds: float) -> tuple[Scene, Slider]:
-    """A block on a moving belt, seen from the belt: clamped between four corners, held by springs that run away."""
-    stiffness, deep, wide, static, kinetic = 1e6, 1e-3, 0.02, 0.5, 0.3
+def belt(speed: float) -> tuple[Scene, Slider]:
+    """A block on a moving belt, seen from the belt: clamped between four corners, held by springs that run away.
+
+    They run as a slow sine does at first; the damping, which has other tests' kernels used again, acts on nothing.
+    """
+    stiffness, deep, wide, static, kinetic, omega = 1e6, 1e-3, 0.02, 0.5, 0.3, 0.05
     friction = Friction(kinetic, stick_stiffness_n_m=1e7, static_coefficient=static)
     # the four side pairs are the spring: both walls stay penetrated, 4 K x in all; their friction acts along locked y
     pull = 4.0 * stiffness * speed
     scene = Scene(
-        Head(MASS, 100.0), Frame(0.3, 0.3), Clearance(-2.0 * wide, -2.0 * deep), Contact("hertz", stiffness),
-        Gravity(0.0), (Table("belt", np.array([0.0, seconds]), np.array([[0.0] * 3, [pull * seconds, 0.0, 0.0]])),),
+        Head(MASS, 100.0), Frame(0.3, 0.3), Clearance(-2.0 * wide, -2.0 * deep),
+        Contact("kelvin_voigt", stiffness, damping=1e-6), Gravity(0.0), (Harmonic("belt", (pull / omega, 0.0), omega),),
         locked=("y", "theta"), friction=friction,
     )  # fmt: skip
     normal = 4.0 * stiffness * deep
-    return scene, Slider(MASS, 4.0 * stiffness, 4e7, static * normal, kinetic * normal, (pull, 0.0, 0.0))
+    return scene, Slider(MASS, 4.0 * stiffness, 4e7, static * normal, kinetic * normal, (0.0, pull / omega, omega))
 
 
 def test_a_block_on_a_moving_belt_sticks_and_slips_for_ever() -> None:
     speed, seconds = 2e-3, 2.0
-    scene, slider = belt(speed, seconds)
+    scene, slider = belt(speed)
     result = simulate(scene, seconds, output_dt=0.01, tol=1e-11)
     expected, switches = slider.run(result.t)
     assert len(switches) >= 10
@@ -160,7 +162,7 @@ def test_a_load_below_the_limit_is_held_without_creep() -> None:
     swing = amplitude / math.hypot(stiffness, lag)
     expected = swing * np.sin(omega * result.t - math.atan2(lag, stiffness))
     assert result.q[settled, 0] == pytest.approx(expected[settled], abs=1e-9 * swing)
-    creeping = simulate(replace(scene, friction=Friction(MU, 0.02)), 0.5, output_dt=0.5)
+    creeping = simulate(block(amplitude, 0.0), 0.5, output_dt=0.5)
     assert creeping.q[-1, 0] > 1000.0 * swing
 
 
@@ -170,7 +172,7 @@ def test_fixed_steps_come_to_the_same_motion_and_the_energy_balances(name: str) 
     scene = replace(preset(name), friction=friction)
     events = simulate(scene, 1.0, output_dt=0.1, energy_balance=True)
     steps = simulate(scene, 1.0, output_dt=0.1, method="rk4", dt=2e-6)
-    assert pose_error(scene, steps.q, events.q) < 1e-6
+    assert pose_error(scene, steps.q, events.q) < 3e-6
     assert events.energy_balance is not None and events.energy_balance.relative_imbalance < 1e-11
     loose = simulate(scene, 1.0, output_dt=0.1, tol=1e-5, energy_balance=True)
     assert pose_error(scene, loose.q, events.q) < 1e-4
@@ -190,15 +192,38 @@ def test_strong_dampers_keep_to_the_tolerance(damping: float) -> None:
 def test_whether_a_corner_holds_from_its_touch_on_is_not_decided_by_rounding() -> None:
     """Kelvin-Voigt's force is there at once, so a slack grip holds."""
     scene = replace(preset("bench_kv"), friction=Friction(0.3, stick_stiffness_n_m=5e7))
-    loose, tight = (simulate(scene, 1.0, output_dt=0.1, tol=tol) for tol in (1e-6, 1e-10))
+    loose, tight = (simulate(scene, 1.0, output_dt=0.1, tol=tol, energy_balance=True) for tol in (1e-6, 1e-10))
     assert pose_error(scene, loose.q, tight.q) < 1e-8
+
+
+def test_whether_a_clipped_corner_that_pushes_again_holds_is_not_decided_by_rounding() -> None:
+    """Its force begins at zero; with mu_s > mu stick and slip both go on there."""
+    friction = Friction(0.2, stick_stiffness_n_m=1e8, static_coefficient=0.28)
+    scene = replace(
+        preset("bench_kv"), contact=Contact("kelvin_voigt", 2.6e9, damping=1e7), friction=friction,
+        initial=Initial((0.005, -0.0002, 0.018), (0.12, 0.48, -0.6)),
+    )  # fmt: skip
+    tight = simulate(scene, 1.0, output_dt=0.01, tol=1e-12, energy_balance=True)
+    for tol in (1e-8, 1e-9, 1e-10):
+        assert pose_error(scene, simulate(scene, 1.0, output_dt=0.01, tol=tol, energy_balance=True).q, tight.q) < tol
+
+
+@pytest.mark.parametrize("damping", [1e5, 1e6])
+def test_a_corner_grips_at_its_touch_as_with_fixed_steps(damping: float) -> None:
+    """Kelvin-Voigt's force is there at once: the damper holds from the touch on, or is too much and drags."""
+    friction = Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=damping)
+    scene = replace(preset("bench_kv"), friction=friction)
+    events = simulate(scene, 0.3, output_dt=0.1, energy_balance=True)
+    steps = simulate(scene, 0.3, output_dt=0.1, method="rk4", dt=4e-6)
+    assert pose_error(scene, steps.q, events.q) < 3e-5
 
 
 def test_painleves_case_is_an_impact_without_collision() -> None:
     """A corner that its own friction presses into the wall: the force grows as cosh, stops the slip, and throws."""
     mass, inertia, stiffness, mu = 1.0, 0.002, 1e8, 0.5
     scene = Scene(
-        Head(mass, inertia), Frame(0.1, 0.6), Clearance(0.1, 0.1), Contact("hertz", stiffness), Gravity(0.0),
+        Head(mass, inertia), Frame(0.1, 0.6), Clearance(0.1, 0.1), Contact("kelvin_voigt", stiffness, damping=1e-3),
+        Gravity(0.0), (Harmonic("nothing to speak of", (1e-9, 0.0), 2.0),),
         initial=Initial((0.0, -0.05, 0.0)), pairs=("top_right_top",),
         friction=Friction(mu, stick_stiffness_n_m=stiffness),
     )  # fmt: skip
@@ -219,11 +244,12 @@ def test_painleves_case_is_an_impact_without_collision() -> None:
         assert result.force[-1, pair] == 0.0
 
 
-def test_a_restored_twin_a_batch_and_a_bounded_twin_go_on_alike() -> None:
+@pytest.mark.parametrize("most", [None, pytest.param(2000, marks=pytest.mark.stress)])
+def test_a_restored_twin_a_batch_and_a_bounded_twin_go_on_alike(most: int | None) -> None:
     scene = replace(preset("paper"), friction=Friction(0.3, stick_stiffness_n_m=5e7, stick_damping_n_s_m=1e5))
     times = np.linspace(0.01, 0.4, 23)
     loads = np.stack([4e4 * np.sin(20.0 * times), -1e4 * np.cos(9.0 * times), 2e4 * np.sin(7.0 * times)], axis=1)
-    twin, other, bounded = (Twin(scene, excitation="sampled", max_evaluations=most) for most in (None, None, 2000))
+    twin, other, bounded = (Twin(scene, excitation="sampled", max_evaluations=limit) for limit in (None, None, most))
     batch = TwinBatch([scene, scene])
     for t, load in zip(times, loads, strict=True):
         row = twin.advance(t, load)

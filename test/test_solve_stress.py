@@ -20,8 +20,8 @@ def with_contact(law: str, stiffness: float, exponent: float = 1.0, **damping: A
 
 SOLVED = {
     **{f"K {k:g}": with_contact("kelvin_voigt", k, damping=6e4) for k in (1e7, 1e9, 1e11, 1e13)},
-    **{f"K {k:g}, n 1.5": with_contact("exact_restitution", k, 1.5, restitution=0.4) for k in (1e9, 1e11, 1e13)},
-    **{f"e {e:g}": with_contact("exact_restitution", 1e8, restitution=e) for e in (0.0, 0.01, 0.99, 1.0)},
+    **{f"K {k:g}, n 1.5": with_contact("exact_restitution", k, 1.5, restitution=0.7) for k in (1e9, 1e11, 1e13)},
+    **{f"e {e:g}": with_contact("exact_restitution", 1e8, restitution=e) for e in (0.0, 0.01, 0.99)},
     **{f"overdamped C {c:g}": with_contact("kelvin_voigt", 2e7, damping=c) for c in (1e6, 1e8)},
     **{
         f"clearance {gap:g}": dataclasses.replace(
@@ -111,6 +111,6 @@ def test_two_corners_at_the_same_instant_touch_together() -> None:
 
 @pytest.mark.parametrize("request_s", [0.0, 1e-12, 1e4])
 def test_any_request_in_time_is_served(request_s: float) -> None:
-    twin = Twin(wall_and_point(Contact("hertz", 1e9, 1.5), speed=1.0, gravity=9.81))
+    twin = Twin(wall_and_point(Contact("kelvin_voigt", 1e9, damping=1e-3), speed=1.0, gravity=9.81))
     row = twin.advance(request_s)
     assert row.status is Status.OK and row.t == request_s and np.isfinite(row.q).all()

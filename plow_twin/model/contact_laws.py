@@ -14,10 +14,11 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
-from scipy.optimize import brentq
-
 from plow_twin.errors import ArgumentError
+from plow_twin.model.root import bracketed_root
 
+#: 1 - e below which the residual of the exact law is little but rounding, and two terms of D's series are better.
+_NEARLY_ELASTIC: Final = 1e-5
 #: Largest D = lambda v0 used: a restitution below about 1/1000 would need an unbounded damping.
 DAMPING_NUMBER_CAP: Final = 1e3
 
@@ -32,18 +33,21 @@ def exact_damping_number(restitution: float) -> float:
         return 0.0
     if restitution <= 0.0:
         return math.inf
+    lost = 1.0 - restitution
+    if lost < _NEARLY_ELASTIC:
+        return 1.5 * lost * (1.0 + lost)
 
     def residual(damping: float) -> float:
         # (1 + e) - ln(...)/D keeps the trivial root D = 0 out of reach
         return (1.0 + restitution) - (math.log1p(damping) - math.log1p(-damping * restitution)) / damping
 
     # the positive root lies below 1/e; near e = 1 it behaves as 3 (1 - e) / 2
-    lower, upper = 0.5 * (1.0 - restitution), 1.0 / restitution
+    lower, upper = 0.5 * lost, 1.0 / restitution
     while upper * restitution >= 1.0:
         upper = math.nextafter(upper, 0.0)
     if residual(upper) > 0.0:
         return upper
-    return float(brentq(residual, lower, upper, xtol=1e-300, rtol=1e-15))
+    return bracketed_root(residual, lower, upper, rtol=1e-15)
 
 
 @dataclass(frozen=True)

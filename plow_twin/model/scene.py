@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import Problem, SceneError
+from plow_twin.errors import ArgumentError, Problem, SceneError
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
 
@@ -452,11 +452,45 @@ MOST_DAMPING_FACTOR: Final = 1e9
 def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
     if wear.prior_m2_n[0] > wear.prior_m2_n[1]:
         yield Problem("wear.prior_m2_n", wear.prior_m2_n, "the 5 % point first, then the 95 % point")
-    rate = wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
-    if LAWS[contact.law].additive and (contact.damping or 0.0) * rate > 1.0:
-        # a force then wears the pad faster than it moves the head: no contact lasts
+    if wear.travel_speed_m_s > fastest_travel(wear, contact):
+        rate = wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
         yield Problem(
             "contact.damping", contact.damping, f"at most {1.0 / rate:.3g} N s/m, A / (k_s v), with this wear"
+        )
+
+
+def fastest_travel(wear: Wear | None, contact: Contact) -> float:
+    """Return the largest speed along the face in m/s beside a damping C, A / (k_s C).
+
+    Beyond it a force wears the pad faster than it moves the head: no contact lasts.
+    """
+    if wear is None or not LAWS[contact.law].additive:
+        return math.inf
+    worn = (contact.damping or 0.0) * wear.coefficient_m2_n
+    return wear.pad_area_m2 / worn if worn > 0.0 else math.inf
+
+
+def check_travel_speed(scene: Scene, speed_m_s: float) -> None:
+    """Raise `ArgumentError` for a speed along the face at which a twin of the scene cannot go on.
+
+    Parameters
+    ----------
+    scene : Scene
+    speed_m_s : float
+        In m/s, of either sign.
+
+    Raises
+    ------
+    ArgumentError
+        For a speed that is not finite, or at which a force would wear a pad faster than it moves the head.
+    """
+    fastest = fastest_travel(scene.wear, scene.contact)
+    if not math.isfinite(speed_m_s):
+        raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
+    if abs(speed_m_s) > fastest:
+        raise ArgumentError(
+            f"speed_m_s: got {speed_m_s!r}, expected at most {fastest:.3g} m/s, A / (k_s C), with this wear and "
+            f"contact.damping {scene.contact.damping!r} N s/m"
         )
 
 

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
-from plow_twin.model.scene import Scene
+from plow_twin.model import geometry
+from plow_twin.model.scene import Scene, check_travel_speed
 from plow_twin.run.advance import AdvanceBatch, check_times
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
-from plow_twin.run.twin import DEFAULT_BUDGET
+from plow_twin.run.twin import DEFAULT_BUDGET, read_snapshot
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.implicit import new_implicit
@@ -174,6 +175,36 @@ class TwinBatch:
             self._states[index] = compiled.initial_state(t)
         self._wrench = np.zeros((len(self), 3))
 
+    def begin_beside(self, snapshot: bytes, moved: ArrayLike, damping: ArrayLike) -> None:
+        """Go on a little beside where one sampled twin stands, with its contacts, last sample and travel speed.
+
+        Parameters
+        ----------
+        snapshot : bytes
+            Of a `Twin` with `excitation="sampled"` whose scene has the record of state of these.
+        moved : array_like, shape (m, 6)
+            What is added to x, y [m], theta [rad] and their rates, for each twin.
+        damping : array_like, shape (m,)
+            Factor, for each twin, of the damping that the contacts under way have read at their touch.
+
+        Raises
+        ------
+        ArgumentError
+            When the data has not the size of a snapshot; nothing has changed then.
+        """
+        here, sample, speed = read_snapshot(snapshot, self._states.dtype)
+        away = np.broadcast_to(np.asarray(moved, dtype=np.float64), (len(self), 6))
+        self._states[:], self._wrench[:] = here, sample
+        self.set_travel_speed(speed)
+        row = self.advance(self.time)
+        pose = np.concatenate([row.q[0, 0], row.v[0, 0]])
+        self._states[:] = here
+        for index in np.flatnonzero(away.any(axis=1)):
+            there = pose + away[index]
+            offset = self.scenes[index].head.com_offset_m
+            self._states["y"][index] = geometry.body_state(there[:3], there[3:], offset)
+        self._states["damping_factor"] *= np.broadcast_to(np.asarray(damping, dtype=np.float64), len(self))[:, None]
+
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
         """Set the speed along the face from here on; only wear depends on it.
 
@@ -185,11 +216,11 @@ class TwinBatch:
         Raises
         ------
         ArgumentError
-            For a speed that is not finite.
+            As `Twin.set_travel_speed`; nothing has changed then.
         """
         speeds = np.broadcast_to(np.abs(np.asarray(speed_m_s, dtype=np.float64)), len(self))
-        if not np.isfinite(speeds).all():
-            raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected finite speeds in m/s")
+        for scene, speed in zip(self.scenes, speeds.tolist(), strict=True):
+            check_travel_speed(scene, speed)
         for index, (scene, speed) in enumerate(zip(self.scenes, speeds, strict=True)):
             if scene.wear is not None:
                 self._params["wear_per_impulse"][index] = wear_rate(scene.wear, speed)

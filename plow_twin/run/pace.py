@@ -62,7 +62,8 @@ class Pace:
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
     """Raise `ArgumentError` for limits that no call can have."""
-    if isinstance(max_steps, bool) or not max_steps >= 1:
+    # a number that is no integer would compile kernels of its own
+    if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:
         raise ArgumentError(f"max_wall_s: got {max_wall_s!r}, expected a time > 0 [s]")

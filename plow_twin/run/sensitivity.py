@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,20 +20,23 @@ from plow_twin.model import geometry
 from plow_twin.model.scene import DOF_NAMES, Load, Scene, Table
 from plow_twin.run.motion import Motion, run_events
 from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene, law_terms
-from plow_twin.solve.state import Status, Work, first_of, new_records, new_work, state_type
+from plow_twin.solve.state import State, Status, Work, first_of, new_records, new_work
 
 Array = NDArray[np.float64]
 
-#: Displacement of a shadow in shares of the clearance, and the tolerance at which it is followed.
+#: Displacement of a shadow in shares of the clearance, smaller near a wall, and the tolerance at which it is followed.
 DISPLACEMENT: Final = 1e-7
+_LEAST_DISPLACEMENT: Final = 1e-10
 SHADOW_TOLERANCE: Final = 1e-12
 _STRETCHES: Final = 200
 #: Earlier times from which growth is kept; every second one is dropped beyond.
 _MOST_KEPT: Final = 256
 #: Change of a parameter that is no length, in shares of it.
 _RELATIVE_CHANGE: Final = 1e-6
-#: A stretch does not end where some pair is nearer to its wall than so many displacements, unless so many in a row do.
-CLEAR_OF_WALLS, MOST_MERGED = 100.0, 20
+#: Walls are at least so many displacements away where a stretch begins. Where that leaves too little of them the one
+#: before goes on, unless so many in a row did.
+_CLEAR_OF_WALLS: Final = 100.0
+MOST_MERGED: Final = 20
 #: Steps of one shadow over one stretch.
 _BUDGET: Final = 10**7
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
@@ -47,7 +50,7 @@ class Sensitivity:
     Attributes
     ----------
     t : ndarray, shape (n,)
-        Times in s; the last one is a little before the end where a pair is just at its wall there.
+        Times in s.
     growth : ndarray, shape (n,)
         Largest factor by which an error made at any time before has grown at `t`. Errors count as poses relative to the
         clearance, velocities over the time in which the largest load crosses it.
@@ -185,20 +188,36 @@ class StretchProduct:
 
     def __init__(self, size: int, parameters: int) -> None:
         self.total, self.rows, self.growth = np.eye(size), np.zeros((parameters, size)), 1.0
+        self._total, self._rows = self.total, self.rows
         self._since, self._basis = np.zeros((0, size, size)), np.eye(size)
 
+    def look(self, matrix: Array, changes: Array) -> None:
+        """Tell where the motion is within a stretch: `matrix` is its fundamental matrix so far.
+
+        `changes`, shape (p, k), is what the parameters did in it. Growth is that of places alone: in the middle of an
+        impact a stiff contact makes of any displacement a large difference of velocities, which is gone after it.
+        """
+        self._grown = matrix @ np.concatenate([self._since, np.eye(len(matrix))[None]])
+        self.growth = _largest(self._grown[:, : len(matrix) // 2])
+        self.total, self.rows = matrix @ self._total, self._rows @ matrix.T + changes
+
     def add(self, matrix: Array, changes: Array) -> Array:
-        """Go on by a stretch: `matrix` is its fundamental matrix, `changes` what the parameters did in it, (p, k).
+        """Go on by a stretch, with the numbers of `look` at its end.
 
         Returns the logarithms of what it stretched a basis by, shape (k,).
         """
-        self.total, self.rows = matrix @ self.total, self.rows @ matrix.T + changes
-        since = matrix @ np.concatenate([self._since, np.eye(len(matrix))[None]])
-        self.growth = max(1.0, float(np.linalg.norm(since, 2, axis=(1, 2)).max()))
-        self._since = since if len(since) < _MOST_KEPT else since[::2]
+        self.look(matrix, changes)
+        self.growth = _largest(self._grown)
+        self._total, self._rows = self.total, self.rows
+        self._since = self._grown if len(self._grown) < _MOST_KEPT else self._grown[::2]
         self._basis, upper = np.linalg.qr(matrix @ self._basis)
         stretched: Array = np.log(np.maximum(np.abs(np.diag(upper)), 1e-300))
         return stretched
+
+
+def _largest(grown: Array) -> float:
+    """Return the largest factor of matrices (n, i, k), at least 1."""
+    return max(1.0, float(np.linalg.norm(grown, 2, axis=(1, 2)).max()))
 
 
 def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[str] = ()) -> Sensitivity:
@@ -230,32 +249,39 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
             raise ArgumentError(f"sensitivity: got {path!r}, expected some of {', '.join(known)}")
     changed = [ChangedScene.of(scene, path, fine) for path in parameters]
     scale, free = scale_of(compiled), free_places(scene)
-    work, state, begin, merged = new_work(), compiled.initial_state(), 0.0, 0
-    product = StretchProduct(len(free), len(changed))
-    times, growth, from_start, logs = [0.0], [1.0], [product.total], np.zeros(len(free))
-    by_parameter = [product.rows]
+    work, merged, size = new_work(), 0, len(free)
+    product, logs = StretchProduct(size, len(changed)), np.zeros(size)
+    times, growth, from_start, by_parameter = [0.0], [1.0], [product.total], [product.rows]
+    # where the stretch under way began, and the first one that counts for the exponent
+    begun, first, moved, implicit = 0.0, None, DISPLACEMENT, 0
+    scenes = [compiled] * (1 + size) + [one.compiled for one in changed]
+    states = _beside(compiled, compiled.initial_state(), moved * scale, free, changed, work)
     for end in _ends(t_end):
-        after, reached, nearest = _follow(compiled, state, end, None, work)
-        if nearest < CLEAR_OF_WALLS * DISPLACEMENT * scale[0] and merged < MOST_MERGED:
+        followed = [_follow(one, state, end, work) for one, state in zip(scenes, states, strict=True)]
+        states = [motion.state for motion in followed]
+        reached = np.array([_pose_and_rate(motion) for motion in followed])
+        away = (reached[1:] - reached[0])[:, free] / scale[free]
+        matrix = away[:size].T / moved
+        changes = away[size:] / np.array([one.change for one in changed])[:, None]
+        assert followed[0].penetration is not None
+        held = int(states[0].implicit_steps) > implicit
+        possible = displacement_beside(followed[0].penetration[0, compiled.params.enabled == 1], scale[0], held)
+        if possible is None and merged < MOST_MERGED:
+            # what grows meanwhile is told, though no stretch begins here
             merged += 1
-            continue
-        merged = 0
-        start = _follow(compiled, state, float(state.time), None, work)[1]
-        away = _displaced(compiled, state, end, start, free, scale, work) - reached
-        rows = _with_changed(changed, state, end, start, work) - reached
-        stretched = product.add(
-            (away[:, free] / scale[free] / DISPLACEMENT).T,
-            rows[:, free] / scale[free] / np.array([one.change for one in changed])[:, None],
-        )
-        if times[-1] >= 0.5 * t_end:
-            begin = begin if begin > 0.0 else times[-1]
-            logs += stretched
+            product.look(matrix, changes)
+        else:
+            stretched = product.add(matrix, changes)
+            if begun >= 0.5 * t_end:
+                first = begun if first is None else first
+                logs += stretched
+            begun, merged, moved, implicit = end, 0, possible or DISPLACEMENT, int(states[0].implicit_steps)
+            states = _beside(compiled, states[0], moved * scale, free, changed, work)
         times.append(end)
         growth.append(product.growth)
         from_start.append(product.total * scale[free][:, None] / scale[free][None, :])
         by_parameter.append(product.rows)
-        state = after
-    exponent = float(logs.max()) / max(times[-1] - begin, 1e-300)
+    exponent = 0.0 if first is None else float(logs.max()) / (begun - first)
     rows = np.array(by_parameter) * scale[free]
     derivatives = {one.path: rows[:, index] for index, one in enumerate(changed)}
     return Sensitivity(np.array(times), np.array(growth), np.array(from_start), exponent, tol, derivatives)
@@ -276,50 +302,77 @@ def scale_of(compiled: CompiledScene) -> Array:
     return scale
 
 
+def displacement_beside(penetration: Array, length: float, held: bool = False) -> float | None:
+    """Return by how much shadows may be displaced, in shares of the clearance, for a stretch that begins here.
+
+    A spring makes a large velocity of a place that is displaced in its contact, as no step of the solver does: no
+    stretch begins there. Where a damper holds the head, a displacement stays, and a small one is as good.
+
+    Parameters
+    ----------
+    penetration : ndarray, shape (n,)
+        Of the pairs that can touch, in m.
+    length : float
+        The clearance in m that displacements are shares of.
+    held : bool
+        Whether overdamped contact holds the head.
+
+    Returns
+    -------
+    float or None
+        None where a pair is so near to its wall, inside or outside, that no displacement is small beside that.
+    """
+    room = float(np.abs(penetration).min(initial=np.inf)) / (_CLEAR_OF_WALLS * length)
+    return min(DISPLACEMENT, room) if room >= (_LEAST_DISPLACEMENT if held else DISPLACEMENT) else None
+
+
 def free_places(scene: Scene) -> NDArray[np.int64]:
     """Return the indices of what can differ: places and rates of the degrees of freedom that are not locked."""
     places = [index for index, name in enumerate(DOF_NAMES) if name not in scene.locked]
     return np.array(places + [3 + index for index in places], dtype=np.int64)
 
 
-def _displaced(
-    compiled: CompiledScene, state: Any, end: float, start: Array, free: NDArray[np.int64], scale: Array, work: Work
-) -> Array:
-    """Return pose and rate at `end` of shadows that are displaced from `start` by one free place or rate, (k, 6)."""
-    reached = np.empty((len(free), 6))
-    for row, index in zip(reached, free, strict=True):
-        displaced = start.copy()
-        displaced[index] += DISPLACEMENT * scale[index]
-        row[:] = _follow(compiled, state, end, displaced, work)[1]
-    return reached
+def _beside(
+    compiled: CompiledScene,
+    state: State,
+    moved: Array,
+    free: NDArray[np.int64],
+    changed: Sequence[ChangedScene],
+    work: Work,
+) -> list[State]:
+    """Return a state and its shadows: for each free place or rate one beside it by `moved`, for each changed scene one.
 
-
-def _with_changed(changed: Sequence[ChangedScene], state: Any, end: float, start: Array, work: Work) -> Array:
-    """Return pose and rate at `end` of shadows from `start` with one parameter changed, shape (p, 6)."""
-    reached = np.empty((len(changed), 6))
-    for row, one in zip(reached, changed, strict=True):
-        begin = state.copy()
-        begin["damping_factor"] *= one.damping
-        row[:] = _follow(one.compiled, begin, end, start, work)[1]
-    return reached
-
-
-def _follow(
-    compiled: CompiledScene, state: Any, end: float, displaced: Array | None, work: Work
-) -> tuple[Any, Array, float]:
-    """Bring a copy of a state, displaced in pose and rate, to `end`.
-
-    Return it with its pose and rate, shape (6,), and how near the nearest pair is to its wall in m, inside or outside.
+    Those of changed scenes are not displaced; a damping that was read at a touch is theirs.
     """
-    records = new_records(state_type(compiled.parts.terms), 1)
+    start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
+    states = [state]
+    for index in free:
+        displaced, shadow = start.copy(), _copy(state)
+        displaced[index] += moved[index]
+        shadow.y[:] = geometry.body_state(displaced[:3], displaced[3:], compiled.scene.head.com_offset_m)
+        states.append(shadow)
+    for one in changed:
+        shadow = _copy(state)
+        shadow.damping_factor *= one.damping
+        states.append(shadow)
+    return states
+
+
+def _copy(state: State) -> State:
+    records = new_records(state.dtype, 1)
     records[0] = state
+    return first_of(records)
+
+
+def _follow(compiled: CompiledScene, state: State, end: float, work: Work) -> Motion:
+    """Bring a copy of a state to `end`; return the motion with the row there."""
     motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
-    motion.state = first_of(records)
-    if displaced is not None:
-        motion.state.y[:] = geometry.body_state(displaced[:3], displaced[3:], compiled.scene.head.com_offset_m)
+    motion.state = _copy(state)
     code, _ = run_events(compiled, motion, np.array([end]), end, work, int(motion.state.steps) + _BUDGET)
     if code != Status.OK:
         raise SolverError(f"shadow at t = {motion.time:.9g} s: {Status(code).text}")
-    assert motion.penetration is not None
-    nearest = float(np.abs(motion.penetration[0, compiled.params.enabled == 1]).min(initial=np.inf))
-    return motion.state, np.concatenate([motion.q[0], motion.v[0]]), nearest
+    return motion
+
+
+def _pose_and_rate(motion: Motion) -> Array:
+    return np.concatenate([motion.q[0], motion.v[0]])

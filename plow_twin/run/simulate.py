@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import time as _time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -28,6 +30,8 @@ Array = NDArray[np.float64]
 #: Type of one contact event: time in s, pair, modes (0 off, 1 on, 2 clipped), rate of penetration in m/s.
 EVENT_DTYPE: Final = EVENT
 _ROWS_BY_DEFAULT = 1000
+#: More rows no memory holds: each takes 176 bytes.
+_MOST_ROWS: Final = 1e10
 
 
 @dataclass(frozen=True)
@@ -143,6 +147,8 @@ def simulate(
     """
     check_times(t_end, output_dt, method, dt)
     check_limits(max_steps, max_wall_s)
+    if isinstance(sensitivity, str):
+        raise ArgumentError(f"sensitivity: got {sensitivity!r}, expected True or a sequence of paths")
     compiled = compile_scene(scene, tol)
     if output_dt is None and dt is not None:
         output_dt = dt * max(1, round(t_end / dt / _ROWS_BY_DEFAULT))
@@ -204,21 +210,27 @@ class _Watch:
 
 def check_times(t_end: float, output_dt: float | None, method: str = "events", dt: float | None = None) -> None:
     """Raise `ArgumentError` for times that no run can have."""
-    if not (np.isfinite(t_end) and t_end >= 0.0):
+    if not (_is_finite(t_end) and t_end >= 0.0):
         raise ArgumentError(f"t_end: got {t_end!r}, expected a finite time >= 0 [s]")
-    if output_dt is not None and not (np.isfinite(output_dt) and output_dt > 0.0):
+    if output_dt is not None and not (_is_finite(output_dt) and output_dt > 0.0):
         raise ArgumentError(f"output_dt: got {output_dt!r}, expected a finite time > 0 [s]")
+    if output_dt is not None and t_end / output_dt > _MOST_ROWS:
+        raise ArgumentError(f"output_dt: got {output_dt!r}, expected at least t_end / {_MOST_ROWS:g} [s]")
     if method not in get_args(Method):
         raise ArgumentError(f"method: got {method!r}, expected one of {', '.join(get_args(Method))}")
     if method == "events":
         if dt is not None:
             raise ArgumentError(f"dt: got {dt!r}, expected None with method='events'")
         return
-    if dt is None or not (np.isfinite(dt) and dt > 0.0):
+    if dt is None or not (_is_finite(dt) and dt > 0.0):
         raise ArgumentError(f"dt: got {dt!r}, expected a finite time > 0 [s] with method={method!r}")
     for name, value in (("t_end", t_end), ("output_dt", output_dt)):
         if value is not None and abs(value / dt - round(value / dt)) > 1e-6 * max(1.0, value / dt):
             raise ArgumentError(f"{name}: got {value!r}, expected a whole multiple of dt = {dt!r} [s]")
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def output_times(t_end: float, output_dt: float | None) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Initial, Scene
+from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.solve import loop
@@ -329,10 +329,9 @@ class Twin:
         Raises
         ------
         ArgumentError
-            For a speed that is not finite.
+            For a speed that is not finite, or beyond what the damping allows (`check_travel_speed`).
         """
-        if not np.isfinite(speed_m_s):
-            raise ArgumentError(f"speed_m_s: got {speed_m_s!r}, expected a finite speed in m/s")
+        check_travel_speed(self.scene, float(speed_m_s))
         if self._parts.terms.wear is not None:
             self._end_step()
             self._set_wear_rate(abs(float(speed_m_s)))
@@ -354,13 +353,8 @@ class Twin:
         ArgumentError
             When the data has not the size of a snapshot.
         """
-        size = self._states.itemsize
-        if len(data) != size + 32:
-            raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {size + 32}")
-        self._states[0] = np.frombuffer(data[:size], self._states.dtype)[0]
-        wrench_and_speed = np.frombuffer(data[size:])
-        self._wrench = wrench_and_speed[:3].copy()
-        self._set_wear_rate(float(wrench_and_speed[3]))
+        self._states[0], self._wrench, speed = read_snapshot(data, self._states.dtype)
+        self._set_wear_rate(speed)
         if self._state.step_size >= 0.0:
             loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
 
@@ -489,6 +483,21 @@ def _finite(samples: NDArray[np.float64]) -> bool:
     if len(samples) == 1:
         return all(map(math.isfinite, samples[0].tolist()))
     return bool(np.isfinite(samples).all())
+
+
+def read_snapshot(data: bytes, dtype: np.dtype[np.void]) -> tuple[np.void, NDArray[np.float64], float]:
+    """Return the state, the wrench (3,) and the travel speed [m/s] of a `Twin.snapshot` whose state is of a type.
+
+    Raises
+    ------
+    ArgumentError
+        When the data has not the size of a snapshot.
+    """
+    size = dtype.itemsize
+    if len(data) != size + 32:
+        raise ArgumentError(f"snapshot: got {len(data)} bytes, expected {size + 32}")
+    wrench_and_speed = np.frombuffer(data[size:])
+    return np.frombuffer(data[:size], dtype)[0], wrench_and_speed[:3].copy(), float(wrench_and_speed[3])
 
 
 def _digest(snapshot: bytes | memoryview) -> str:

@@ -8,16 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError, SolverError
-from plow_twin.model import geometry
 from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.sensitivity import (
-    CLEAR_OF_WALLS,
     DISPLACEMENT,
     MOST_MERGED,
     SHADOW_TOLERANCE,
     ChangedScene,
     StretchProduct,
+    displacement_beside,
     free_places,
     refuse_support,
     scale_of,
@@ -74,7 +73,8 @@ class TwinSensitivity:
                 raise ArgumentError(f"parameters: got {path!r}, expected some of {allowed}")
         self._twin = twin
         self._changed = [ChangedScene.of(scene, path, SHADOW_TOLERANCE) for path in parameters]
-        self._scale, self._free = scale_of(compile_scene(scene, SHADOW_TOLERANCE, sampled=True)), free_places(scene)
+        compiled = compile_scene(scene, SHADOW_TOLERANCE, sampled=True)
+        self._scale, self._free, self._enabled = scale_of(compiled), free_places(scene), compiled.params.enabled == 1
         size = len(self._free)
         members = [scene] * (1 + size) + [one.compiled.scene for one in self._changed]
         self._shadows = TwinBatch(members, tol=SHADOW_TOLERANCE, start=twin.time)
@@ -130,15 +130,13 @@ class TwinSensitivity:
         if (rows.status != Status.OK).any():
             raise SolverError(f"shadow at t = {t:.9g} s: {Status(int(rows.status.max())).text}")
         reached = np.concatenate([rows.q[:, 0], rows.v[:, 0]], axis=1)
-        away = (reached[1:] - reached[0])[:, self._free] / self._scale[self._free] / DISPLACEMENT
+        away = (reached[1:] - reached[0])[:, self._free] / self._scale[self._free]
         size = len(self._free)
-        if t - self.t >= _STRETCH_S or np.abs(away[:size]).max() > _FAR:
-            enabled = self._twin._compiled.params.enabled == 1
-            nearest = float(np.abs(rows.penetration[0, 0, enabled]).min(initial=np.inf))
-            clear = nearest >= CLEAR_OF_WALLS * DISPLACEMENT * self._scale[0]
+        if t - self.t >= _STRETCH_S or np.abs(away[:size]).max() > _FAR * DISPLACEMENT:
+            clear = displacement_beside(rows.penetration[0, 0, self._enabled], float(self._scale[0])) is not None
             self._merged += 0 if clear else 1
             if clear or self._merged > MOST_MERGED:
-                self._end(t, away[:size].T, away[size:] * DISPLACEMENT)
+                self._end(t, away[:size].T / DISPLACEMENT, away[size:])
         return told
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
@@ -149,16 +147,7 @@ class TwinSensitivity:
 
     def _start(self) -> None:
         """Begin a stretch: all shadows at the twin's state, the displaced ones a little beside it."""
-        states, here = self._shadows._states, self._twin._states[0]
-        states[:] = here
-        self._shadows._wrench[:] = self._twin.wrench
-        offset = self._twin.scene.head.com_offset_m
-        row = self._shadows.advance(self._twin.time)
-        q, v = row.q[0, 0], row.v[0, 0]
-        states[:] = here
-        for member, index in enumerate(self._free, start=1):
-            moved = np.concatenate([q, v])
-            moved[index] += DISPLACEMENT * self._scale[index]
-            states["y"][member] = geometry.body_state(moved[:3], moved[3:], offset)
-        for member, one in enumerate(self._changed, start=1 + len(self._free)):
-            states["damping_factor"][member] *= one.damping
+        size, changed = len(self._free), [one.damping for one in self._changed]
+        moved = np.zeros((len(self._shadows), 6))
+        moved[np.arange(1, 1 + size), self._free] = DISPLACEMENT * self._scale[self._free]
+        self._shadows.begin_beside(self._twin.snapshot(), moved, np.array([1.0] * (1 + size) + changed))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -75,6 +76,10 @@ class CompiledScene:
         return state
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real)
+
+
 def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> CompiledScene:
     """Compile a scene.
 
@@ -92,7 +97,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         For a tolerance out of range.
     """
     low, high = TOLERANCE_RANGE
-    if not low <= tol <= high:
+    if not (_is_number(tol) and low <= tol <= high):
         raise ArgumentError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
     loads = compile_loads(() if sampled else scene.loads)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
@@ -258,12 +263,13 @@ def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
 
 
 def _release(scene: Scene, velocity_tolerance: float, speed: float) -> float:
-    """Return the penetration from which the impulse to separation is below 1e-5 of the velocity tolerance.
+    """Return the penetration from which the impulse to separation is below a share of the velocity tolerance.
 
-    integral F dt = K d^(n+1) / ((n+1) v) at the speed v.
+    integral F dt = K d^(n+1) / ((n+1) v) at the speed v. Separations may be a hundred times slower than that, and many.
     """
     exponent = scene.contact.exponent
-    impulse = 1e-5 * velocity_tolerance * scene.head.mass_kg
+    share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
+    impulse = share * velocity_tolerance * scene.head.mass_kg
     return float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
 
 

@@ -16,9 +16,9 @@ from __future__ import annotations
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.contact_force import law_force, pair_force
+from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value
-from plow_twin.solve.state import COS, OMEGA, ON, SIN, SLIPS_BACKWARD, SLIPS_FORWARD, STICKS, VX, VY, X, Y
+from plow_twin.solve.state import CLIPPED, COS, OFF, OMEGA, ON, SIN, SLIPS_BACKWARD, SLIPS_FORWARD, STICKS, VX, VY, X, Y
 
 #: Below this share of its terms a guard is zero but for rounding.
 _ROUNDING = 1e-10
@@ -58,12 +58,22 @@ def _anchor(p, state, pair, force, place, rate) -> None:
     state.anchor[pair] = place - (force - p.stick_damping * rate) / p.stick_stiffness
 
 
+@kernel(inline="code")
+def _normal_force(p, state, pair, depth):
+    """Return N of a pair that pushes, for a penetration that may be negative by rounding."""
+    return max(law_force(p, state, pair, max(depth, 0.0), rate_of(p, pair, state.y)), 0.0)
+
+
 @kernel()
-def grasp(p, state, pair) -> None:
-    """Let the corner of a pair that begins to push hold its wall by a slack spring, or slip where that is too much."""
+def grasp(p, state, pair, old) -> None:
+    """Let the corner of a pair that begins to push hold its wall by a slack spring, or slip where that is too much.
+
+    What its mode was, `old`, tells the force exactly: that of no depth at a touch, where Kelvin-Voigt has one at once,
+    and none where a clipped pair pushes again. Rounding would tell either of stick and slip.
+    """
     place, rate = _along(p, pair, state.y)
-    # at a touch rounding decides whether the corner is inside, and Kelvin-Voigt's force is there at once
-    normal = max(law_force(p, state, pair, penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y)), 0.0)
+    depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
+    normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
     # without a force yet it is their rates that decide: the guard of a slip looks at them
@@ -76,7 +86,8 @@ def switch_grip(p, state, pair, new) -> None:
     """Let a corner slip or stick."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        normal = pair_force(p, state, pair, penetration_of(p, state, pair, state.y), rate_of(p, pair, state.y))
+        # at a touch Kelvin-Voigt's force is there at once, whatever rounding says of the depth
+        normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0
     else:
@@ -89,8 +100,8 @@ def settle_grips(p, state, force) -> None:
     for pair in range(PAIR_COUNT):
         place, rate = _along(p, pair, state.y)
         if state.mode[pair] != ON or force[pair] <= 0.0:
-            state.grip[pair] = 0
-            _anchor(p, state, pair, 0.0, place, rate)
+            # it touches with a slack spring, as in `grasp`
+            state.anchor[pair], state.grip[pair] = place, 0
             continue
         held = held_force(p, state, pair, place, rate)
         limit = (p.static_friction if state.grip[pair] == 0 else p.friction) * force[pair]

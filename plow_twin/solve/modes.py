@@ -118,7 +118,7 @@ def settle_modes(p, state, stick) -> None:
             _start_inside(p, state, pair, energy)
             state.mode[pair] = mode_inside(p, state, pair)
             if stick is not None:
-                grasp(p, state, pair)
+                grasp(p, state, pair, ON)
     state.elapsed = 0.0
     state.step_size = -1.0
     state.last_step_size = 0.0

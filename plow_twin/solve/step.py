@@ -168,7 +168,7 @@ def _switch(p, state, pair, new, totals, log, fraction, stick) -> None:
             else:
                 state.mode[pair] = RELEASED
     if stick is not None and state.mode[pair] == ON and old != ON:
-        grasp(p, state, pair)
+        grasp(p, state, pair, old)
     # to the outside a released pair is on
     old, new = ON if old == RELEASED else old, ON if new == RELEASED else new
     if log is not None and old != new:

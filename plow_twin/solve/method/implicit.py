@@ -13,7 +13,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import roots_jacobi
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row, splat
@@ -75,6 +74,9 @@ def _coefficients(nodes: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
 @cache
 def _rule() -> tuple[NDArray[np.float64], ...]:
     """Return nodes, weights, and the coefficients from values at the start and the nodes, and at the nodes alone."""
+    # only stiff scenes need it, and it takes a while to import
+    from scipy.special import roots_jacobi
+
     inner = 0.5 * (roots_jacobi(STAGES - 1, 1.0, 0.0)[0] + 1.0)
     nodes = np.append(np.sort(inner), 1.0).astype(np.longdouble)
     degree = np.arange(1, STAGES + 1)
