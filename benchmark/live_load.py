@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import struct
 import subprocess
@@ -190,8 +191,8 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
         "lost": int(figures.get("samples_lost", 0)),
         "messages": len(ages),
         "core": round(share, 3),
-        "age_p50_ms": round(ages[len(ages) // 2], 3),
-        "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+        "age_p50_ms": round(ages[len(ages) // 2], 3) if ages else math.nan,
+        "age_p99_ms": round(ages[len(ages) * 99 // 100], 3) if ages else math.nan,
         "age_max_of_first_second_ms": round(first_s, 3),
     }
 
@@ -213,7 +214,7 @@ def _twin(mode: str, folder: str) -> list[str]:
 
 
 def compare(seconds: float, repeats: int) -> None:
-    """Print the medians of all cases, and the targets with what was reached."""
+    """Print each run as it ends, then the medians of all cases, and the targets with what was reached."""
     runs: dict[Case, list[dict[str, float]]] = {case: [] for case in CASES}
     with tempfile.TemporaryDirectory() as folder:
         for repeat in range(repeats):
@@ -221,8 +222,14 @@ def compare(seconds: float, repeats: int) -> None:
                 path = f"{folder}/{number}_{repeat}" if case.recorded else ""
                 answerer = [sys.executable, __file__, "--role", case.mode]
                 command = answerer if case in (ECHO, RAW_ECHO) else _twin(case.mode, path)
-                runs[case].append(measure(command, case.rate_hz, seconds))
+                found = measure(command, case.rate_hz, seconds)
+                print(json.dumps(case._asdict() | found), flush=True)
+                if found["messages"]:  # one without an answer has no age, but is told
+                    runs[case].append(found)
+    if not all(runs.values()):
+        sys.exit("a case was never answered: no medians")
     rows = {case: {key: median(run[key] for run in found) for key in found[0]} for case, found in runs.items()}
+    print("medians", flush=True)
     for case, row in rows.items():
         print(json.dumps(case._asdict() | row), flush=True)
     for text, reached, most in _targets(rows):

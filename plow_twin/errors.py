@@ -100,5 +100,9 @@ class RecordingError(PlowTwinError, ValueError):
     """A recording cannot be written or read; the message names the file and the record."""
 
 
+class TakenError(RecordingError):
+    """A recording cannot be made where another one is."""
+
+
 class ForeignRecordingError(RecordingError):
     """A recording that was asked for as a run of plow_twin is none; it may be a recording of another kind."""

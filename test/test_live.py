@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -10,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -27,21 +29,24 @@ from record_support import PAPER_AMPLITUDE, rewrite
 from plow_twin.cli.app import run as run_cli
 from plow_twin.errors import RecordingError
 from plow_twin.live import parameters
-from plow_twin.live.bridge.files import Files
+from plow_twin.live.bridge.files import Files, StandardInput
 from plow_twin.live.bridge.mqtt import Access, Mqtt
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.inputs import Inputs
+from plow_twin.live.load_model import read_load_model
 from plow_twin.live.part import Part
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Preparation
 from plow_twin.record.doctor import examine
-from plow_twin.record.mapping import read_map, time_ns
+from plow_twin.record.mapping import read_map
 from plow_twin.record.measured import read_recording
 from plow_twin.record.reader import EntryRecord, RunReader
 from plow_twin.record.replay import replay
-from plow_twin.record.sources import Arrived
+from plow_twin.record.sources import Arrived, Columns
+from plow_twin.record.times import time_ns
 from plow_twin.record.unused import unused_messages
+from plow_twin.record.writer import RunWriter
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import Gaps, PartOfPose, Pose
@@ -62,14 +67,17 @@ def _csv(path: Path, count: int, more: str = "") -> Path:
     return path
 
 
-def _run(path: Path, mapping: Path | None = None, **values: Any) -> dict[str, Part]:
-    """Feed a twin from a file and return its diagnostics."""
+def _run(path: Path, mapping: Path | None = None, reports: list[Part] | None = None, **values: Any) -> dict[str, Part]:
+    """Feed a twin from a file and return its diagnostics; those of its state on the way go to `reports`."""
     settings = parameters.settings(values)
     said: list[str] = []
+
+    def say(name: str, part: Part) -> None:
+        if name == "state" and reports is not None:
+            reports.append(part)
+
     prepared = Preparation(settings).result(lambda: False)
-    front = BridgeFront(
-        Files([path], follow=False), mapping, settings, prepared, lambda name, _: said.append(name), said.append
-    )
+    front = BridgeFront(Files([path], follow=False), mapping, settings, prepared, say, said.append)
     assert front.run(lambda: False) == []
     return front.parts()
 
@@ -135,8 +143,11 @@ def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> N
 
 def test_bounded_work_is_said_with_its_error_and_given_again_by_the_journal(tmp_path: Path) -> None:
     given = {"scene": "bench_kv", "max_evaluations": 16, "record_path": str(tmp_path / "run")}
-    values = _run(_csv(tmp_path / "load.csv", 1500), **given)["state"][2]
-    assert int(values["coarse_advances"]) > 0 and 0.0 < float(values["error_estimate_m"]) < 1e-3
+    reports: list[Part] = []
+    parts = _run(_csv(tmp_path / "load.csv", 1500), reports=reports, **given)
+    # each report tells of the time since the one before it
+    largest = max(float(values["error_estimate_m"]) for _, _, values in (*reports, parts["state"]))
+    assert int(parts["state"][2]["coarse_advances"]) > 0 and 0.0 < largest < 1e-3
     report = replay(tmp_path / "run")
     assert (report.samples, report.exit_code, report.first_divergence) == (1500, 0, None)
     assert report.compared["contact_forces"] == 1500
@@ -194,13 +205,22 @@ def test_the_alarms_of_a_run_are_computed_again_and_compared(tmp_path: Path) -> 
     assert (report.exit_code, report.compared["alarms"]) == (0, 0) and report.not_compared["alarms"] > 0
 
 
+def test_what_is_not_used_of_any_input_is_a_warning(tmp_path: Path) -> None:
+    rows = [",".join(map(repr, (*_row(index), 50.0 if index == 7 else 1.0))) for index in range(20)]
+    path = tmp_path / "load.csv"
+    path.write_text("t,fx,fy,m,speed\n" + "\n".join(rows) + "\n")
+    level, message, values = _run(path)["input"]
+    assert (level, message, values["travel_used"], values["travel_dropped"]) == (1, "travel_dropped", "19", "1")
+
+
 def test_the_senders_own_numbers_tell_loss_repetition_and_a_new_start(tmp_path: Path) -> None:
     numbers = [*range(7, 100), 99, *range(110, 200), *range(1, 50), *range(52, 60)]
     lines = [
         json.dumps({"time": 1000 + index, "load": {"f": [index, 2, 3]}, "n": n}) for index, n in enumerate(numbers)
     ]
     path = tmp_path / "plough.csv"
-    path.write_text("\n".join([*lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
+    # what cannot be read before the first number is no number 1
+    path.write_text("\n".join(["{}", "nothing", *lines, '{"n": 60, "load"']) + "\n", encoding="utf-8")
     mapping = tmp_path / "map.yaml"
     mapping.write_text(
         "excitation: {topic: plough, fields: {fx: 'load.f[0]', fy: 'load.f[1]', m: 'load.f[2]'}, sequence: n,\n"
@@ -208,7 +228,7 @@ def test_the_senders_own_numbers_tell_loss_repetition_and_a_new_start(tmp_path: 
     )
     values = _run(path, mapping, limit_force=1e9, limit_force_rate=1e12)["input"][2]
     # 10 between 99 and 110, 2 between 49 and 52
-    assert (values["samples_lost"], values["dropped_duplicate"], values["dropped_malformed"]) == ("12", "1", "1")
+    assert (values["samples_lost"], values["dropped_duplicate"], values["dropped_malformed"]) == ("12", "1", "3")
     assert int(values["samples_used"]) == len(numbers) - 1
 
 
@@ -217,7 +237,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
 
     def read(text: str, **content: Any) -> tuple[int, dict[str, float]] | None:
         path.write_text(text)
-        return read_map(path, None)["head_pose"].read(Arrived("p", "json", 5, content))
+        return read_map(path, None)["head_pose"].read(Arrived("p", 5, content))
 
     pose = "head_pose: {topic: p, fields: {x: a, y: b.c, theta: turn}, clock_offset: -0.5, "
     pose += "unit: {x: mm, y: cm, theta: deg}, "
@@ -240,11 +260,29 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
         ("clock_offset: soon", "clock_offset: got 'soon'"),
         ("stamp_unit: h", "stamp_unit: got 'h'"),
         ("gain: 2", "got gain"),
+        ("stamp_unit: [s]", "stamp_unit: got ['s'], expected one of s, ms"),
+        ("stamp: [t]", "stamp: got ['t'], expected the name"),
+        ("sequence: 0.5", "sequence: got 0.5, expected the name"),
+        ("fields: {x: [1]}", "fields: got {'x': [1]}, expected names of columns"),
+        ("fields: 5", "fields: got 5"),
+        ("scale: {x: true}", "scale: got {'x': True}, expected numbers"),
+        ("limits: {x: [0, true]}", "expected numbers, or pairs"),
     ):
         path.write_text(f"head_pose: {{topic: p, {text}}}")
         with pytest.raises(RecordingError, match="head_pose") as caught:
             read_map(path, None)
         assert said in str(caught.value)
+    # a time that is asked for by name is not that of receipt where it is absent
+    assert read("head_pose: {topic: p, stamp: at}", x=1, y=2, theta=3) is None
+    for key, name in (("stamp", "at"), ("sequence", "n")):
+        path.write_text(f"head_pose: {{topic: p, {key}: {name}}}")
+        with pytest.raises(RecordingError, match=f"{key}: got '{name}', expected one of the columns t, x, y, theta"):
+            read_map(path, {"p": Columns(("t", "x", "y", "theta"))})
+    for data in (b"head_pose: {topic: p", b"\xff\xfe\x00", b"[" * 5000, b"7"):
+        path.write_bytes(data)
+        for reader in (lambda path: read_map(path, None), read_load_model):
+            with pytest.raises(RecordingError, match=r"map\.yaml: "):
+                reader(path)
 
 
 class Live:
@@ -310,6 +348,34 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
     assert (report.samples, report.exit_code) == (300, 0)
 
 
+def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_takes_its_place(tmp_path: Path) -> None:
+    path = tmp_path / "load.csv"
+    path.write_text("t,fx,fy,m\n1,10,0,0\n2,20,0,0\n3,3")
+    files = Files([path], follow=True)
+    files.start(["load"])
+
+    def read() -> list[float | None]:
+        contents = [arrived.content for arrived in files.poll(0.0)]
+        return [None if content is None else float(content.get("fx", math.nan)) for content in contents]
+
+    assert read() == [10.0, 20.0]
+    path.write_text("4,40,0,0\n")  # cut, and its writer goes on without a header; half a line was there
+    assert read() == [None, 40.0]
+    path.rename(tmp_path / "load.csv.1")
+    with (tmp_path / "load.csv.1").open("a") as stream:
+        stream.write("5,50,0,0\n")  # the writer has not heard of it yet
+    assert read() == [50.0]
+    path.write_text("m;fx;t;fy\n0;60;6;0\n")
+    assert read() == [60.0]
+    path.write_text("0,7\n0,70,7,0\n")  # cut within a line: its second half is none
+    assert read() == [None, 70.0]
+    path.unlink()
+    assert read() == []
+    path.write_text("a,b\n1,2\n")
+    assert repr(read()) == "[nan]"  # under another header there is no load: counted where it is read
+    files.close()
+
+
 def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -> None:
     arguments = ("-", "--record", str(tmp_path / "run"), "--set", "excitation_timeout=0.05")
     with _live(*arguments, stdin=subprocess.PIPE) as live:
@@ -329,6 +395,81 @@ def test_lines_on_standard_input_are_taken_and_silence_is_held(tmp_path: Path) -
     assert (report.samples, report.exit_code) == (100, 0)
 
 
+def test_a_closed_standard_input_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", None)  # as Python finds it closed
+    with pytest.raises(BridgeError, match="closed standard input"):
+        StandardInput()
+
+
+class Endless:
+    """Samples at 1 kHz without an end, with poses and speeds between them; `look` is asked before each batch."""
+
+    def __init__(self, look: Callable[[int], bool]) -> None:
+        self.ends = self.finished = False
+        self.connected = True
+        self.lost, self.trouble = 0, ""
+        self._look, self._index, self._begin = look, 0, time.time()
+
+    def topics(self) -> dict[str, Columns]:
+        return {"load": Columns(("t", "fx", "fy", "m", "x", "y", "theta", "speed"))}
+
+    def start(self, topics: list[str]) -> None:
+        pass
+
+    def poll(self, timeout_s: float) -> list[Arrived]:
+        self.finished = self._look(self._index)
+        found = []
+        for _ in range(20):
+            t, *load = _row(self._index)
+            row: dict[str, Any] = dict(zip(("t", "fx", "fy", "m"), (self._begin + t, *load), strict=True))
+            row |= dict(
+                zip(("x", "y", "theta"), (1e-3, 1e-3, 0.0) if self._index % 10 == 0 else ("",) * 3, strict=True)
+            )
+            row["speed"] = 1.0 if self._index % 100 == 0 else ""
+            found.append(Arrived("load", time.time_ns(), row))
+            self._index += 1
+        return found[::-1] if self._index % 1000 == 0 else found  # some are late
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.stress
+def test_nothing_lives_longer_than_the_time_remembered_but_the_index_of_the_recording(tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text("excitation: {topic: load}\nhead_pose: {topic: load}\ntravel: {topic: load}\n")
+    given = {"record_path": str(tmp_path / "run"), "alarm_force": [1e3, 1e9], "alarm_residual": [0.015, 0.0]}
+    settings = parameters.settings(given | {"jump_forward": 3600.0, "excitation_timeout": 3600.0})
+    found: list[tuple[int, int, int]] = []
+
+    def look(index: int) -> bool:
+        if index and index % 8000 == 0:
+            recording = front.runtime.recording
+            assert recording is not None
+            while recording.counters.queued:
+                time.sleep(0.01)
+            gc.collect()
+            writer = recording._recorder._writer
+            assert isinstance(writer, RunWriter)
+            index_bytes = len(writer._part.file._chunk_index)
+            found.append((len(gc.get_objects()), tracemalloc.get_traced_memory()[0] - index_bytes, index_bytes))
+        return len(found) == 3
+
+    prepared = Preparation(settings).result(lambda: False)
+    front = BridgeFront(Endless(look), tmp_path / "map.yaml", settings, prepared, lambda *_: None, pytest.fail)
+    tracemalloc.start()
+    try:
+        assert front.run(lambda: False) == []
+    finally:
+        tracemalloc.stop()
+    (_, _, _), (objects, size, before), (more, larger, after) = found
+    # of 8,000 samples and 25,000 messages; what is remembered of the last seconds breathes by some hundred
+    assert more - objects < 800 and larger - size < 100_000, found
+    # some 140 B a chunk: 2 MB an hour, until the part ends
+    assert 0 < after - before < 20_000
+    figures = front.parts()["input"][2]
+    assert int(figures["samples_used"]) == int(figures["samples_in"]) and int(figures["rolled_back"]) > 0
+
+
 @pytest.fixture
 def broker(tmp_path: Path) -> Iterator[Access]:
     """A broker with TLS and one user, whose messages it keeps while he is away."""
@@ -344,7 +485,10 @@ def broker(tmp_path: Path) -> Iterator[Access]:
     tls = {"ssl": True, "certfile": str(certificate), "keyfile": str(key)}
     config = {
         "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}", **tls}},
-        "plugins": {"amqtt.plugins.authentication.FileAuthPlugin": {"password_file": str(tmp_path / "users")}},
+        "plugins": {
+            "amqtt.plugins.authentication.FileAuthPlugin": {"password_file": str(tmp_path / "users")},
+            "amqtt.plugins.topic_checking.TopicTabooPlugin": {},
+        },
     }
     (tmp_path / "broker.yaml").write_text(json.dumps(config))
     with (tmp_path / "broker.log").open("wb") as log:
@@ -386,8 +530,8 @@ class Sender:
             payload = {"t": t, "force": {"x": fx / 1e3, "y": fy / 1e3}, "moment": m, "n": self.number}
             self.raw(json.dumps(payload).encode())
 
-    def raw(self, payload: bytes) -> None:
-        self.client.publish("plough/load", payload, qos=1).wait_for_publish(30.0)
+    def raw(self, payload: bytes, *, retain: bool = False) -> None:
+        self.client.publish("plough/load", payload, qos=1, retain=retain).wait_for_publish(30.0)
 
     def close(self) -> None:
         self.client.disconnect()
@@ -409,19 +553,23 @@ def test_a_broker_keeps_what_comes_while_the_twin_is_away_and_garbage_is_counted
         *("--user", broker.user, "--password-file", str(tmp_path / "password"), "--tls-ca", str(broker.ca)),
     )
     sender = Sender(broker)
+    old = {"t": 3.0, "force": {"x": 1.0, "y": 1.0}, "moment": 1.0, "n": 9000}
+    sender.raw(json.dumps(old).encode(), retain=True)  # from before the twin: neither a sample nor the first number
     with _live(*arguments) as live:
-        live.until(lambda heard: True, "a report")
+        live.until_count("dropped_inactive", 1)
         sender.send(50)
         for payload in (b"{nonsense", b"\xff\xfe", b"[" * 60000, b'{"n": 51}', b"x" * 100000):
             sender.raw(payload)
-        values = live.until_count("samples_in", 55)
-        assert (values["samples_used"], values["dropped_malformed"]) == ("50", "5")
+        values = live.until_count("samples_in", 56)
+        assert (values["samples_used"], values["dropped_malformed"], values["samples_lost"]) == ("50", "5", "0")
         assert live.stop() == 3
+    sender.client.publish("plough/load", b"", qos=0, retain=True).wait_for_publish(30.0)
     sender.send(50)
     with _live(*arguments) as live:
         values = live.until_count("samples_used", 50)
-        assert values["samples_lost"] == "0"
-        assert live.stop() == 0
+        # the broker keeps the empty message too that takes back the retained one
+        assert (values["samples_lost"], values["dropped_malformed"]) == ("0", "1")
+        assert live.stop() == 3
     sender.close()
 
 
@@ -437,6 +585,9 @@ def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_ref
         with pytest.raises(BridgeError, match=said):
             bridge.start(["plough/load"])
         assert not bridge.connected
+    for topic, said in (("prohibited", "refused: prohibited"), ("plough/+/load", r"topic: got 'plough/\+/load'")):
+        with pytest.raises(BridgeError, match=said):
+            Mqtt(replace(broker, client_id="other"), connect_s=5.0).start(["plough/load", topic])
 
 
 def test_what_the_system_refuses_is_a_warning_and_the_rest_is_done() -> None:

@@ -41,6 +41,28 @@ def test_power_speed_and_depth_give_the_load_and_its_deviation() -> None:
     assert MODEL.cutting_force({"chain_force": 1e3})[0] == 0.0  # type: ignore[index]  # the chain alone, nothing is cut
 
 
+def test_absurd_telemetry_goes_through_to_where_it_is_counted_and_is_no_certainty(tmp_path: Path) -> None:
+    for drive in ({"power": 1e200, "speed": 2.0}, {"chain_force": 1e308}, {"depth": -1e308}):
+        found = MODEL.wrench(drive)
+        assert found is not None and not max(map(abs, (*found[0], *found[1]))) < 1e100
+    # a depth below zero, as of a sensor that is off a little, tells no more surely than the same above it
+    (below, wide), (_, same) = (MODEL.cutting_force({"depth": depth}) for depth in (-0.08, 0.08))  # type: ignore[misc]
+    assert (below, wide) == (0.0, same)
+    (tmp_path / "map.yaml").write_text(MAP)
+    told = {5: "1e200,2,,0", 7: "200,1e-300,8,0"}
+    rows = [f"{0.1 * k:.1f},{told.get(k, '200,2,8,0')}" for k in range(10)]
+    (tmp_path / "drive.csv").write_text("\n".join(["t,p,v,d,s", *rows]) + "\n")
+    settings = parameters.settings({"record_path": str(tmp_path / "run")})
+    files = Files([tmp_path / "drive.csv"], follow=False)
+    prepared = Preparation(settings).result(lambda: False)
+    front = BridgeFront(files, tmp_path / "map.yaml", settings, prepared, lambda *_: None, print)
+    assert front.run(lambda: False) == []
+    values = front.parts()["input"][2]
+    assert (values["samples_used"], values["dropped_implausible"]) == ("9", "1")
+    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    assert max(max(entry.deviation) for entry in entries if isinstance(entry, Spread)) < 1e6
+
+
 def test_the_interval_holds_what_coefficients_drawn_by_chance_give() -> None:
     drive = {"power": 200e3, "speed": 2.0}
     found = MODEL.wrench(drive)

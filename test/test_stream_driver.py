@@ -182,6 +182,31 @@ def test_batches_give_the_bits_of_single_samples_and_a_journal_that_repeats_them
         assert np.asarray(getattr(one, name)).tobytes() == np.asarray(getattr(other, name)).tobytes(), name
 
 
+@pytest.mark.parametrize("every", [100, 2])
+def test_wrong_stamps_among_right_ones_keep_no_right_one_out(every: int) -> None:
+    bench = Bench()
+    for index in range(2000):
+        wrong = index % every == every - 1
+        ahead_ns = (86_400 if index % 3 else -3600) * NS_PER_S if wrong else 0
+        bench.sample(T0 + index * MS + ahead_ns, LOAD, now_ns=index * MS)
+    counted = counters(bench.driver)
+    # five in ten seconds may be a step of the clock, each with the way back
+    assert counted["resets"] == 10
+    assert counted["dropped_unsteady"] == 2000 // every - 5
+    assert counted["samples_used"] + counted["dropped_unsteady"] == 2000
+
+
+@pytest.mark.parametrize("every_sample", [True, False])
+def test_silence_is_seen_after_a_reset_within_the_last_batch(every_sample: bool) -> None:
+    bench = Bench(Policy(failure_limit=3), every_sample=every_sample)
+    absurd = (1e200, -1e200, 1e200)
+    batch = [(T0 + i * MS, absurd if 95 <= i < 99 else LOAD) for i in range(110)]
+    list(bench.driver.samples(batch, now_ns=0))
+    assert bench.kinds().count("Reset") == 1 and bench.driver.newest_ns == T0 + 109 * MS
+    assert bench.driver.silence(NS_PER_S) is None or every_sample
+    assert bench.driver.state is StreamState.STALE
+
+
 def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
     bench = Bench(Policy(failure_limit=3), every_sample=False)
     absurd = (1e200, -1e200, 1e200)

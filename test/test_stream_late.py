@@ -171,6 +171,28 @@ def test_wear_outlives_resets_failures_and_clock_steps_and_a_held_load_wears_not
     assert _replayed(live.journal).wear_depth.tolist() == list(pads)
 
 
+def test_speeds_of_another_clock_act_from_the_time_reached_on_and_are_counted_and_nothing_grows() -> None:
+    right = None
+    for ahead_s in (0, 3600, -3600):
+        live = Live()
+        live.send(*(_arrival(index) for index in range(300)))
+        for _ in range(50):
+            live.driver.travel(T0 + 299 * MS + ahead_s * NS_PER_S, 5.0)
+        live.send(*(_arrival(index) for index in range(300, 600)))
+        assert live.driver.travel_misplaced == (50 if ahead_s else 0)
+        right = live.wear if right is None else right
+        assert (live.wear == right).all()
+    live = Live()
+    # while no sample comes the speeds wait for it, no more of them than a step of the clock lasts
+    live.send(*(_arrival(index) for index in range(10)))
+    for index in range(0, 30_000, 10):
+        live.driver.travel(T0 + index * MS, 2.0 + 1e-6 * index)
+    session = live.driver.session
+    assert len(session._travels) <= 1000 and len(session.history._travels) <= 2
+    live.send(*(_arrival(index) for index in range(10, 600)))
+    assert _replayed(live.journal).wear_depth.tolist() == live.wear.tolist()
+
+
 def test_a_hold_without_end_ends() -> None:
     live = Live(policy=Policy(excitation_timeout_s=0.1, hold_limit_s=2.0))
     live.send(_arrival(0))

@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from plow_twin.errors import ArgumentError
 from plow_twin.model.loads import compile_loads
-from plow_twin.model.scene import Scene, Wear
+from plow_twin.model.scene import Contact, Scene, Wear
+from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -205,3 +207,26 @@ def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
         seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
         np.testing.assert_allclose(after.slow.wear_rate * seconds, grown, atol=1e-18)
     assert max(publication.slow.wear_rate.max() for publication in slow if publication.slow is not None) > 0.0
+
+
+def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() -> None:
+    """Force would wear a pad faster than it moves the head: refused before it acts, and before it is journaled."""
+    damping, area = 2e5, 0.015
+    contact = Contact("kelvin_voigt", 1e9, damping=damping)
+    scene = replace(SCENE, contact=contact, wear=Wear(area / (4.0 * damping), area, 2.0, prior_m2_n=(1e-15, 1e-6)))
+    twin, emitted = Twin(scene, excitation="sampled"), []
+    session = Session(twin, on_entry=emitted.append)
+    session.stamp_ns = T0
+    session.apply(Travel(T0 + 10 * MS, -3.9))
+    for refuse in (
+        lambda: twin.set_travel_speed(-4.1),
+        lambda: TwinBatch([scene, scene]).set_travel_speed([2.0, 4.1]),
+        lambda: session.apply(Travel(T0 + 20 * MS, 4.1)),
+    ):
+        with pytest.raises(ArgumentError, match=r"got -?4.1, expected at most 4 m/s, .* contact.damping 200000.0 N"):
+            refuse()
+    # nor can the damping be raised beside a speed that is to come
+    with pytest.raises(ArgumentError, match=r"speed_m_s: got -3.9, expected at most 3.2 m/s"):
+        session.check_model({"contact.damping": 1.25 * damping})
+    session.check_model({"contact.damping": damping})
+    assert emitted == [Travel(T0 + 10 * MS, -3.9)] and session.twin is twin

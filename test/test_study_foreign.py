@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.writer import Writer
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
@@ -136,8 +137,30 @@ def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> No
     with pytest.raises(RecordingError, match="excitation: got load"):
         analyse(short, scene=PAPER)
     (tmp_path / "map.yaml").write_text("excitation: {topic: load, fields: {fx: fx, fy: fy, m: moment}}")
-    with pytest.raises(RecordingError, match="'moment', expected a column of t, fx, fy"):
+    with pytest.raises(RecordingError, match="'moment', expected one of the columns t, fx, fy"):
         analyse(short, scene=PAPER, mapping=tmp_path / "map.yaml")
+    (tmp_path / "map.yaml").write_text("excitation: {topic: load, fields: {fx: fx, fy: fy, m: fy}, stamp: when}")
+    with pytest.raises(RecordingError, match="stamp: got 'when', expected one of the columns t, fx, fy"):
+        analyse(short, scene=PAPER, mapping=tmp_path / "map.yaml")
+
+
+def test_columns_of_any_name_dates_and_rows_of_several_signals_are_read(tmp_path: Path) -> None:
+    lines = ['head;when;"Fx, N";2;"M;Nm";x']
+    for index in range(COUNT):
+        start = f"A;2026-01-02T03:04:05.{index:03}Z;"
+        wrench = ";".join(f"{value:.6f}" for value in paper_sample(index).wrench)
+        lines += [f"{start}{wrench};", f"{start};;;0,25"]
+    (tmp_path / "all.csv").write_text("\n".join(lines))
+    (tmp_path / "map.yaml").write_text(
+        "excitation: {topic: all, fields: {fx: 'Fx, N', fy: 2, m: 'M;Nm'}, stamp: when}\n"
+        "head_pose: {topic: all, fields: {x: x}, unit: {x: mm}, stamp: when}\n"
+    )
+    found = analyse(tmp_path / "all.csv", scene=PAPER, mapping=tmp_path / "map.yaml")
+    plain = analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER)
+    assert found.input == plain.input == {"samples_in": COUNT, "samples_used": COUNT} and not found.lossy
+    np.testing.assert_array_equal(found.predictions[0].loads.largest, plain.predictions[0].loads.largest)
+    stamps, values = found.measured.signals["x"].series()
+    assert (stamps[0], len(stamps), set(values)) == (1_767_323_045_000_000_000, COUNT, {0.25e-3})
 
 
 def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tmp_path: Path) -> None:
@@ -145,6 +168,7 @@ def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tm
     (run.folder / "run_1.mcap").touch()
     report = replay(run.folder)
     assert (report.status, report.exit_code, report.samples) == (FileStatus.TRUNCATED, 3, COUNT)
-    assert examine(run.folder).problems == ["run_1.mcap: cut off: it has no end"]
+    unnamed = "run_1.mcap: metadata.yaml does not name it"
+    assert examine(run.folder).problems == ["run_1.mcap: cut off: it has no end", unnamed]
     repair(run.folder)
     assert replay(run.folder).exit_code == 0 and (run.folder / "run_1.mcap.damaged").exists()

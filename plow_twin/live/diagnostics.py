@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from plow_twin.live.inputs import TOPICS
 from plow_twin.live.part import Part
 from plow_twin.stream.driver import StreamState, counters
-from plow_twin.stream.intake import Verdict
+from plow_twin.stream.intake import Intake, Verdict
 
 if TYPE_CHECKING:
     from plow_twin.live.runtime import Runtime
@@ -62,7 +62,8 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "holds": "advances under the hold policy",
         "travel_used": "speeds along the face used",
         "travel_dropped": "speeds along the face dropped",
-        "travel_implausible": "of these, larger than limit_travel, or changed faster than it can",
+        "travel_misplaced": "speeds used that act from the time reached on: their stamps are of another clock",
+        "travel_implausible": "of these, beyond limit_travel or what the damping allows, or changed faster than it can",
         "head_pose_used": "measured poses used",
         "head_pose_dropped": "measured poses dropped",
         "head_pose_implausible": "of these, larger than limit_pose, or changed faster than it can",
@@ -264,6 +265,7 @@ class Health:
             "samples_lost": inputs.senders.lost,
             "samples_not_followed": inputs.senders.ignored,
             "messages_lost": inputs.lost,
+            **{f"{topic}_dropped": _refused(getattr(inputs, topic)) for topic in ("travel", "head_pose", "gaps")},
         }
         grown = self._grown({**counted, **more}, _TROUBLE)
         if peak > inputs.depth // 2:
@@ -367,7 +369,17 @@ _TROUBLE: Final = (
     "samples_lost",
     "samples_not_followed",
     "messages_lost",
+    "travel_dropped",
+    "travel_misplaced",
+    "head_pose_dropped",
+    "gaps_dropped",
 )
+
+
+def _refused(intake: Intake) -> int:
+    """Return how many messages were not used while they could have been."""
+    away = intake.counts[Verdict.INACTIVE] + intake.counts[Verdict.NO_CLOCK]
+    return intake.arrived - intake.used - away
 
 
 def _ms(seconds: float) -> str:

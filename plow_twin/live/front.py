@@ -133,12 +133,15 @@ class BridgeFront:
         return self._health.parts("active", "", self.runtime, time.monotonic_ns())
 
     def _loop(self, stop_asked: Callable[[], bool], give_up: float) -> None:
-        inputs, bridge = self.runtime.inputs, self._bridge
+        inputs, bridge, trouble = self.runtime.inputs, self._bridge, ""
         periodic = [Timer(1.0 / rate, do) for rate, do in self.runtime.periodic()] + [Timer(_REPORT_S, self._report)]
         while not (stop_asked() or bridge.finished) and time.monotonic() < give_up:
             next_due = min(timer.due for timer in periodic)
             messages = bridge.poll(max(0.0, min(_POLL_S, next_due - time.monotonic())))
             inputs.lost = bridge.lost
+            if bridge.trouble != trouble:
+                trouble = bridge.trouble
+                self.say_error(trouble or "the source is connected again")
             inputs.publishers |= dict.fromkeys(self._connected, int(bridge.connected))
             if messages:
                 if not bridge.ends:
@@ -168,7 +171,7 @@ def _roles(bridge: Bridge, mapping: Path | None, source: str, modelled: bool) ->
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
         # whatever stands there: it may be no text at all
-        there = "; ".join(f"{topic} ({ascii(kind.partition(':')[2])[:120]})" for topic, kind in (topics or {}).items())
+        there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         raise BridgeError(f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m")
     return roles
 

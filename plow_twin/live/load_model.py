@@ -20,9 +20,8 @@ from typing import Any, Final
 import numpy as np
 
 from plow_twin.errors import RecordingError
+from plow_twin.record.mapping import LOAD_MODEL, read_map_file
 
-#: Key of the mapping file that holds the coefficients.
-KEY: Final = "load_model"
 #: Below that speed [m/s] the power says nothing of the chain's force.
 SLOWEST_M_S: Final = 0.1
 #: 5 % and 95 % points of a normal distribution, in standard deviations.
@@ -74,10 +73,13 @@ class LoadModel:
         opinions = [found for found in (self._by_drive(told), self._by_coal(told)) if found is not None]
         if not opinions:
             return None
-        weights = [1.0 / max(deviation, 1.0) ** 2 for _, deviation in opinions]
-        total = sum(weights)
-        mean = sum(weight * value for weight, (value, _) in zip(weights, opinions, strict=True)) / total
-        return max(mean, 0.0), math.sqrt(1.0 / total)
+        deviations = [max(deviation, 1.0) for _, deviation in opinions]
+        # against the smallest, and no powers below: numbers of any size go through to where they are refused
+        smallest = min(deviations)
+        shares = [smallest / deviation for deviation in deviations]
+        total = sum(share * share for share in shares)
+        mean = sum(share * share * value for share, (value, _) in zip(shares, opinions, strict=True)) / total
+        return max(mean, 0.0), smallest / math.sqrt(total)
 
     def wrench(self, drive: Mapping[str, float]) -> tuple[Wrench, Wrench] | None:
         """Return Fx, Fy [N], M [N m], and their standard deviations, or None when the drive does not tell enough."""
@@ -87,12 +89,16 @@ class LoadModel:
         z, spread = force
         push, lateral = self.push_ratio, self.lateral_ratio
         fx, fy = push[0] * z, lateral[0] * z
-        var_x = (push[0] * spread) ** 2 + (z * push[1]) ** 2 + (spread * push[1]) ** 2
-        var_y = (lateral[0] * spread) ** 2 + (z * lateral[1]) ** 2 + (spread * lateral[1]) ** 2
-        both = push[0] * lateral[0] * spread**2
         x, y = self.at_m
-        var_m = x * x * var_y + y * y * var_x - 2.0 * x * y * both
-        return (fx, fy, x * fy - y * fx), (math.sqrt(var_x), math.sqrt(var_y), math.sqrt(max(var_m, 0.0)))
+        arms = (x * lateral[1], y * push[1])
+        deviations = (
+            math.hypot(push[0] * spread, z * push[1], spread * push[1]),
+            math.hypot(lateral[0] * spread, z * lateral[1], spread * lateral[1]),
+            math.hypot(
+                (x * lateral[0] - y * push[0]) * spread, *(z * arm for arm in arms), *(spread * arm for arm in arms)
+            ),
+        )
+        return (fx, fy, x * fy - y * fx), deviations
 
     def _by_drive(self, told: Mapping[str, float]) -> Number | None:
         if "chain_force" in told:
@@ -113,7 +119,7 @@ class LoadModel:
                 return None
             factor = float(np.interp(told["position"], *self.resistance))
         force, deviation = self.specific_force_n_m
-        return force * factor * told["depth"], deviation * factor * told["depth"]
+        return force * factor * told["depth"], deviation * factor * abs(told["depth"])
 
 
 def read_load_model(path: Path | None) -> LoadModel | None:
@@ -126,20 +132,17 @@ def read_load_model(path: Path | None) -> LoadModel | None:
     """
     if path is None:
         return None
-    import yaml
-
-    given: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    entry = given.get(KEY) if isinstance(given, dict) else None
+    entry = read_map_file(path).get(LOAD_MODEL)
     if entry is None:
         return None
     names = [spec.name for spec in fields(LoadModel)]
     if not isinstance(entry, dict) or not set(entry) <= set(names) or not {"push_ratio", "at_m"} <= set(entry):
         raise RecordingError(
-            f"{path}: {KEY}: got {entry!r}, expected push_ratio, at_m and others of {', '.join(names)}"
+            f"{path}: {LOAD_MODEL}: got {entry!r}, expected push_ratio, at_m and others of {', '.join(names)}"
         )
     if not {"efficiency", "specific_force_n_m", "idle_force_n"} & set(entry):
         raise RecordingError(
-            f"{path}: {KEY}: expected efficiency, specific_force_n_m or idle_force_n (for chain_force)"
+            f"{path}: {LOAD_MODEL}: expected efficiency, specific_force_n_m or idle_force_n (for chain_force)"
         )
     values: dict[str, Any] = {
         name: _resistance(path, value) if name == "resistance" else _pair(path, name, value)
@@ -153,10 +156,10 @@ def _pair(path: Path, name: str, given: Any) -> Number:
     try:
         first, second = (float(value) for value in given)
     except (TypeError, ValueError) as error:
-        raise RecordingError(f"{path}: {KEY}: {name}: got {given!r}, expected two numbers") from error
+        raise RecordingError(f"{path}: {LOAD_MODEL}: {name}: got {given!r}, expected two numbers") from error
     if not math.isfinite(first + second) or (name != "at_m" and second < 0.0):
         expected = "two finite numbers" if name == "at_m" else "a mean and a deviation >= 0"
-        raise RecordingError(f"{path}: {KEY}: {name}: got {given!r}, expected {expected}")
+        raise RecordingError(f"{path}: {LOAD_MODEL}: {name}: got {given!r}, expected {expected}")
     return first, second
 
 
@@ -165,10 +168,12 @@ def _resistance(path: Path, given: Any) -> tuple[tuple[float, ...], tuple[float,
         places = tuple(float(value) for value in given["position_m"])
         factors = tuple(float(value) for value in given["factor"])
     except (TypeError, ValueError, KeyError) as error:
-        raise RecordingError(f"{path}: {KEY}: resistance: got {given!r}, expected position_m and factor") from error
+        raise RecordingError(
+            f"{path}: {LOAD_MODEL}: resistance: got {given!r}, expected position_m and factor"
+        ) from error
     rising = all(later > earlier for earlier, later in pairwise(places))
     if not places or len(places) != len(factors) or not rising or not all(0.0 <= value < math.inf for value in factors):
         raise RecordingError(
-            f"{path}: {KEY}: resistance: got {given!r}, expected rising position_m and as many factors >= 0"
+            f"{path}: {LOAD_MODEL}: resistance: got {given!r}, expected rising position_m and as many factors >= 0"
         )
     return places, factors

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +15,7 @@ from plow_twin.record.decimation import Decimation
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
-from plow_twin.record.writer import free_folder
+from plow_twin.record.writer import in_free_folder
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Publication
@@ -63,9 +64,9 @@ class Recording:
             record_outputs=settings.record_outputs,
         )
         self._decimation = Decimation(settings.record_outputs, settings.record_rate)
-        self._recorder = Recorder(
-            free_folder(Path(settings.record_path)),
-            header,
+        make = partial(
+            Recorder,
+            header=header,
             queue_size=_QUEUE_SIZE,
             part_bytes=round(settings.record_part_mb * 1e6),
             part_s=settings.record_part_s,
@@ -75,6 +76,7 @@ class Recording:
             now_ns=clock or time.time_ns,
             on_error=on_error,
         )
+        self._recorder = in_free_folder(Path(settings.record_path), make)
 
     @property
     def path(self) -> Path:

@@ -20,7 +20,7 @@ from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_cha
 from plow_twin.live.publishing import Front, Publishing
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import WearKeeper
-from plow_twin.model.scene import Scene
+from plow_twin.model.scene import Scene, fastest_travel
 from plow_twin.record.alarms import alarms_of
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.wear_state import scene_identity
@@ -29,7 +29,7 @@ from plow_twin.stream.health import Periods
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose
 from plow_twin.stream.limits import Limits, excitation_limits, pose_limits, value_limits
-from plow_twin.stream.model_changes import changed_twin
+from plow_twin.stream.model_changes import changed_scene, changed_twin
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
@@ -88,13 +88,14 @@ class Runtime:
         #: what the wear's identity is
         self.identity = scene_identity(self.scene)
         depth = kept_wear.get(self.identity)
-        if settings.wear_state_path:
-            self.wear_keeper = WearKeeper(Path(settings.wear_state_path), settings.hardware_id, self.scene)
-            depth = self.wear_keeper.load() or depth
         self.alarms = alarms_of(asdict(settings))
         # refuses, here and not while samples come, what the settings would change
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
+            if settings.wear_state_path:
+                self.wear_keeper = WearKeeper(Path(settings.wear_state_path), settings.hardware_id, self.scene)
+                made.callback(self.wear_keeper.release)
+                depth = self.wear_keeper.load() or depth
             self.recording = self._record()
             if self.recording:
                 made.callback(self.recording.close)
@@ -295,8 +296,10 @@ class Runtime:
     def _set_limits(self, settings: Settings) -> None:
         """Set what of the inputs besides the load is plausible."""
         pose = pose_limits(self.scene, settings.limit_pose, settings.limit_pose_rate)
+        travel = value_limits(settings.limit_travel, settings.limit_travel_rate)
+        scene = changed_scene(self.scene, model_changes(settings))
         self.inputs.set_limits(
-            value_limits(settings.limit_travel, settings.limit_travel_rate),
+            Limits((min(settings.limit_travel, fastest_travel(scene.wear, scene.contact)),), travel.fastest),
             pose,
             value_limits(settings.limit_gap or pose_limits(self.scene).largest[0], settings.limit_gap_rate),
         )

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from plow_twin.live.runtime import Runtime
 from plow_twin.record.alarms import ACKNOWLEDGED
+from plow_twin.record.wear_state import check_depth
 from plow_twin.stream.journal import Snapshot
 
 
@@ -66,6 +67,7 @@ class Services:
         """Set the wear of the pads to the parameter `set_wear`."""
         depth = self._runtime.settings.set_wear
         try:
+            check_depth(depth, self._runtime.scene)
             self._runtime.driver.set_wear(self._runtime.stamp_ns, depth, "service")
         except ValueError as error:
             return False, f"parameter set_wear: {error}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.scene import Scene
-from plow_twin.record.wear_state import WearState, load_wear, save_wear, scene_identity
+from plow_twin.record.wear_state import WearState, claim_folder, load_wear, save_wear, scene_identity
 
 
 class WearKeeper:
@@ -23,10 +24,16 @@ class WearKeeper:
         Serial of the head.
     scene
         Its scene.
+
+    Raises
+    ------
+    WearStateError
+        Another twin keeps its wear in the folder.
     """
 
     def __init__(self, folder: Path, head: str, scene: Scene) -> None:
         self.folder, self._head, self._scene = folder, head, scene
+        self._claim = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
@@ -53,6 +60,13 @@ class WearKeeper:
             self._writing.result()
         self.save(depth)
         self._writer.shutdown(wait=True)
+        self.release()
+
+    def release(self) -> None:
+        """Leave the folder to others; nothing is saved."""
+        claim, self._claim = self._claim, None
+        if claim is not None:
+            os.close(claim)
 
     def _save(self, values: tuple[float, ...]) -> None:
         try:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.journal_codec import Dropped
-from plow_twin.record.mapping import Role
+from plow_twin.record.mapping import Role, readings
 from plow_twin.record.reader import Entries
 from plow_twin.record.sources import Arrived
 from plow_twin.run.advance import AdvanceSeries
@@ -238,22 +238,20 @@ class Feed:
         RecordingError
             No sample could be used.
         """
-        by_topic: dict[str, list[tuple[str, Role]]] = {}
-        for name, role in self.roles.items():
-            by_topic.setdefault(role.topic, []).append((name, role))
-        for arrived in messages:
-            for name, role in by_topic.get(arrived.topic, ()):
-                found = role.read(arrived)
-                if found is None:
-                    self.unfit += 1
-                    if name == "excitation":
-                        self.intake.refuse(Verdict.MALFORMED)
-                else:
-                    self._take(name, *found, arrived.log_time_ns)
+        for name, arrived, found in readings(messages, self.roles):
+            if found is not None:
+                self._take(name, *found, arrived.log_time_ns)
+            elif name == "excitation":
+                self.intake.refuse(Verdict.MALFORMED)
+            else:
+                self.unfit += 1
         self.flush()
         if not self.intake.used:
             topic = self.roles["excitation"].topic if "excitation" in self.roles else "none"
-            raise RecordingError(f"excitation: got no sample that can be used (topic {topic}), expected some")
+            refused = ", ".join(f"{verdict.value} {count}" for verdict, count in self.intake.counts.items() if count)
+            raise RecordingError(
+                f"excitation: got no sample that can be used (topic {topic}: {refused or 'no message'}), expected some"
+            )
         for walker in self.walkers:
             walker.close()
 
@@ -268,8 +266,10 @@ class Feed:
                     walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":
             self._sample(stamp_ns, (values["fx"], values["fy"], values["m"]), log_time_ns)
-        else:
+        elif stamp_ns > 0:
             self.measured(name, stamp_ns, values)
+        else:
+            self.unfit += 1
 
     def _sample(self, stamp_ns: int, wrench: tuple[float, float, float], log_time_ns: int) -> None:
         verdict = self.intake.judge(stamp_ns, wrench, self._reached_ns)

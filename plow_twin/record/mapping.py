@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.sources import Arrived, Source
+from plow_twin.record.sources import Arrived, Columns, Source, TopicType
+from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
 
 #: What a recording can hold, and the numbers of each, with the fields where they stand by default, by type.
 ROLES: Final[dict[str, tuple[str, ...]]] = {
@@ -24,7 +24,7 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "drive": ("power", "chain_force", "speed", "depth", "position"),
 }
 #: Key of a mapping that is no role: how a live twin makes the load of what the drive tells.
-_LOAD_MODEL: Final = "load_model"
+LOAD_MODEL: Final = "load_model"
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("excitation", "geometry_msgs/msg/WrenchStamped"): _WRENCH,
@@ -48,8 +48,6 @@ _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("forces", "sensor_msgs/msg/JointState"): {name: f"effort[{name}]" for name in PAIR_NAMES},
     ("gaps", "sensor_msgs/msg/JointState"): {name: f"position[{name}]" for name in PAIR_NAMES},
 }
-_NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 #: Topics by which a role is recognised without a mapping.
 _NAMES: Final = {
     "excitation": ("excitation", "load", "wrench"),
@@ -84,13 +82,6 @@ _QUANTITIES: Final = {
     **{("gaps", name): "length" for name in PAIR_NAMES},
     **{("forces", name): "force" for name in PAIR_NAMES},
 }
-_STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-#: Columns and keys that hold the time where the mapping names none.
-TIMES: Final = ("t", "time")
-#: Times below this are no times of the epoch, but count from some start [s]: they are moved away from 0, which stands
-#: for a missing stamp.
-_EPOCH_S: Final = 1e9
-_ORIGIN_NS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True)
@@ -106,7 +97,7 @@ class Role:
     """
 
     topic: str
-    message_type: str
+    message_type: TopicType
     fields: Mapping[str, str]
     scale: Mapping[str, float] = field(default_factory=dict)
     offset: Mapping[str, float] = field(default_factory=dict)
@@ -147,50 +138,18 @@ class Role:
 
     def _stamp_ns(self, arrived: Arrived) -> int | None:
         content = arrived.content
+        received_ns = None if arrived.log_time_ns == NO_TIME else arrived.log_time_ns
         if self.stamp == "log":
-            return arrived.log_time_ns
+            return received_ns
         if isinstance(content, Mapping):
             if self.stamp == "header":
                 name = next((name for name in TIMES if name in content), None)
-                return arrived.log_time_ns if name is None else time_ns(content[name], self.stamp_unit)
-            time = _at(content, self.stamp)
-            return arrived.log_time_ns if time is None else time_ns(time, self.stamp_unit)
+                return received_ns if name is None else time_ns(content[name], self.stamp_unit)
+            # a time that is asked for by name and is not there is none: that of receipt would be invented
+            return time_ns(_at(content, self.stamp), self.stamp_unit)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
         # a type without a header has only its receive time
-        return arrived.log_time_ns if stamp is None else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
-
-
-def time_ns(value: Any, unit: str = "s") -> int | None:
-    """Return the stamp [ns] that a number, or a text after ISO 8601 (UTC unless it says otherwise), stands for.
-
-    None when it stands for none.
-    """
-    if isinstance(value, str):
-        value = value.strip()
-        # a number first: 20260102 would be a date too
-        if value.isascii() and value.isdigit() and len(value) < 20:
-            value = int(value)
-        elif _NUMBER.fullmatch(value):
-            value = float(value)
-        else:
-            return _date_ns(value)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
-        return None
-    scale = _STAMP_UNITS[unit]
-    # integers keep their nanoseconds; a float of today's date holds some 0.2 us
-    stamp_ns = value * scale if isinstance(value, int) else round(value * scale)
-    if abs(stamp_ns) > 4e18:
-        return None
-    return stamp_ns if stamp_ns >= _EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
-
-
-def _date_ns(text: str) -> int | None:
-    try:
-        time = datetime.fromisoformat(text)
-    except ValueError:
-        return None
-    time = time if time.tzinfo else time.replace(tzinfo=UTC)
-    return (time - _EPOCH) // timedelta(microseconds=1) * 1000
+        return received_ns if stamp is None else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def _at(content: Mapping[str, Any], path: str) -> Any | None:
@@ -213,7 +172,7 @@ def _plain_number(value: Any) -> float | None:
     if isinstance(value, str):
         if not value.strip():
             return math.nan
-        if not _NUMBER.fullmatch(value.strip()):
+        if not NUMBER.fullmatch(value.strip()):
             return None
     elif isinstance(value, bool) or not isinstance(value, int | float):
         return None
@@ -246,6 +205,23 @@ def _follow(content: Any, path: str) -> float | None:
         return None
 
 
+def readings(
+    messages: Iterable[Arrived], roles: Mapping[str, Role]
+) -> Iterator[tuple[str, Arrived, tuple[int, dict[str, float]] | None]]:
+    """Yield for each message the roles that it has, and what it says in each as `Role.read`.
+
+    Where several roles share a topic, a message says nothing in those whose fields are empty.
+    """
+    by_topic: dict[str, list[tuple[str, Role]]] = {}
+    for name, role in roles.items():
+        by_topic.setdefault(role.topic, []).append((name, role))
+    for arrived in messages:
+        shared = by_topic.get(arrived.topic, [])
+        for name, role in shared:
+            if len(shared) == 1 or not role.empty(arrived):
+                yield name, arrived, role.read(arrived)
+
+
 def roles_by_source(
     sources: Sequence[Source], path: Path | None, left_out: str = ""
 ) -> Iterator[tuple[Source, dict[str, Role]]]:
@@ -262,7 +238,7 @@ def roles_by_source(
         yield source, {name: role for name, role in roles.items() if role.topic in table}
 
 
-def read_map(path: Path | None, topics: Mapping[str, str] | None) -> dict[str, Role]:
+def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[str, Role]:
     """Return the roles of a recording's topics: as the YAML file says, else as names and types tell.
 
     `topics` are types by topic; None when they are not known beforehand: JSON on any topic that the file names.
@@ -275,19 +251,31 @@ def read_map(path: Path | None, topics: Mapping[str, str] | None) -> dict[str, R
     if path is None:
         topics = topics or {}
         return {role: found for role in _NAMES if (found := _guess(role, topics)) is not None}
+    given = read_map_file(path)
+    return {str(role): _role(path, str(role), entry, topics) for role, entry in given.items() if role != LOAD_MODEL}
+
+
+def read_map_file(path: Path) -> dict[Any, Any]:
+    """Return what the YAML file of a mapping holds, unchecked.
+
+    Raises
+    ------
+    RecordingError
+        It holds no mapping.
+    """
     import yaml
 
     try:
         text = path.read_text(encoding="utf-8")
         given = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
         raise RecordingError(f"{path}: cannot be read as YAML: {error}") from error
     if not isinstance(given, dict) or not given:
         raise RecordingError(f"{path}: got {type(given).__name__}, expected a mapping with {', '.join(ROLES)}")
-    return {str(role): _role(path, str(role), entry, topics) for role, entry in given.items() if role != _LOAD_MODEL}
+    return given
 
 
-def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str] | None) -> Role:
+def _role(path: Path, role: str, entry: Any, topics: Mapping[str, TopicType] | None) -> Role:
     if role not in ROLES:
         raise RecordingError(f"{path}: got {role!r}, expected one of {', '.join(ROLES)}")
     if not isinstance(entry, dict) or not isinstance(entry.get("topic"), str):
@@ -299,33 +287,42 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, str] | None) -
     fields = entry.get("fields") or _default_fields(role, kind)
     if not fields:
         raise RecordingError(f"{path}: {role}: fields are missing, and there are no default ones for {kind}")
-    _check_columns(path, role, kind, fields)
-    return Role(
+    stamp, sequence = (
+        _path(path, role, key, entry.get(key, usual)) for key, usual in (("stamp", "header"), ("sequence", ""))
+    )
+    found = Role(
         topic,
         kind,
-        _named(path, role, "fields", fields, str),
-        _named(path, role, "scale", entry.get("scale") or {}, float),
-        _named(path, role, "offset", entry.get("offset") or {}, float),
-        str(entry.get("stamp", "header")),
+        _named(path, role, "fields", fields, _text),
+        _named(path, role, "scale", entry.get("scale") or {}, _number),
+        _named(path, role, "offset", entry.get("offset") or {}, _number),
+        stamp,
         _factors(path, role, entry.get("unit") or {}),
         _limits(path, role, entry.get("limits") or {}),
-        _choice(path, role, "stamp_unit", entry.get("stamp_unit", "s"), _STAMP_UNITS),
+        _choice(path, role, "stamp_unit", entry.get("stamp_unit", "s"), STAMP_UNITS),
         round(_clock_offset(path, role, entry.get("clock_offset", 0.0)) * 1e9),
-        str(entry.get("sequence", "")),
+        sequence,
     )
+    _check_columns(path, role, found)
+    return found
 
 
-def _check_columns(path: Path, role: str, kind: str, fields: Any) -> None:
-    """Raise a `RecordingError` for fields that are neither columns of a file of lines nor lie in one (`load.f[0]`)."""
-    if not kind.startswith("csv:") or not isinstance(fields, dict):
+def _check_columns(path: Path, name: str, role: Role) -> None:
+    """Raise a `RecordingError` for what is neither a column of a file of lines nor lies in one (`load.f[0]`)."""
+    columns = role.message_type
+    if not isinstance(columns, Columns):
         return
-    columns = kind.removeprefix("csv:").split(",")
-    for name in fields.values():
-        if name not in columns and re.split(r"[.\[]", name, maxsplit=1)[0] not in columns:
-            raise RecordingError(f"{path}: {role}: fields: got {name!r}, expected a column of {', '.join(columns)}")
+    named = [("fields", column) for column in role.fields.values()]
+    named += [("stamp", role.stamp)] if role.stamp not in ("header", "log") else []
+    named += [("sequence", role.sequence)] if role.sequence else []
+    for key, column in named:
+        if not {column, re.split(r"[.\[]", column, maxsplit=1)[0]} & set(columns.names):
+            raise RecordingError(f"{path}: {name}: {key}: got {column!r}, expected one of the {columns}")
 
 
-def _topic(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, str] | None) -> tuple[str, str]:
+def _topic(
+    path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, TopicType] | None
+) -> tuple[str, TopicType]:
     """Return name and type of a role's topic."""
     if topics is None:
         return entry["topic"], str(entry.get("type", "json"))
@@ -335,11 +332,9 @@ def _topic(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str,
     )
     if topic not in topics:
         raise RecordingError(f"{path}: {role}: topic: got {topic!r}, expected one of {', '.join(sorted(topics))}")
-    kind = str(entry.get("type", topics[topic]))
-    if topics[topic].startswith("csv"):
-        kind = topics[topic]
-    elif kind != topics[topic]:
-        raise RecordingError(f"{path}: {role}: type: got {kind!r}, but {topic} is of type {topics[topic]!r}")
+    kind = topics[topic]
+    if not isinstance(kind, Columns) and entry.get("type", kind) != kind:
+        raise RecordingError(f"{path}: {role}: type: got {entry['type']!r}, but {topic} is of type {kind!r}")
     return topic, kind
 
 
@@ -347,7 +342,7 @@ def _factors(path: Path, role: str, given: Any) -> dict[str, float]:
     """Return what takes each number to SI."""
     if isinstance(given, str):
         given = dict.fromkeys(ROLES[role], given)
-    units = _named(path, role, "unit", given, str)
+    units = _named(path, role, "unit", given, _text)
     return {
         name: UNITS[_QUANTITIES[role, name]][_choice(path, role, "unit", unit, UNITS[_QUANTITIES[role, name]])]
         for name, unit in units.items()
@@ -360,18 +355,40 @@ def _limits(path: Path, role: str, given: Any) -> dict[str, tuple[float, float]]
         given = dict.fromkeys(ROLES[role], given)
 
     def pair(value: Any) -> tuple[float, float]:
-        low, high = value if isinstance(value, list) else (-float(value), float(value))
-        if not float(low) < float(high):
+        low, high = map(_number, value) if isinstance(value, list) else (-_number(value), _number(value))
+        if not low < high:
             raise ValueError(value)
-        return float(low), float(high)
+        return low, high
 
     return _named(path, role, "limits", given, pair)
 
 
 def _choice(path: Path, role: str, key: str, given: Any, known: Mapping[str, Any]) -> str:
-    if given not in known:
+    if not isinstance(given, str) or given not in known:
         raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected one of {', '.join(known)}")
+    return given
+
+
+def _path(path: Path, role: str, key: str, given: Any) -> str:
+    """Return where something stands in a message."""
+    try:
+        return _text(given)
+    except TypeError as error:
+        expected = "expected the name of a column or a path"
+        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, {expected}") from error
+
+
+def _text(given: Any) -> str:
+    """Return a name; one of digits is an integer in YAML."""
+    if isinstance(given, bool) or not isinstance(given, str | int):
+        raise TypeError(given)
     return str(given)
+
+
+def _number(given: Any) -> float:
+    if isinstance(given, bool):
+        raise TypeError(given)
+    return float(given)
 
 
 def _clock_offset(path: Path, role: str, given: Any) -> float:
@@ -380,17 +397,25 @@ def _clock_offset(path: Path, role: str, given: Any) -> float:
     return float(given)
 
 
+_EXPECTED: Final = {
+    "fields": "names of columns, or paths",
+    "scale": "numbers",
+    "offset": "numbers",
+    "unit": "units",
+    "limits": "numbers, or pairs of smallest and largest",
+}
+
+
 def _named(path: Path, role: str, key: str, given: Any, kind: Callable[[Any], Any]) -> dict[str, Any]:
     names = ROLES[role]
-    if isinstance(given, int | float) and not isinstance(given, bool):
+    if isinstance(given, int | float) and not isinstance(given, bool) and key != "fields":
         given = dict.fromkeys(names, given)
     if not isinstance(given, dict) or not set(map(str, given)) <= set(names):
         raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected a mapping of {', '.join(names)}")
     try:
         values = {str(name): kind(value) for name, value in given.items()}
     except (TypeError, ValueError) as error:
-        expected = "numbers, or pairs of smallest and largest" if key == "limits" else f"{kind.__name__} values"
-        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected {expected}") from error
+        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected {_EXPECTED[key]}") from error
     if any(isinstance(value, float) and not math.isfinite(value) for value in values.values()):
         raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected finite numbers")
     if key == "fields" and role == "excitation" and set(values) != set(names):
@@ -398,16 +423,15 @@ def _named(path: Path, role: str, key: str, given: Any, kind: Callable[[Any], An
     return values
 
 
-def _default_fields(role: str, kind: str) -> dict[str, str]:
-    if kind.startswith("csv:"):
-        columns = kind.removeprefix("csv:").split(",")
-        return {name: name for name in ROLES[role] if name in columns}
+def _default_fields(role: str, kind: TopicType) -> dict[str, str]:
+    if isinstance(kind, Columns):
+        return {name: name for name in ROLES[role] if name in kind.names}
     if kind == "json":
         return {name: name for name in ROLES[role]}
     return _FIELDS.get((role, kind), {})
 
 
-def _guess(role: str, topics: Mapping[str, str]) -> Role | None:
+def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
     """Return the topic that a role is to be read from: by its name, else when it alone has a fitting type."""
     fitting = {}
     for topic, kind in topics.items():

@@ -7,22 +7,21 @@ as it goes. Only some chunks are in memory at a time.
 from __future__ import annotations
 
 import csv
-import math
+import re
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final, Protocol
+from typing import IO, Any, Final, Protocol, TypeAlias
 from urllib.parse import quote
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun
 from plow_twin.record.reader import run_parts
+from plow_twin.record.times import NO_TIME, STAMP_UNITS, TIMES, time_ns
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
-#: CSV has no clock; a stamp of 0 would count as missing: it starts there [ns].
-CSV_ORIGIN_NS: Final = 1_000_000_000
 _ROWS: Final = 1000
 #: Characters of a CSV file that are looked at for what parts its columns.
 _LONGEST_HEADER: Final = 65_536
@@ -31,13 +30,32 @@ _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
+class Columns:
+    """What stands in for a type where messages are lines: the names of their columns, or keys of the first one."""
+
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Return the names as a reader may tell them apart, whatever is in them."""
+        return "columns " + ", ".join(
+            ascii(name) if "," in name or not name.isprintable() else name for name in self.names
+        )
+
+
+#: The name of a ROS type, `json`, or columns.
+TopicType: TypeAlias = str | Columns
+
+
+@dataclass(frozen=True, slots=True)
 class Arrived:
-    """A message: topic, type, when it was received [ns], and its fields by path (`wrench.force.x`)."""
+    """A message: topic, when it was received [ns], and its fields by path (`wrench.force.x`)."""
 
     topic: str
-    message_type: str
+    #: `NO_TIME`: not known
     log_time_ns: int
     content: Any
+    #: a broker had kept it from before anybody listened
+    retained: bool = False
 
 
 @dataclass
@@ -53,7 +71,7 @@ class Source(Protocol):
 
     losses: Losses
 
-    def topics(self) -> dict[str, str]:
+    def topics(self) -> Mapping[str, TopicType]:
         """Return types by topic."""
 
     def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
@@ -171,7 +189,7 @@ class McapSource:
                     content = decoder.decode(messages.data(index), channel.message_type)
                     if content is not None:
                         log_time = int(messages.log_time_ns[index])
-                        yield Arrived(channel.topic, channel.message_type, log_time, content)
+                        yield Arrived(channel.topic, log_time, content)
             if not reader.finished:
                 self.losses.counts["truncated_files"] += 1
             if reader.damaged:
@@ -234,16 +252,16 @@ class SqliteSource:
                 }
                 cursor = connection.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id")
                 while rows := cursor.fetchmany(_ROWS):
-                    for number, time_ns, data in rows:
+                    for number, stamp_ns, data in rows:
                         if number not in named:
                             continue
                         name, kind = named[number]
-                        if not isinstance(data, bytes) or not isinstance(time_ns, int):
+                        if not isinstance(data, bytes) or not isinstance(stamp_ns, int):
                             self.losses.counts["undecodable"] += 1
                             continue
                         content = decoder.decode(data, kind)
                         if content is not None:
-                            yield Arrived(name, kind, time_ns, content)
+                            yield Arrived(name, stamp_ns, content)
             except (*_SQLITE_ERRORS, OverflowError):
                 self.losses.counts["truncated_files"] += 1
             finally:
@@ -251,7 +269,7 @@ class SqliteSource:
 
 
 class CsvSource:
-    """CSV files with a header line, each a topic under its name without `.csv`; times in s.
+    """CSV files with a header line, each a topic under its name without `.csv`.
 
     Columns are parted by commas, or by semicolons or tabs where the header has more of these; numbers may have decimal
     commas then, as spreadsheets write them in many countries.
@@ -260,29 +278,27 @@ class CsvSource:
     def __init__(self, parts: list[Path]) -> None:
         self.parts = parts
         self.losses = Losses()
-        #: added to all times [ns]
-        self.origin_ns = CSV_ORIGIN_NS
 
-    def topics(self) -> dict[str, str]:
-        """Return `csv` with its columns, by topic.
+    def topics(self) -> dict[str, TopicType]:
+        """Return the columns by topic.
 
         Raises
         ------
         RecordingError
             A column's name stands twice.
         """
-        found = {}
+        found: dict[str, TopicType] = {}
         for part in self.parts:
             with _open_csv(part) as stream:
                 names = [name.strip() for name in next(csv.reader(stream, delimiter=_delimiter(stream)), [])]
             twice = [name for name, count in Counter(names).items() if name and count > 1]
             if twice:
                 raise RecordingError(f"{part}: column {twice[0]!r} stands there more than once, expected one of a name")
-            found[part.stem] = "csv:" + ",".join(names)
+            found[part.stem] = Columns(tuple(names))
         return found
 
     def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
-        """Yield the rows of all files in order of time; a row without a time is counted."""
+        """Yield the rows of all files in order of the time in `t`, `time` or the first column."""
         import heapq
 
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
@@ -293,17 +309,15 @@ class CsvSource:
         try:
             with _open_csv(part) as stream:
                 delimiter = _delimiter(stream)
-                decimal = "." if delimiter == "," else ","
-                for row in csv.DictReader(stream, delimiter=delimiter):
-                    content = {
-                        str(key).strip(): _number(value, decimal) for key, value in row.items() if key is not None
-                    }
-                    time = next(iter(content.values()), math.nan)
-                    time = content.get("t", content.get("time", time))
-                    if not math.isfinite(time) or abs(time) > 4e9:
-                        self.losses.counts["without_time"] += 1
+                rows = csv.reader(stream, delimiter=delimiter)
+                names = tuple(name.strip() for name in next(rows, []))
+                place = next((names.index(name) for name in TIMES if name in names), 0)
+                for cells in rows:
+                    if not any(cells):
                         continue
-                    yield Arrived(part.stem, "csv", round(time * 1e9) + self.origin_ns, content)
+                    cells = cells if delimiter == "," else [cell.replace(",", ".") for cell in cells]
+                    time = _row_time_ns(cells[place]) if place < len(cells) else NO_TIME
+                    yield Arrived(part.stem, time, dict(zip(names, cells, strict=False)))
         except csv.Error:
             self.losses.counts["truncated_files"] += 1
 
@@ -317,11 +331,14 @@ def _delimiter(stream: IO[str]) -> str:
     """Return what parts the columns, by the header line, which is read again after that."""
     header = stream.readline(_LONGEST_HEADER)
     stream.seek(0)
-    return max(",;\t", key=header.count)
+    return delimiter_of(header)
 
 
-def _number(text: Any, decimal: str = ".") -> float:
-    try:
-        return float(text if decimal == "." else text.replace(decimal, "."))
-    except (AttributeError, TypeError, ValueError):
-        return math.nan
+def delimiter_of(header: str) -> str:
+    """Return what parts the columns of a header line: comma, semicolon or tab, the most frequent outside quotes."""
+    return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
+
+
+def _row_time_ns(cell: str) -> int:
+    """Return the time of a row for its place among those of other files: a number too large for s counts finer."""
+    return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)

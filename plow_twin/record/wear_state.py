@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -48,6 +50,13 @@ def scene_identity(scene: Scene) -> str:
     return hashlib.sha256(" ".join(float(number).hex() for number in numbers).encode()).hexdigest()[:16]
 
 
+def check_depth(depth_m: Sequence[float], scene: Scene) -> None:
+    """Raise a `ValueError` for a depth that no pad of a scene's frame can have lost."""
+    most = 0.5 * min(scene.frame.width_m, scene.frame.height_m)
+    if not all(0.0 <= depth <= most for depth in depth_m):
+        raise ValueError(f"got {list(depth_m)}, expected depths from 0 to half the frame's smaller side, {most:g} m")
+
+
 def load_wear(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None:
     """Return the saved depths [m], or None when none have been saved.
 
@@ -70,7 +79,36 @@ def load_wear(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None
                 f"{path}: {name}: got {got!r}, expected {expected!r}: the wear of another {name} is not used; "
                 "give another folder or move the file away"
             )
+    try:
+        check_depth(state.depth_m, scene)
+    except ValueError as error:
+        raise WearStateError(f"{path}: depth_m: {error}") from error
     return state.depth_m
+
+
+def claim_folder(folder: Path) -> int | None:
+    """Make sure that no other twin keeps its wear in a folder, as long as the descriptor returned is open.
+
+    None where there is no folder yet and none can be made: saving will say so.
+
+    Raises
+    ------
+    WearStateError
+        Another twin keeps its wear there: two would overwrite each other's.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(descriptor)
+        raise WearStateError(f"{folder}: another twin keeps its wear there, expected a folder for each") from None
+    except OSError:  # a file system without locks
+        pass
+    return descriptor
 
 
 def save_wear(folder: Path, state: WearState) -> None:

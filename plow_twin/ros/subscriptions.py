@@ -106,6 +106,8 @@ class Subscriptions:
         present = [bytes(publisher.endpoint_gid) for publisher in publishers]
         for gid, publisher in zip(present, publishers, strict=True):
             space = publisher.node_namespace.rstrip("/")
+            if (topic, gid) not in self._names and len(self._names) >= _MOST_PUBLISHERS:
+                self._names.pop(next(iter(self._names)))
             self._names[topic, gid] = f"{space}/{publisher.node_name} {gid.hex()}"
         return present
 
@@ -113,7 +115,7 @@ class Subscriptions:
         """Return node and identity of a publisher; of one that has gone unseen the identity alone."""
         if (topic, sender) not in self._names:
             self._present(topic)
-        return self._names.setdefault((topic, sender), sender.hex())
+        return self._names.get((topic, sender), sender.hex())
 
     def _subscribe(self, kind: type, topic: str, depth: int, take: Callable[[list[Taken]], None]) -> None:
         subscription = self._node.create_subscription(

@@ -20,6 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.cdr import schema_text
 from plow_twin.record.metadata_yaml import dump_yaml, offered
+from plow_twin.record.writer import in_free_folder
 from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
@@ -130,14 +131,14 @@ def record_topics(
     exclude: str | None,
     but: Iterable[str],
     stopped: Callable[[], bool],
-    on_started: Callable[[], object] = lambda: None,
+    on_started: Callable[[Path], object] = lambda folder: None,
 ) -> Mapping[str, Any]:
     """Record topics to a new folder until `stopped`; return what was written, lost and skipped by topic.
 
     Parameters
     ----------
     folder
-        Made for the recording.
+        Made for the recording; `<folder>_2`, ... when it holds something already.
     topics
         Names, without a namespace those of the root.
     every
@@ -155,12 +156,12 @@ def record_topics(
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = WithoutEvents("plow_twin_record", start_parameter_services=False, enable_rosout=False)
-    writer = BagWriter(folder)
+    writer = in_free_folder(folder, BagWriter)
     try:
         recorder = TopicRecorder(node, writer, wanted)
         executor = make_executor()
         executor.add_node(node)
-        on_started()
+        on_started(writer.folder)
         while not stopped():
             executor.spin_once(timeout_sec=0.1)
         executor.remove_node(node)

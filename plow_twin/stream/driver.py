@@ -97,6 +97,8 @@ class Driver:
         self.holds = 0
         #: samples that were late and have been worked in by going back
         self.rolled_back = 0
+        #: speeds along the face that could not act at their stamps
+        self.travel_misplaced = 0
         #: steady times of the latest resets [ns], and of the latest one refused
         self._resets_ns: deque[int] = deque()
         self._unsteady_ns: int | None = None
@@ -138,7 +140,7 @@ class Driver:
                 yield from self._use(run, now_ns)
                 run = []
             if verdict.resets:
-                self._restart_model(stamp_ns, verdict.value, now_ns)
+                self._restart_model(stamp_ns, verdict.value, None if self.intake.returned else now_ns)
             if self._newest_ns is None or stamp_ns > self._newest_ns:
                 self._newest_ns = stamp_ns
             self._received_ns, self._zeroed = now_ns, False
@@ -196,7 +198,18 @@ class Driver:
         return self._advance(Hold(stamp_ns), now_ns, StreamState.RUNNING)
 
     def travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Take over the speed along the face [m/s]; its sign is a direction, which wears alike."""
+        """Take over the speed along the face [m/s]; its sign is a direction, which wears alike.
+
+        One whose stamp is further ahead than `jump_forward_s`, or older than all that is remembered, is of another
+        clock: it acts from the time reached on, and is counted.
+        """
+        reached_ns, oldest_ns = self.session.stamp_ns, self.session.history.oldest_ns
+        if reached_ns is not None:
+            ahead = stamp_ns - reached_ns > self.intake.jump_forward_s * NS_PER_S
+            if ahead or (oldest_ns is not None and stamp_ns <= oldest_ns):
+                self.travel_misplaced += 1
+            if ahead:
+                stamp_ns = reached_ns
         self.session.apply(Travel(stamp_ns, speed_m_s))
 
     def parameter(self, name: str, value: ParameterValue) -> None:
@@ -288,7 +301,7 @@ class Driver:
         return len(self._resets_ns) < _MOST_RESETS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
-        """Reset the model; what was asked for (`now_ns` None) does not count against the limit."""
+        """Reset the model; what was asked for, and a return (`now_ns` None), do not count against the limit."""
         if now_ns is not None:
             self._resets_ns.append(now_ns)
         self.session.apply(Reset(stamp_ns, reason))
@@ -313,6 +326,7 @@ class Driver:
                 publication = self.due()
                 if publication is not None:
                     yield publication
+            self._find_newest()
             return
         for series in self.session.apply_samples(samples):
             self._advanced(now_ns)
@@ -320,9 +334,15 @@ class Driver:
             for status in series.status[-1:] if not series.status.any() else series.status:
                 self._judge_advance(Status(int(status)), StreamState.RUNNING)
             self._give_up_after_failures(now_ns)
+        self._find_newest()
         publication = self.due() if self.every_sample else None
         if publication is not None:
             yield publication
+
+    def _find_newest(self) -> None:
+        """Let silence be seen after a reset between two samples of one batch."""
+        if self._newest_ns is None:
+            self._newest_ns = self.session.stamp_ns
 
     def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Publication | None:
         advance = self.session.apply(entry)
@@ -375,6 +395,7 @@ def counters(driver: Driver) -> dict[str, int]:
         "jumps_forward": intake.counts[Verdict.JUMP_FORWARD],
         "out_of_plane": intake.out_of_plane,
         "holds": driver.holds,
+        "travel_misplaced": driver.travel_misplaced,
         "resets": driver.resets,
         "solver_failures": driver.failures,
     }

@@ -106,9 +106,14 @@ class History:
         return not self._snapshots or newest_ns // self._spacing_ns != self._snapshots[-1][0] // self._spacing_ns
 
     def add_travel(self, travel: Travel) -> None:
-        """Take in a speed that has been applied."""
-        if self._span_ns:
-            self._travels.insert(bisect_right([item.stamp_ns for item in self._travels], travel.stamp_ns), travel)
+        """Take in a speed that has been applied; of those with one stamp the last one counts."""
+        if not self._span_ns:
+            return
+        place = bisect_right(self._travels, travel.stamp_ns, key=lambda item: item.stamp_ns)
+        if place and self._travels[place - 1].stamp_ns == travel.stamp_ns:
+            place -= 1
+            del self._travels[place]
+        self._travels.insert(place, travel)
 
     def add_snapshot(self, stamp_ns: int, data: bytes) -> None:
         """Take in the state at `stamp_ns`, and forget what is older than the time remembered."""

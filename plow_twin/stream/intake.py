@@ -99,6 +99,10 @@ class Intake:
         self.out_of_plane = 0
         self._newest_ns: int | None = None
         self._newest_values: Sequence[float] = ()
+        #: newest stamp before the last jump [ns]
+        self._before_jump_ns: int | None = None
+        #: whether the last sample judged jumped back to where the stamps were before a jump: what was between was wrong
+        self.returned = False
         #: samples missing up to the last jump; since then: first stamp, samples used
         self._missing_before = 0
         self._first_ns = 0
@@ -143,10 +147,12 @@ class Intake:
         history
             What a late sample can be worked into.
         may_reset
-            Whether a step of the sender's clock may reset the model now.
+            Whether a step of the sender's clock may reset the model now; to where the stamps were before the last one
+            it always may, or a single wrong stamp could keep all right ones out.
         """
         verdict = self._judge(stamp_ns, values, reached_ns, history)
-        if verdict.resets and not may_reset:
+        self.returned = verdict.resets and self._goes_on_from_before(stamp_ns)
+        if verdict.resets and not (may_reset or self.returned):
             verdict = Verdict.UNSTEADY
         self.counts[verdict] += 1
         if not verdict.used:
@@ -154,6 +160,8 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
+            # what was between is no line to go back to
+            self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
             self._newest_ns, self._newest_values = stamp_ns, values
@@ -196,6 +204,10 @@ class Intake:
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:
             return Verdict.DUPLICATE if stamp_ns in history else Verdict.WORKED_IN
         return Verdict.LATE if self._newest_ns is None or stamp_ns > newest_ns else Verdict.OUT_OF_ORDER
+
+    def _goes_on_from_before(self, stamp_ns: int) -> bool:
+        before_ns = self._before_jump_ns
+        return before_ns is not None and 0 < stamp_ns - before_ns <= self.jump_forward_s * NS_PER_S
 
     def _too_fast(self, stamp_ns: int, values: Sequence[float]) -> bool:
         if self.limits is None or self._newest_ns is None:

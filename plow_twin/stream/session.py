@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from bisect import insort
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.scene import check_travel_speed
 from plow_twin.stream.history import History
 from plow_twin.stream.journal import (
     Digest,
@@ -145,7 +147,8 @@ class Session:
                 return self.apply_sample(entry)[-1]
             case Hold() | Unload():
                 return self._apply_hold(entry)
-            case Travel():
+            case Travel(_, speed):
+                check_travel_speed(self.twin.scene, speed)
                 self._on_entry(entry)
                 self._apply_travel(entry)
             case Reset():
@@ -270,7 +273,7 @@ class Session:
 
     def check_model(self, changes: Mapping[str, float]) -> None:
         """Raise an `ArgumentError` when the model cannot be changed so while it runs."""
-        changed_twin(self.twin, self._scene, changes)
+        self._changed_twin(changes)
 
     def take_error_estimate(self) -> float:
         """Return the largest error [m] that `max_evaluations` is estimated to have made since the last call."""
@@ -431,7 +434,7 @@ class Session:
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
-            self._travels = sorted([*self._travels, travel], key=lambda item: item.stamp_ns)
+            insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
         elif travel.stamp_ns <= oldest_ns:
@@ -481,7 +484,7 @@ class Session:
     def _change_model(self, changes: dict[str, float]) -> None:
         """Go on with other numbers of the scene; the contacts begin anew, what is remembered is forgotten."""
         before, speed = self.twin, 0.0 if self.held else self._speed
-        self.twin = changed_twin(before, self._scene, changes)
+        self.twin = self._changed_twin(changes)
         self._carry(before)
         self.changes = changes
         if self._wears:
@@ -489,6 +492,13 @@ class Session:
         self.outputs.set_scene(self.twin.scene)
         self.outputs.clear_shift()
         self._forget()
+
+    def _changed_twin(self, changes: Mapping[str, float]) -> Twin:
+        """Return a twin of other numbers that can go on at the speeds that are set and to come."""
+        found = changed_twin(self.twin, self._scene, changes)
+        for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
+            check_travel_speed(found.scene, speed)
+        return found
 
     def _carry(self, before: Twin) -> None:
         """Begin with pose, rates, load and time of another twin; the wear is the present one."""

@@ -42,6 +42,8 @@ class Feeder:
         #: stamp of the newest sample handed over [ns]
         self.newest_ns = 0
         self._number = 0
+        #: whether the sender has told a number
+        self._counts = False
         self._sender = 0
         self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
         inputs = runtime.inputs
@@ -74,11 +76,14 @@ class Feeder:
         return f"{self._source}#{self._sender}".encode() if self._sender else self._source.encode()
 
     def _sample(self, role: Role, arrived: Arrived) -> list[Arrival]:
-        sender, number, again = self._numbered(role, arrived)
         intake = self._runtime.driver.intake
         found = role.read(arrived)
         stamp_ns, values = (0, {}) if found is None else found
         numbers = tuple(values.values())
+        if arrived.retained:
+            intake.refuse(Verdict.INACTIVE, stamp_ns, numbers)
+            return []
+        sender, number, again = self._numbered(role, arrived)
         if again:
             intake.refuse(Verdict.DUPLICATE, stamp_ns, numbers)
             return []
@@ -94,6 +99,9 @@ class Feeder:
             intake.refuse(Verdict.MALFORMED, stamp_ns, numbers)
             return []
         wrench, deviation = load
+        absurd = intake.limits is not None and intake.limits.exceeded(wrench)
+        if absurd or not all(map(math.isfinite, (*wrench, *deviation))):
+            return [(stamp_ns, wrench)]  # will not be used, and its deviation is none of the others'
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
             self._runtime.driver.spread(stamp_ns, deviation)
@@ -105,6 +113,12 @@ class Feeder:
         if number is None:
             # unreadable, or not numbered: it is the one that follows
             number = self._number + 1
+        elif not self._counts:
+            self._counts = True
+            if self._number:  # those before had no numbers: they tell nothing of this one's
+                self._sender += 1
+                self._runtime.inputs.senders.start([self._name])
+                self._runtime.inputs.senders.alive([self._name])
         elif number < self._number - _RESTART or (number <= 1 < self._number):
             self._sender += 1
             self._runtime.inputs.senders.alive([self._name])
@@ -116,6 +130,8 @@ class Feeder:
         inputs.arriving = (name, arrived.topic.encode())
         if found is None:
             intake.refuse(Verdict.MALFORMED)
+        elif arrived.retained and name != "travel":  # a speed holds until the next one
+            intake.refuse(Verdict.INACTIVE, found[0], tuple(found[1].values()))
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))
         elif name == "travel":

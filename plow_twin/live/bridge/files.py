@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 import os
 import select
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -13,8 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.live.bridge.source import BridgeError, Lines, Rows
-from plow_twin.record.mapping import TIMES, time_ns
-from plow_twin.record.sources import Arrived
+from plow_twin.record.sources import Arrived, Columns, TopicType
+from plow_twin.record.times import TIMES, time_ns
 
 #: Most bytes read from a source at once.
 _BLOCK: Final = 1 << 18
@@ -33,9 +34,8 @@ class _Tail:
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    _inode: int = 0
-    #: read further, past a last line without newline
-    whole: bool = False
+    #: half lines that no end came for: the file was cut or replaced
+    left: int = 0
 
     @property
     def topic(self) -> str:
@@ -44,24 +44,36 @@ class _Tail:
     def read(self) -> list[Arrived]:
         """Return the messages of the next block."""
         data = self._block()
-        if not data and not self.whole:
-            return []
-        lines = self.lines.add(data) if data else self.lines.end()
+        lines = [None] * self.left + (self.lines.add(data) if data else [])
+        self.left = 0
         return messages(self.topic, lines, self.rows)
 
     def _block(self) -> bytes:
-        try:
-            found = os.stat(self.path)
-        except FileNotFoundError:
-            return b""
-        if self._file is None or found.st_ino != self._inode or found.st_size < self._file.tell():
-            rest = b"" if self._file is None or found.st_size < self._file.tell() else self._file.read(_BLOCK)
+        if self._file is None or self._is_another():
+            cut = self._file is not None and os.fstat(self._file.fileno()).st_size < self._file.tell()
+            rest = b"" if self._file is None or cut else self._file.read(_BLOCK)
             if rest:  # what the writer left in the one that was moved away
                 return bytes(rest)
+            try:
+                file = self.path.open("rb")
+            except FileNotFoundError:
+                return b""
             self.close()
-            self._file, self._inode = self.path.open("rb"), found.st_ino
-            self.lines, self.rows = Lines(), Rows()
+            self._file = file
+            self.rows = self.rows.of_another_file()
+            # half a line that was left there: a number in it may have been cut
+            self.left += self.lines.begun
+            self.lines = Lines()
         return bytes(self._file.read(_BLOCK))
+
+    def _is_another(self) -> bool:
+        """Tell whether the file was cut, or another one stands at its path."""
+        try:
+            found = self.path.stat()
+        except FileNotFoundError:
+            return False  # until there is another, the one that was moved away may grow
+        ours = os.fstat(self._file.fileno())
+        return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or found.st_size < self._file.tell()
 
     def close(self) -> None:
         if self._file is not None:
@@ -76,7 +88,7 @@ def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]
     for line in lines:
         content = rows.read(line)
         if content is not False:
-            found.append(Arrived(topic, "csv", now_ns, content))
+            found.append(Arrived(topic, now_ns, content))
     return found
 
 
@@ -101,21 +113,22 @@ class Files:
         self.finished = False
         self.connected = True
         self.lost = 0
-        self._tails = [_Tail(path, whole=not follow) for path in paths]
+        self.trouble = ""
+        self._tails = [_Tail(path) for path in paths]
         for tail in self._tails:
             if not tail.path.is_file():
                 raise BridgeError(f"{tail.path}: no such file")
         self._merged: Iterator[Arrived] | None = None
 
-    def topics(self) -> dict[str, str]:
+    def topics(self) -> dict[str, TopicType]:
         """Return columns by topic, by the first line of each file."""
-        found = {}
+        found: dict[str, TopicType] = {}
         for tail in self._tails:
             rows = Rows()
             with tail.path.open("rb") as stream:
                 while rows.columns is None and (line := stream.readline(_BLOCK)):
                     rows.read(line)
-            found[tail.topic] = "csv:" + ",".join(rows.columns or ())
+            found[tail.topic] = Columns(tuple(rows.columns or ()))
         return found
 
     def start(self, topics: list[str]) -> None:
@@ -169,22 +182,31 @@ class _InOrder:
 
 
 class StandardInput:
-    """Lines on standard input, or on another descriptor; they end with it."""
+    """Lines on standard input, or on another descriptor; they end with it.
+
+    Raises
+    ------
+    BridgeError
+        It is closed.
+    """
 
     def __init__(self, descriptor: int = 0) -> None:
+        if descriptor == 0 and sys.stdin is None:
+            raise BridgeError("-: got a closed standard input, expected lines")
         self.ends = False
         self.finished = False
         self.connected = True
         self.lost = 0
+        self.trouble = ""
         self._descriptor = descriptor
         self._lines, self._rows = Lines(), Rows()
         self._first: list[Arrived] = []
 
-    def topics(self) -> dict[str, str]:
+    def topics(self) -> dict[str, TopicType]:
         """Wait for the first line, and return its columns."""
         while self._rows.columns is None and not self.finished:
             self._first += self._read(1.0)
-        return {STDIN_TOPIC: "csv:" + ",".join(self._rows.columns or ())}
+        return {STDIN_TOPIC: Columns(tuple(self._rows.columns or ()))}
 
     def start(self, topics: list[str]) -> None:
         """Take note of nothing: there is one topic."""
@@ -197,10 +219,13 @@ class StandardInput:
         return self._read(timeout_s)
 
     def _read(self, timeout_s: float) -> list[Arrived]:
-        ready, _, _ = select.select([self._descriptor], [], [], timeout_s)
-        if not ready:
-            return []
-        data = os.read(self._descriptor, _BLOCK)
+        try:
+            ready, _, _ = select.select([self._descriptor], [], [], timeout_s)
+            if not ready:
+                return []
+            data = os.read(self._descriptor, _BLOCK)
+        except OSError as error:
+            raise BridgeError(f"-: standard input cannot be read: {error.strerror}") from error
         self.finished = not data
         lines = self._lines.add(data) if data else self._lines.end()
         return messages(STDIN_TOPIC, lines, self._rows)

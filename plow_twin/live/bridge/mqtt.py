@@ -60,13 +60,16 @@ class Mqtt:
         self.finished = False
         self.connected = False
         self.lost = 0
+        self.trouble = ""
         self._access, self._connect_s = access, connect_s
         self.host, self.port, tls = _address(access)
         self._topics: list[str] = []
-        self._queue: deque[tuple[str, bytes, int]] = deque()
+        self._subscribed = False
+        #: whether what the broker calls retained was sent before anybody listened
+        self._from_before = True
+        self._queue: deque[tuple[str, bytes, int, bool]] = deque()
         self._arrived = threading.Event()
         self._answer = threading.Event()
-        self._refusal = ""
         self._client = self._make_client(tls)
 
     def topics(self) -> None:
@@ -75,15 +78,20 @@ class Mqtt:
 
     def start(self, topics: list[str]) -> None:
         """Connect and subscribe."""
+        for topic in topics:
+            if any(sign in topic for sign in "+#") or not topic:
+                raise BridgeError(f"topic: got {topic!r}, expected one topic, without + and #")
         self._topics = topics
         try:
             self._client.connect(self.host, self.port)
         except (OSError, ValueError) as error:
             raise BridgeError(f"{self._access.url}: no broker at {self.host}:{self.port}: {error}") from error
         self._client.loop_start()
-        if not self._answer.wait(self._connect_s) or self._refusal:
+        answered = self._answer.wait(self._connect_s)
+        trouble = self.trouble if answered else f"no answer within {self._connect_s:g} s"
+        if trouble:
             self.close()
-            raise BridgeError(f"{self._access.url}: {self._refusal or f'no answer within {self._connect_s:g} s'}")
+            raise BridgeError(f"{self._access.url}: {trouble}")
 
     def poll(self, timeout_s: float) -> list[Arrived]:
         """Return what has arrived."""
@@ -91,7 +99,7 @@ class Mqtt:
             self._arrived.wait(timeout_s)
         self._arrived.clear()
         taken = [self._queue.popleft() for _ in range(len(self._queue))]
-        return [Arrived(topic, "json", time_ns, read_json(payload)) for topic, payload, time_ns in taken]
+        return [Arrived(topic, time_ns, read_json(payload), retained) for topic, payload, time_ns, retained in taken]
 
     def close(self) -> None:
         """Leave the broker; it keeps what comes until the session is resumed."""
@@ -116,25 +124,38 @@ class Mqtt:
             except (OSError, ValueError) as error:
                 raise BridgeError(f"{access.url}: the files of TLS cannot be used: {error}") from error
         client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
-        client.on_message = self._on_message
+        client.on_subscribe, client.on_message = self._on_subscribe, self._on_message
         return client
 
     def _on_connect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
         if reason.is_failure:
-            self._refusal = f"refused: {reason}"
+            self.trouble = f"refused: {reason}"
+            self._answer.set()
+            return
+        # in a session that goes on brokers may send what they kept for it as retained too
+        self._from_before = not flags.session_present
+        if self._subscribed and flags.session_present:
+            self.connected, self.trouble = True, ""
         else:
-            self.connected = True
             client.subscribe([(topic, 1) for topic in self._topics])
+
+    def _on_subscribe(self, client: Any, data: Any, number: Any, reasons: Any, properties: Any) -> None:
+        refused = [
+            f"{topic}: {reason}" for topic, reason in zip(self._topics, reasons, strict=False) if reason.is_failure
+        ]
+        self.connected = self._subscribed = not refused
+        self.trouble = f"refused: {'; '.join(refused)}" if refused else ""
         self._answer.set()
 
     def _on_disconnect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
         self.connected = False
+        self.trouble = self.trouble or f"the connection broke: {reason}; it is tried again"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
         if len(self._queue) >= _QUEUE:
             self.lost += 1
             return
-        self._queue.append((message.topic, message.payload, time.time_ns()))
+        self._queue.append((message.topic, message.payload, time.time_ns(), message.retain and self._from_before))
         self._arrived.set()
 
 

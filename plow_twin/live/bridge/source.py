@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Final, Protocol
 
 from plow_twin.errors import PlowTwinError
-from plow_twin.record.sources import Arrived
+from plow_twin.record.sources import Arrived, TopicType, delimiter_of
 
 #: A longer line or payload is none of a sensor's [B].
 LONGEST: Final = 65536
@@ -30,14 +30,17 @@ class Bridge(Protocol):
     connected : bool
     lost : int
         Messages that could not be kept until they were read.
+    trouble : str
+        Why nothing comes just now; empty: it may.
     """
 
     ends: bool
     finished: bool
     connected: bool
     lost: int
+    trouble: str
 
-    def topics(self) -> Mapping[str, str] | None:
+    def topics(self) -> Mapping[str, TopicType] | None:
         """Return types by topic; None: any topic that the mapping names."""
 
     def start(self, topics: list[str]) -> None:
@@ -79,6 +82,11 @@ class Lines:
             self._rest, self._skipping = b"", True
         return found
 
+    @property
+    def begun(self) -> bool:
+        """Whether a line has begun and not ended."""
+        return self._skipping or bool(self._rest)
+
     def end(self) -> list[bytes | None]:
         """Return what is left at the end, where the last line may lack its newline."""
         rest, self._rest = self._rest, b""
@@ -93,34 +101,56 @@ class Rows:
         self.columns: list[str] | None = None
         self._json = False
         self._delimiter = ","
+        #: columns of the file in whose place this one stands
+        self._before: list[str] | None = None
+
+    def of_another_file(self) -> Rows:
+        """Return what reads a file that takes this one's place: under its own header, without one under this one's."""
+        rows = Rows()
+        rows._before = self.columns
+        return rows
 
     def read(self, line: bytes | None) -> dict[str, Any] | bool | None:
         """Return the content of a line: None where it is unreadable, False where it says nothing (header, empty)."""
         if line is None:
             return None
-        line = line.strip(b"\r \t\xef\xbb\xbf")
-        if not line or line.startswith(b"#"):
+        line = line.strip(b"\r \xef\xbb\xbf")  # not tabs: empty cells may stand between them
+        if not line.strip() or line.startswith(b"#"):
             return False
-        if self.columns is None and line.startswith(b"{"):
+        if self.columns is None and (self._json or line.startswith(b"{")):
             self._json = True
-            self.columns = list(read_json(line) or {})
+            self.columns = list(read_json(line) or ()) or None  # an object that is cut or empty has no keys to tell
         if self._json:
             return read_json(line)
         cells = self._cells(line)
         if cells is None:
             return None
         if self.columns is None:
-            self.columns = [cell.strip() for cell in cells]
-            return False
+            if self._before is None or not any(map(_is_number, cells)):
+                self.columns = [cell.strip() for cell in cells]
+                return False
+            self.columns = self._before
         if [cell.strip() for cell in cells] == self.columns:
             return False  # a file that goes on under its header again
-        return dict(zip(self.columns, cells, strict=True)) if len(cells) == len(self.columns) else None
+        if len(cells) != len(self.columns):
+            return None
+        if self._delimiter != ",":  # decimal commas
+            cells = [cell.replace(",", ".") for cell in cells]
+        return dict(zip(self.columns, cells, strict=True))
 
     def _cells(self, line: bytes) -> list[str] | None:
         text = line.decode(errors="replace")
         if self.columns is None:
-            self._delimiter = max(",;\t", key=text.count)
+            self._delimiter = delimiter_of(text)
         try:
             return next(csv.reader([text], delimiter=self._delimiter, strict=True), None)
         except csv.Error:
             return None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,53 @@
+"""The times in messages and rows: numbers of some unit, or dates."""
+
+from __future__ import annotations
+
+import re
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
+
+#: Columns and keys that hold the time where the mapping names none.
+TIMES: Final = ("t", "time")
+#: Units of a time, in ns.
+STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+#: Of a message that has no time [ns].
+NO_TIME: Final = -1
+NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+#: Times below this are no times of the epoch, but count from some start [s]: they are moved away from 0, which stands
+#: for a missing stamp.
+_EPOCH_S: Final = 1e9
+_ORIGIN_NS: Final = 1_000_000_000
+
+
+def time_ns(value: Any, unit: str = "s") -> int | None:
+    """Return the stamp [ns] that a number, or a text after ISO 8601 (UTC unless it says otherwise), stands for.
+
+    None when it stands for none.
+    """
+    if isinstance(value, str):
+        value = value.strip()
+        # a number first: 20260102 would be a date too
+        if value.isascii() and value.isdigit() and len(value) < 20:
+            value = int(value)
+        elif NUMBER.fullmatch(value):
+            value = float(value)
+        else:
+            return _date_ns(value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
+        return None
+    scale = STAMP_UNITS[unit]
+    # integers keep their nanoseconds; a float of today's date holds some 0.2 us
+    stamp_ns = value * scale if isinstance(value, int) else round(value * scale)
+    if abs(stamp_ns) > 4e18:
+        return None
+    return stamp_ns if stamp_ns >= _EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
+
+
+def _date_ns(text: str) -> int | None:
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    time = time if time.tzinfo else time.replace(tzinfo=UTC)
+    return (time - _EPOCH) // timedelta(microseconds=1) * 1000
