@@ -143,6 +143,15 @@ def test_view_refuses_what_cannot_be_drawn(run: Run, tmp_path: Path) -> None:
     assert refused.returncode == 1 and "excitation_source" in refused.stderr
 
 
+def test_view_names_a_port_that_is_taken(run: Run, tmp_path: Path) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        refused = plow_twin("view", run.folder, "--out", tmp_path / "x.rrd", "--web", "--web-port", str(port))
+    assert refused.returncode == 1 and f"web port: got {port}" in refused.stderr and "serving" not in refused.stdout
+
+
 @pytest.fixture(scope="module")
 def served(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The address that `view --web` names, while it serves."""

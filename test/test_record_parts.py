@@ -97,14 +97,41 @@ def test_a_recording_that_is_being_written_is_not_repaired(tmp_path: Path) -> No
 
 def test_a_damaged_chunk_is_left_out_by_a_repair_and_the_gap_is_named(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
-    data = bytearray(run.file.read_bytes())
-    start, length = chunk_spans(run.file)[2]
-    data[start + length // 2] ^= 0xFF
-    run.file.write_bytes(data)
-    assert repair(run.folder) == [run.file] and (run.folder / "run_0.mcap.damaged").exists()
-    report = examine(run.folder)
-    assert report.parts[0].healthy and report.entries[Sample.__name__] <= COUNT
-    assert replay(run.folder).divergences == 0
+    whole, spans = run.file.read_bytes(), chunk_spans(run.file)
+    assert len(spans) > 6
+    for start, length in spans[2:6]:  # of the journal and of outputs
+        data = bytearray(whole)
+        data[start + length // 2] ^= 0xFF
+        run.file.write_bytes(data)
+        before = replay(run.folder)
+        assert repair(run.folder) == [run.file] and (run.folder / "run_0.mcap.damaged").exists()
+        report, after = examine(run.folder), replay(run.folder)
+        assert report.parts[0].healthy and report.entries[Sample.__name__] <= COUNT
+        assert "run_0.mcap: 1 chunk(s) left out by a repair" in report.problems and repair(run.folder) == []
+        assert (after.exit_code, after.divergences) == (3, 0) == (before.exit_code, before.divergences)
+        assert after.messages_compared == before.messages_compared
+
+
+def test_what_other_programs_would_stumble_over_is_named_and_repaired(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(100)))
+    listing = run.folder / "metadata.yaml"
+    good = listing.read_text()
+    for text, problem in (
+        ("{{", "metadata.yaml: cannot be read"),
+        ("", "metadata.yaml: cannot be read"),
+        (good.replace("run_0.mcap", "run_7.mcap"), "run_7.mcap is missing"),
+    ):
+        listing.write_text(text)
+        assert any(problem in one for one in examine(run.folder).problems)
+        assert repair(run.folder) == [] and examine(run.folder).problems == []
+        with AnyReader([run.folder]) as reader:
+            assert reader.message_count
+    with run.file.open("ab") as stream:
+        stream.write(b"x" * 100)
+    assert examine(run.folder).problems == ["run_0.mcap: 100 B behind its end"]
+    assert repair(run.folder) == [run.file] and examine(run.folder).problems == []
+    with AnyReader([run.folder]) as reader:
+        assert reader.message_count
 
 
 def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:

@@ -16,9 +16,10 @@ from typing import Any
 import pytest
 from record_support import paper_sample, record_run
 
+from plow_twin.errors import RecordingError
 from plow_twin.stream.journal import Entry
 from plow_twin.study.analysis.many import analyse_many
-from plow_twin.study.analysis.task import Task, analyse_task
+from plow_twin.study.analysis.task import Task, analyse_task, names_apart
 
 RUNS = 4
 PAPER = Path("paper")
@@ -39,6 +40,11 @@ def tasks(runs: Path, out: Path) -> list[Task]:
     return [Task(path, PAPER, None, (), out / path.name) for path in sorted(runs.iterdir())]
 
 
+def workers_of(process: subprocess.Popen[str]) -> list[str]:
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    return [pid for pid in children if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
+
+
 def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "plow_twin", "analyse", str(runs), "--scene", "paper", "--out", str(out)]
@@ -46,9 +52,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(run
         deadline = time.monotonic() + 120
         while not list(out.glob("*/asked.json")) and time.monotonic() < deadline:
             time.sleep(0.01)
-        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-        workers = [pid for pid in children if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
-        os.kill(int(workers[0]), signal.SIGKILL)
+        os.kill(int(workers_of(process)[0]), signal.SIGKILL)
         report = json.loads(process.communicate(timeout=200)[0])
     assert process.returncode == 0
     assert [facts["input"]["samples_used"] for facts in report["runs"]] == [2000 + n for n in range(RUNS)]
@@ -62,6 +66,27 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(run
     assert again["input"] == report["runs"][2]["input"] and tasks(runs, out)[2].stored() is not None
     other = Task(runs / "r0", Path("paper_best_fit"), None, (), out / "r0")
     assert other.stored() is None
+
+
+def test_an_interrupt_ends_the_call_and_its_workers_at_once(tmp_path: Path) -> None:
+    for number in range(2):  # some minutes of work each
+        (tmp_path / "runs" / f"r{number}").mkdir(parents=True)
+        rows = (f"{60 * i},{','.join(map(str, paper_sample(60_000 * i).wrench))}" for i in range(2000))
+        (tmp_path / "runs" / f"r{number}" / "load.csv").write_text("t,fx,fy,m\n" + "\n".join(rows))
+    command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "runs"), "--scene", "paper"]
+    command += ["--out", str(tmp_path / "out"), "--workers", "2"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        while len(list(tmp_path.glob("out/*/run/run_0.mcap"))) < 2:
+            assert process.poll() is None
+            time.sleep(0.05)
+        workers = workers_of(process)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        said = process.communicate(timeout=20)[1]
+    assert process.returncode == 1 and "interrupted" in said and "Traceback" not in said
+    assert len(workers) == 2
+    for pid in workers:  # gone, or dead and not yet taken note of
+        status = Path(f"/proc/{pid}/status")
+        assert not status.exists() or "State:\tZ" in status.read_text()
 
 
 @pytest.mark.stress
@@ -97,3 +122,31 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     writer.join()
     assert process.returncode == 0 and last["lost"] == {}
     assert 0 < first["input"]["samples_used"] <= 2000 and last["input"]["samples_used"] == 4000
+
+
+def test_recordings_of_one_name_have_results_of_their_own(tmp_path: Path) -> None:
+    files = [tmp_path / "a" / "load.csv", tmp_path / "a" / "load.mcap", tmp_path / "a" / "pose.csv"]
+    folders = [tmp_path / "jan" / "1" / "run", tmp_path / "feb" / "1" / "run", tmp_path / "run.1", tmp_path / "run.2"]
+    for folder in folders:
+        folder.mkdir(parents=True)
+    (tmp_path / "a").mkdir()
+    for file in files:
+        file.touch()
+    names = names_apart([*files, *folders])
+    assert names == ["load.csv", "load.mcap", "pose", "jan_1_run", "feb_1_run", "run.1", "run.2"]
+
+
+def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(runs: Path, tmp_path: Path) -> None:
+    task = Task(runs / "r0", PAPER, None, (), tmp_path / "out")
+    first = task.run()
+    assert task.stored() == first
+    half = tmp_path / "out" / "run" / "run_0.mcap"
+    half.write_bytes(half.read_bytes()[:-4000])
+    other = Task(runs / "r1", PAPER, None, (), tmp_path / "out")
+    other.clear()  # as one that is interrupted later
+    assert task.stored() is None and not half.exists()
+    assert task.run()["loads"] == first["loads"]
+    recorded = record_run(tmp_path / "mine" / "run", map(paper_sample, range(10))).file
+    with pytest.raises(RecordingError, match="exists already"):
+        Task(runs / "r0", PAPER, None, (), tmp_path / "mine").run()
+    assert recorded.exists()

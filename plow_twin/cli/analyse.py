@@ -55,7 +55,7 @@ def analyse(
 ) -> int:
     """Analyse recordings: runs of ours, MCAP, rosbag2's sqlite3, CSV, or folders of them."""
     from plow_twin.study.analysis.analyse import expand
-    from plow_twin.study.analysis.task import Task
+    from plow_twin.study.analysis.task import Task, names_apart
 
     if watch is not None:
         if len(recordings) != 1:
@@ -70,11 +70,12 @@ def analyse(
     for path in recordings:
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    found = expand(recordings)
+    found = list(dict.fromkeys(expand(recordings)))
     many = len(found) > 1 or found != list(recordings)
     extra = tuple(Path(name) for name in others)
     scene_file = Path(scene) if scene else None
-    tasks = [Task(path, scene_file, mapping, extra, _out(out, path, many)) for path in found]
+    folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
+    tasks = [Task(path, scene_file, mapping, extra, folder) for path, folder in zip(found, folders, strict=True)]
     results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
@@ -86,26 +87,10 @@ def analyse(
     return FAILED if failed else DONE_WITH_LOSS if lossy else DONE
 
 
-def _out(out: Path | None, path: Path, many: bool) -> Path | None:
-    return out / path.stem if out is not None and many else out
-
-
 def _alone(task: Any, quiet: bool) -> dict[str, Any]:
-    from plow_twin.study.analysis.analyse import analyse as run
-    from plow_twin.study.analysis.report import write_report
-
     with progress("analysing", quiet) as on_progress:
-        found = run(
-            task.path,
-            scene=task.scene,
-            mapping=task.mapping,
-            others=task.others,
-            out=task.out,
-            on_progress=on_progress,
-        )
-    if task.out is not None:
-        write_report(found, task.out)
-    return {**found.facts(), "lossy": found.lossy}
+        facts: dict[str, Any] = task.stored() or task.run(on_progress)
+    return facts
 
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:

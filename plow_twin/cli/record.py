@@ -41,18 +41,17 @@ def record(
         raise click.UsageError("got no topic, expected some or --all")
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels: where the types' texts stand
     from plow_twin.cli.interruption import interruptible
-    from plow_twin.record.bag import new_beside_folder
     from plow_twin.record.reader import RunReader
     from plow_twin.record.running import running_run
-    from plow_twin.record.writer import free_folder
+    from plow_twin.record.writer import BESIDE, free_folder
     from plow_twin.ros.topic_recorder import record_topics
 
     with interruptible() as stopped:
         present = running_run(run, wait, stopped)
         own = {*RunReader(present).header.topics.values()} if present is not None else set()
-        folder = new_beside_folder(present or free_folder(run))
+        folder = (present or free_folder(run)) / BESIDE
 
-        def say() -> None:
+        def say(folder: Path) -> None:
             if not quiet:
                 click.echo(f"recording to {folder} until interrupted", err=True)
 

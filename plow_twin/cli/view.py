@@ -126,10 +126,10 @@ def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> in
 
 def _serve(file: Path, port: int) -> int:
     """Serve a .rrd with the viewer's own program on the loopback address until it is interrupted."""
-    from plow_twin.view.viewer import LOOPBACK, free_port, page_address, viewer_program
+    from plow_twin.view.viewer import LOOPBACK, free_port, page_address, page_port, viewer_program
 
     program, data_port = viewer_program(), free_port()
-    port = port or free_port()
+    port = page_port(port)
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()

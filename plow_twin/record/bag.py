@@ -11,7 +11,7 @@ from typing import Final
 from plow_twin.build import package_version
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, write_metadata
-from plow_twin.record.writer import BESIDE, free_folder, make_folder, shortage
+from plow_twin.record.writer import BESIDE, make_folder, shortage
 
 _CHUNK_SIZE: Final = 2**20
 _MIN_FREE_BYTES: Final = 64 * 1024 * 1024
@@ -103,8 +103,3 @@ class BagWriter:
 def beside_folders(run: Path) -> Sequence[Path]:
     """Return the folders in a run's folder with what was recorded beside it."""
     return sorted(path for path in run.glob(f"{BESIDE}*") if path.is_dir() and any(path.glob("*.mcap")))
-
-
-def new_beside_folder(run: Path) -> Path:
-    """Return the folder for what is recorded beside a run from now on."""
-    return free_folder(run / BESIDE)

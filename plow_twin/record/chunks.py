@@ -25,6 +25,8 @@ try:  # twenty times as fast as the standard library's
 except ImportError:
     from zlib import crc32 as crc32
 
+#: A metadata record where a repair has left out a chunk that could not be read: it counts as one.
+DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 #: A longer record, or a chunk that says it holds more, is damage [B].
 RECORD_LIMIT: Final = 256 * 1024 * 1024
@@ -107,11 +109,13 @@ class ChunkReader:
     channels: dict[int, Channel] = field(default_factory=dict)
     finished: bool = False
     damaged: int = 0
+    #: of these, what a repair has left out
+    left_out: int = 0
     position: int = 0
     _table: Indexes = field(default_factory=lambda: np.empty((_COLUMNS, 0), np.int64), init=False)
 
     def __iter__(self) -> Iterator[Messages]:
-        self.finished, self.damaged, self.position = False, 0, 0
+        self.finished, self.damaged, self.left_out, self.position = False, 0, 0, 0
         schemas: dict[int, tuple[str, bytes]] = {}
         loose: list[bytes] = []
         opened: list[Bytes] = []
@@ -162,6 +166,8 @@ class ChunkReader:
                 elif opcode in (_SCHEMA, _CHANNEL):
                     self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
+                    yield from self._scan(opened, schemas)  # a note of damage stands between the messages
+                    opened = []
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
@@ -237,6 +243,8 @@ class ChunkReader:
         except Exception:
             self.damaged += 1
             return
+        if metadata.name == DAMAGE_RECORD:
+            self.damaged, self.left_out = self.damaged + 1, self.left_out + 1
         self.on_metadata(metadata.name, dict(metadata.metadata))
 
     def _note_damage(self, schemas: dict[int, tuple[str, bytes]]) -> None:

@@ -14,13 +14,13 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
-from plow_twin.record.chunks import ChunkReader, Messages, is_begun
+from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_begun
 from plow_twin.record.follow import is_claimed
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
-from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
+from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, listed_parts, qos_text, write_metadata
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Loss, Sample, Snapshot
@@ -39,11 +39,15 @@ class PartReport:
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
+    #: bytes behind the end, with which others take the file for none
+    trailing_bytes: int = 0
+    #: chunks that a repair before has left out
+    left_out: int = 0
 
     @property
     def healthy(self) -> bool:
-        """Whether it has its end and no damage."""
-        return self.finished and not self.damaged_chunks
+        """Whether it has its end, nothing behind that, and no damage."""
+        return self.finished and not self.damaged_chunks and not self.trailing_bytes
 
 
 @dataclass
@@ -150,7 +154,10 @@ def _part(path: Path) -> PartReport:
         for number in messages.channel.tolist():
             channel = reader.channels.get(number)
             counts[channel.topic if channel else "undeclared"] += 1
-    return PartReport(path, path.stat().st_size, reader.finished, reader.damaged, dict(sorted(counts.items())))
+    size = path.stat().st_size
+    trailing = size - reader.position - len(MAGIC) if reader.finished else 0
+    damaged = reader.damaged - reader.left_out
+    return PartReport(path, size, reader.finished, damaged, dict(sorted(counts.items())), trailing, reader.left_out)
 
 
 def _name_problems(report: RunReport, reader: RunReader) -> None:
@@ -159,8 +166,11 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
             report.problems.append(f"{part.path.name}: cut off: it has no end")
         if part.damaged_chunks:
             report.problems.append(f"{part.path.name}: {part.damaged_chunks} damaged chunk(s)")
-    if not report.metadata_yaml:
-        report.problems.append("metadata.yaml is missing")
+        if part.left_out:
+            report.problems.append(f"{part.path.name}: {part.left_out} chunk(s) left out by a repair")
+        if part.trailing_bytes:
+            report.problems.append(f"{part.path.name}: {part.trailing_bytes} B behind its end")
+    report.problems += _metadata_problems(reader)
     if report.gaps:
         report.problems.append(f"{report.gaps} journal entries are missing")
     for topic, count in report.lost.items():
@@ -169,6 +179,20 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
         report.problems.append(f"stopped early: {reader.stop_reason}")
     if not report.entries[Snapshot.__name__] and report.entries[Digest.__name__]:
         report.problems.append("no snapshot: nothing can be compared")
+
+
+def _metadata_problems(reader: RunReader) -> list[str]:
+    """Return what is wrong with `metadata.yaml`, by which other programs find the parts."""
+    folder = reader.path.parent
+    if not (folder / "metadata.yaml").is_file():
+        return ["metadata.yaml is missing"]
+    try:
+        listed = listed_parts(folder)
+    except RecordingError as error:
+        return [f"metadata.yaml: {str(error).rpartition(': ')[2]}"]
+    there = [part.name for part in reader.parts]
+    missing = [f"{name} is missing: metadata.yaml names it" for name in listed if not (folder / name).is_file()]
+    return missing + [f"{name}: metadata.yaml does not name it" for name in there if name not in listed]
 
 
 def repair(path: Path) -> list[Path]:
@@ -196,17 +220,22 @@ def repair(path: Path) -> list[Path]:
             rewritten.append(part)
             continue
         if not report.healthy:
-            _rewrite(part)
+            _rewrite(part, last=part == reader.parts[-1])
             rewritten.append(part)
         facts.append(_facts(part))
-    if rewritten or not (reader.path.parent / "metadata.yaml").is_file():
-        custom = {f"plow_twin_{REPAIRED_KEY}": ", ".join(part.name for part in rewritten)} if rewritten else {}
+    wrong = _metadata_problems(reader)
+    if rewritten or wrong:
+        repaired = [part.name for part in rewritten] + [text for text in wrong if "is missing:" in text]
+        custom = {f"plow_twin_{REPAIRED_KEY}": ", ".join(repaired)} if repaired else {}
         write_metadata(reader.path.parent, bag_metadata(facts, custom))
     return rewritten
 
 
-def _rewrite(part: Path) -> None:
-    """Copy what can be read into a new file in the place of the old one."""
+def _rewrite(part: Path, *, last: bool) -> None:
+    """Copy what can be read into a new file in the place of the old one, with a note where something is left out.
+
+    The end of the last part is where a recorder was stopped, which leaves no gap.
+    """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)
     loss: dict[str, str] = {}
@@ -215,14 +244,24 @@ def _rewrite(part: Path) -> None:
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:
             loss.update(record)
-        else:
+        elif name != DAMAGE_RECORD:  # it counts as damage
             file.metadata(name, record)
 
     reader = ChunkReader(part, on_metadata)
     numbers: dict[int, int] = {}
+    noted = 0
+
+    def note_damage(count: int) -> None:
+        nonlocal noted
+        for _ in range(noted, count):
+            file.metadata(DAMAGE_RECORD, {"file": part.name})
+        noted = count
+
     try:
         for messages in reader:
+            note_damage(reader.damaged)
             _copy(messages, reader, file, numbers)
+        note_damage(reader.damaged + (not reader.finished and not last))
         file.metadata(LOSS_RECORD, loss)
         file.finish()
     finally:

@@ -15,7 +15,7 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.chunks import MAGIC, MESSAGE_HEAD, crc32
 from plow_twin.record.follow import claim
 from plow_twin.record.template import Bytes, Indexes, Template, compiled, fill
@@ -352,6 +352,8 @@ class UnbufferedFile:
         self._path = path
         try:
             self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except FileExistsError as error:
+            raise TakenError(f"{path}: exists already, expected a new file for the recording") from error
         except OSError as error:
             raise RecordingError(f"{path}: cannot be made: {error.strerror}") from error
         claim(self._descriptor)

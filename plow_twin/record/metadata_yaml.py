@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.durable import sync_path
 from plow_twin.record.messages import DiagnosticStatus
@@ -126,6 +127,22 @@ def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[
             "ros_distro": "jazzy",
         }
     }
+
+
+def listed_parts(folder: Path) -> list[str]:
+    """Return the files that `metadata.yaml` names.
+
+    Raises
+    ------
+    RecordingError
+        It is no metadata of a bag.
+    """
+    path = folder / "metadata.yaml"
+    try:
+        found = load_yaml(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]["relative_file_paths"]
+    except Exception as error:  # the library's own, for each kind of damage another
+        raise RecordingError(f"{path}: cannot be read as the metadata of a bag") from error
+    return [str(name) for name in found]
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, Any], *, sync: bool = False) -> None:

@@ -231,10 +231,12 @@ class RunReader:
         self.counts.clear()
         merger = _Merger(self, outputs)
         size, before = sum(part.stat().st_size for part in self.parts), 0
-        finished = True
+        finished, cut = True, False
         for part in self._parts_to_read():
+            self.damaged_chunks += cut  # what the part before lacks may be missing in what comes now
+            cut = False
             if self.tail is None and len(self.parts) > 1 and not is_begun(part):
-                finished = False
+                finished, cut = False, True
                 continue
             reader = ChunkReader(
                 part,
@@ -250,7 +252,7 @@ class RunReader:
                     yield from merger.finish()
                     yield Batch(_NO_ENTRIES, [])
             before += reader.position
-            finished = finished and reader.finished
+            finished, cut = finished and reader.finished, not reader.finished
             self.damaged_chunks += reader.damaged
             merger.end()
         yield from merger.finish()

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
@@ -396,16 +396,27 @@ class Recorder:
         self._part_since = time.monotonic()
         if self._ring is not None and self._mark is not None:
             try:
-                self._ring.dump(self._mark, lost)
+                self._dump(self._ring, self._mark, lost)
                 self._marks += 1
             except (OSError, RecordingError) as error:  # the ring goes on
                 if self._on_error is not None:
                     self._on_error(f"{self._mark}: not written: {error}")
             self._mark = None
 
+    def _dump(self, ring: RingWriter, folder: Path, lost: Mapping[str, int]) -> None:
+        from plow_twin.record.writer import in_free_folder
+
+        try:
+            ring.dump(folder, lost)
+        except TakenError:  # another process was quicker
+            in_free_folder(self._folder, lambda other: ring.dump(other, lost))
+
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
+        reason = self._writer.reason_to_stop()
+        if reason is not None:  # its folder may be gone too: there is no disk to ask
+            return reason
         if self._part_is_full():
             self._split_due = True
         shortage = self._writer.shortage()
@@ -414,7 +425,7 @@ class Recorder:
         elif shortage is None and self._paused:
             with self._lock:
                 self._paused = self._error = None
-        return self._writer.reason_to_stop()
+        return None
 
     def _pause(self, reason: str) -> None:
         """Take nothing in until the disk has room again; what is queued or not yet safe is lost."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.durable import sync_path
 from plow_twin.record.header import RunHeader
 from plow_twin.record.mcap_file import ByteFile
@@ -77,6 +77,8 @@ class RingWriter(RunWriter):
 
         Raises
         ------
+        TakenError
+            Another recording is there.
         OSError, RecordingError
             It could not be written; the ring is as it was.
         """
@@ -87,7 +89,11 @@ class RingWriter(RunWriter):
         facts = []
         for _, part, content in self._kept:
             name = f"{folder.name}_{part.name.rpartition('_')[2]}"
-            (folder / name).write_bytes(content)
+            try:
+                with (folder / name).open("xb") as stream:
+                    stream.write(content)
+            except FileExistsError as error:
+                raise TakenError(f"{folder / name}: exists already, expected a new file for the recording") from error
             if self._sync_dumps:
                 sync_path(folder / name)
             facts.append(PartFacts(name, part.start_ns, part.end_ns, part.topics))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import RecordingError, TakenError
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
 from plow_twin.record.chunks import MESSAGE_HEAD
@@ -30,6 +30,7 @@ from plow_twin.stream.outputs import Publication, Publications
 #: Folder in a run's folder with what was recorded beside it; further ones are `beside_2`, ...
 BESIDE: Final = "beside"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
+Made = TypeVar("Made")
 
 
 @dataclass
@@ -289,6 +290,15 @@ def free_folder(folder: Path) -> Path:
     return path
 
 
+def in_free_folder(folder: Path, make: Callable[[Path], Made]) -> Made:
+    """Make a recording in `free_folder`, or in the next one where another process is quicker."""
+    while True:
+        try:
+            return make(free_folder(folder))
+        except TakenError:
+            continue
+
+
 def _size(path: Path) -> int:
     try:
         return path.stat().st_size
@@ -301,11 +311,13 @@ def make_folder(folder: Path) -> None:
 
     Raises
     ------
+    TakenError
+        It holds something already.
     RecordingError
-        It holds something already, or cannot be made.
+        It cannot be made.
     """
     if not _is_free(folder):
-        raise RecordingError(f"{folder}: exists already, expected a new or empty folder for the recording")
+        raise TakenError(f"{folder}: exists already, expected a new or empty folder for the recording")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

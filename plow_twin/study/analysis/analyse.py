@@ -18,13 +18,13 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed, JournalWalk, Walked, Walker
-from plow_twin.record.mapping import Role, read_map, roles_by_source
+from plow_twin.record.mapping import Role, read_map, readings, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import Source, open_source
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Pose
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
@@ -42,6 +42,9 @@ _COLUMNS: Final = (
 )
 #: Tolerance of a run that is made of another recording.
 _TOLERANCE: Final = 1e-9
+_MAP: Final = "map_"
+#: Among the parameters of each run that an analysis has made.
+MAPPED_LOAD: Final = f"{_MAP}excitation"
 #: Receives the share of the work done, 0..1.
 OnProgress = Callable[[float], object]
 
@@ -297,13 +300,10 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
 
 
 def _collect(source: Source, roles: Mapping[str, Role], measured: Measured) -> None:
-    names = {role.topic: name for name, role in roles.items()}
-    if not names:
-        return
-    for arrived in source.messages(names.__contains__):
-        found = roles[names[arrived.topic]].read(arrived)
+    topics = {role.topic for role in roles.values()}
+    for name, _, found in readings(source.messages(topics.__contains__) if topics else (), roles):
         if found is not None:
-            measured.add(names[arrived.topic], *found)
+            measured.add(name, *found)
 
 
 def _walk_other(
@@ -330,7 +330,7 @@ def _walk_other(
         f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count
     }
     losses = {**source.losses.counts, **dropped}
-    if feed.unfit and not intake.counts[Verdict.MALFORMED]:
+    if feed.unfit:
         losses["unfit_messages"] = feed.unfit
     if walkers[0].failures:
         losses["solver_failures"] = walkers[0].failures
@@ -344,7 +344,7 @@ def _writer(out: Path, scene: Scene, roles: Mapping[str, Role]) -> Any:
     from plow_twin.record.header import RunHeader
     from plow_twin.record.writer import RunWriter
 
-    parameters = {f"map_{name}": role.topic for name, role in roles.items()}
+    parameters = {f"{_MAP}{name}": role.topic for name, role in roles.items()}
     header = RunHeader(dump_scene(scene), tol=_TOLERANCE, parameters=parameters)
     return RunWriter(out / "run", header, chunk_size=2**20, min_free_bytes=64 * 1024 * 1024)
 

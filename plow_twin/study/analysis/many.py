@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from typing import Any
 
 from plow_twin.study.analysis.task import Task, analyse_task
@@ -64,7 +65,8 @@ def _here(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone
 def _round(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
     """Run some tasks and return those that were lost: when a worker dies, with all that had not ended."""
     left = []
-    pool = ProcessPoolExecutor(min(workers, len(waiting)), mp_context=get_context("spawn"))
+    others = active_children()
+    pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _leave_interrupts_to_the_caller)
     try:
         futures = {pool.submit(analyse_task, tasks[number]): number for number in waiting}
         for future in as_completed(futures):
@@ -72,9 +74,17 @@ def _round(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDon
                 done(futures[future], future.result())
             except BrokenProcessPool:
                 left.append(futures[future])
+    except BaseException:  # an interrupt: what has not ended is made anew by the next call
+        for worker in set(active_children()).difference(others):
+            worker.kill()
+        raise
     finally:
         pool.shutdown(cancel_futures=True)
     return left
+
+
+def _leave_interrupts_to_the_caller() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _on_cluster(tasks: Sequence[Task], waiting: list[int], address: str, done: _OnDone) -> None:

@@ -5,18 +5,37 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.build import package_version
-from plow_twin.errors import PlowTwinError
-from plow_twin.study.analysis.analyse import analyse
+from plow_twin.errors import PlowTwinError, RecordingError
+from plow_twin.record.reader import read_header
+from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
 from plow_twin.study.store import write_atomically
 
 #: Written last: what the other files of an analysis were made of.
 _ASKED: Final = "asked.json"
+
+
+def names_apart(paths: Sequence[Path]) -> list[str]:
+    """Return a short name for each recording: as much of its path as tells it from the others."""
+    whole = [path.absolute() for path in paths]
+    stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
+    parts = [
+        (*path.parts[1:-1], path.stem if path.is_file() and stems[path.with_suffix("")] == 1 else path.name)
+        for path in whole
+    ]
+    deepest = max(map(len, parts), default=0)
+    ends = [Counter(part[-depth:] for part in parts) for depth in range(1, deepest + 1)]
+    return [
+        next(("_".join(part[-n:]) for n in range(1, deepest) if ends[n - 1][part[-n:]] == 1), "_".join(part))
+        for part in parts
+    ]
 
 
 @dataclass(frozen=True)
@@ -41,12 +60,34 @@ class Task:
         return {**facts, "lossy": bool(facts["lost"])} if asked == self._asked() else None
 
     def clear(self) -> None:
-        """Remove the run that an analysis which did not end has left."""
-        if self.out is None or not (self.out / "run").is_dir():
+        """Remove the run that an analysis before has left; a run that a twin has recorded stays."""
+        if self.out is None:
             return
-        files = list((self.out / "run").iterdir())
-        if all(re.fullmatch(r"run_\d+\.mcap|metadata\.yaml(\.partial)?", file.name) for file in files):
+        (self.out / _ASKED).unlink(missing_ok=True)
+        if (self.out / "run").is_dir() and all(map(_is_ours, (self.out / "run").iterdir())):
             shutil.rmtree(self.out / "run")
+
+    def run(self, on_progress: Callable[[float], object] | None = None) -> dict[str, Any]:
+        """Return the facts of the analysis and write its files.
+
+        Raises
+        ------
+        PlowTwinError
+            It cannot be made.
+        """
+        self.clear()
+        found = analyse(
+            self.path,
+            scene=self.scene,
+            mapping=self.mapping,
+            others=self.others,
+            out=self.out,
+            on_progress=on_progress,
+        )
+        if self.out is not None:
+            write_report(found, self.out)
+            self.store()
+        return {**found.facts(), "lossy": found.lossy}
 
     def store(self) -> None:
         """Note what the files in `out` are, once all are written."""
@@ -59,6 +100,21 @@ class Task:
         return {"inputs": [_state(path) for path in inputs], "version": package_version()}
 
 
+def _is_ours(file: Path) -> bool:
+    """Tell whether a file belongs to a run that an analysis has made."""
+    if file.name in ("metadata.yaml", "metadata.yaml.partial"):
+        return True
+    if not re.fullmatch(r"run_\d+\.mcap", file.name):
+        return False
+    if file.stat().st_size == 0:  # killed before its first byte
+        return True
+    try:
+        header = read_header(file)
+    except RecordingError:
+        return False
+    return header is not None and MAPPED_LOAD in header.parameters
+
+
 def _state(path: Path) -> list[Any]:
     """Return name, sizes and times of a file, or of those in a folder."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
@@ -68,11 +124,6 @@ def _state(path: Path) -> list[Any]:
 def analyse_task(task: Task) -> dict[str, Any]:
     """Return the facts of one analysis; `error` when it failed. Its results are written to `out`."""
     try:
-        task.clear()
-        found = analyse(task.path, scene=task.scene, mapping=task.mapping, others=task.others, out=task.out)
-        if task.out is not None:
-            write_report(found, task.out)
-            task.store()
-        return {**found.facts(), "lossy": found.lossy}
+        return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
