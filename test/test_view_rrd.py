@@ -25,7 +25,7 @@ from plow_twin.stream.journal import Entry, Pose, Travel
 from plow_twin.view import ViewSummary, to_rrd
 from plow_twin.view.columns import extremes
 from plow_twin.view.contact_sets import masks_of, set_color
-from plow_twin.view.section import ARROW_MM_PER_N, Section
+from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, Section
 
 COUNT = 1500
 
@@ -48,6 +48,16 @@ def read(path: Path) -> dict[str, pa.Table]:
         if not chunk.is_static:
             batches.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
     return {entity: pa.concat_tables([pa.Table.from_batches([b]) for b in rows]) for entity, rows in batches.items()}
+
+
+def curve_names(path: Path) -> dict[str, str]:
+    """Return what the legend calls each curve of a .rrd."""
+    names: dict[str, str] = {}
+    for chunk in RrdReader(str(path)).stream():
+        batch = chunk.to_record_batch()
+        if chunk.is_static and "SeriesLines:names" in batch.schema.names:
+            names[chunk.entity_path] = batch["SeriesLines:names"].to_pylist()[-1][0]
+    return names
 
 
 def scalars(table: pa.Table) -> np.ndarray:
@@ -87,6 +97,12 @@ def test_curves_of_penetration_clearance_and_load(run: Run, view: tuple[ViewSumm
     assert set(tables) >= {"/wear/pad_top_left_top", "/wear/pad_top_left_top/p95", "/quality/sample_interval_ms"}
     np.testing.assert_array_equal(scalars(tables["/load/fx"]), [paper_sample(i).wrench[0] / 1e3 for i in range(COUNT)])
     assert set(scalars(tables["/quality/sample_interval_ms"])) == {1.0}
+    largest = np.abs([paper_sample(i).wrench for i in range(COUNT)]).max(axis=0) / 1e3
+    names = curve_names(view[0].path)
+    expected = (f"{name}, to {value:.3g}" for name, value in zip(("Fx", "Fy", "M"), largest, strict=True))
+    assert [names[f"/load/{part}"].removesuffix(" m") for part in ("fx", "fy", "moment")] == [
+        f"{e} kN" for e in expected
+    ]
 
 
 def test_the_growth_of_the_clearance_is_drawn_in_micrometres(tmp_path: Path) -> None:
@@ -152,7 +168,9 @@ def test_what_lies_along_the_face_what_was_measured_and_what_if(tmp_path: Path) 
     depths = tables["/exaggerated/pads/wear"]["Points2D:labels"].to_pylist()[-1]
     assert len(depths) == 8 and all(depth.endswith(" um") for depth in depths)
     for group in ("clearance", "growth"):
-        band, low, high = (scalars(tables[f"/{group}/vertical{part}"]) for part in ("/band", "/p05", "/p95"))
+        band, low, high = (
+            scalars(tables[f"/{group}/{part}"]) for part in ("band/vertical", "vertical/p05", "vertical/p95")
+        )
         assert band.min() >= low.min() and high[-2] <= band.max() <= high.max()
 
 
@@ -228,6 +246,14 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     np.testing.assert_allclose(bottom[:, 1], 135.0 + 10.0)
     np.testing.assert_allclose(sorted(left[:, 0]), [-165.0 - 40.0, -165.0 + 2.0])
     assert touching.tolist() == [False, False, False, True]
+
+
+def test_what_pads_have_lost_is_written_inside_the_frame_in_rows_apart() -> None:
+    section = Section.of(load_scene(scene_path("paper")))
+    places = section.pads(np.full(8, 1e-3))[2]
+    assert (np.abs(places) < [0.3 * section.frame[0], 0.4 * section.frame[1]]).all()
+    column = np.sort(places[places[:, 0] < 0.0][:, 1])
+    assert len(column) == 4 and np.diff(column).min() > 1.5 * LABEL_MM
 
 
 def test_a_picture_needs_no_viewer(run: Run, tmp_path: Path) -> None:

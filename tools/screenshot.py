@@ -50,12 +50,30 @@ def connect(port: int, patience_s: float = 60.0) -> ViewerClient:
             time.sleep(0.5)
 
 
+def bring_forward(client: ViewerClient, origins: list[str]) -> None:
+    """Show the views of these origins where they lie behind other tabs."""
+    shown = client.get_blueprint()
+    layout = shown.blueprint
+    views = {
+        f"view/{place.rpartition('/')[2]}": part["ViewBlueprint"]["space_origin"]
+        for place, part in layout.items()
+        if "ViewBlueprint" in part
+    }
+    for part in layout.values():
+        tabs = part.get("ContainerBlueprint", {})
+        chosen = [view for view in tabs.get("contents", ()) if views.get(view) in origins]
+        if tabs.get("container_kind") == "Tabs" and chosen:
+            tabs["active_tab"] = chosen[0]
+    client.set_blueprint(layout, "recording")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Draw a recording as rerun shows it, without a screen.")
     parser.add_argument("run", type=Path)
     parser.add_argument("out", type=Path, nargs="?", default=Path("docs/images/view.png"))
     parser.add_argument("--at", type=float, default=3.65, help="seconds after the first stamp (default: %(default)s)")
     parser.add_argument("--with", dest="others", action="append", default=[], help="a further scene (view --with)")
+    parser.add_argument("--tab", action="append", default=[], help="a view to bring forward, by its origin (growth)")
     options = parser.parse_args()
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
@@ -68,6 +86,7 @@ def main() -> None:
             client = connect(port)
             client.open(str(rrd))
             client.set_time("run_time", duration=options.at, play_state="paused")
+            bring_forward(client, options.tab)
             time.sleep(8.0)  # lets the plots settle and the greeting go
             client.save_screenshot(str(shot))
         finally:

@@ -27,7 +27,7 @@ from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
 from plow_twin.view.events import Events
 from plow_twin.view.face import FaceChart
 from plow_twin.view.residuals import Residuals
-from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAIR_COLORS, Section
+from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
 #: Stamps further than that from the recorder's clock [ns] are on another clock: no age is drawn.
@@ -113,6 +113,7 @@ class Drawing:
         self._sample_ns: int | None = None
         self._early: list[tuple[int, DiagnosticStatus]] = []
         self._wrench = np.zeros(3)
+        self._largest_load = self._named_load = np.zeros(3)
         self._new_m = np.array(
             [getattr(scene.clearance, f"{name.partition('/')[0]}_m") for name in np.array(CLEARANCE_NAMES)[~_PADS]]
         )
@@ -137,8 +138,9 @@ class Drawing:
         self.stream.log("exaggerated/pads", pads, static=True)
         depths = rr.Points2D.from_fields(colors=list(PAIR_COLORS), radii=[0.1], show_labels=True)
         self.stream.log("exaggerated/pads/wear", depths, static=True)
-        places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.43 * self.section.frame[1]]]))
-        names = (*self.section.labels, "frame (fixed)")
+        places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.37 * self.section.frame[1]]]))
+        places[:, 1] -= LABEL_MM
+        names = (*self.section.labels, self.section.frame_name)
         labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
         self.stream.log("section/frame/names", labels, static=True)
         self.stream.log("section/head", rr.LineStrips2D.from_fields(radii=[0.9]), static=True)
@@ -194,6 +196,7 @@ class Drawing:
         if samples.size:
             at, wrench = stamps[samples], entries.wrench[samples]
             self.load.add(at, steps[samples], wrench / 1e3)
+            self._largest_load = np.maximum(self._largest_load, np.abs(wrench).max(axis=0) / 1e3)
             age = entries.log_time_ns[samples] - at
             near = np.abs(age) <= _LARGEST_AGE_NS
             self.age.add(at[near], steps[samples][near], age[near, None] / 1e6)
@@ -263,7 +266,7 @@ class Drawing:
             if depth_mm[row].any():
                 middles, halves, places = self.section.pads(depth_mm[row])
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
-                labels = [f"{1e3 * depth:.3g} um" for depth in depth_mm[row]]
+                labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} um" for depth in depth_mm[row]]
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
 
     def _along_face(self, entries: Entries, rows: Rows, places: Indexes) -> None:
@@ -342,6 +345,9 @@ class Drawing:
 
     def flush(self) -> None:
         """Send what is still collected."""
+        if (self._largest_load > 1.05 * self._named_load).any():
+            layout.style_load(self.stream, self._largest_load)
+            self._named_load = self._largest_load
         for buffer in buffers(self):
             buffer.flush()
         for part in (self.events, self.contact_sets, self.face, self.what_if):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -29,12 +29,19 @@ INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 #: The area between the bounds of a clearance: a curve that changes between them.
-BAND: Final = tuple(f"{group}/{way}/band" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
+#: Their names sort before those of the clearances, so that these are drawn above them.
+BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-_LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
+#: Bounds are left out where a view opens: bands show those of the clearances, and a legend of more than eight is cut.
+_WITHOUT_BOUNDS: Final = (
+    "$origin/**",
+    *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
+)
+_LOAD_NAMES: Final = (("Fx", "Fy", "M"), ("kN", "kN", "kN m"))
 _LOAD_COLORS: Final = (LOAD_COLOR, (86, 180, 233), (200, 200, 200))
+_QUALITY: Final = ((240, 160, 60), (86, 180, 233))
 _RESIDUAL_NAMES: Final = ("x [mm]", "y [mm]", "theta [mrad]")
 _WHAT_IF_COLORS: Final = (
     (235, 235, 235),
@@ -44,6 +51,9 @@ _WHAT_IF_COLORS: Final = (
     (204, 121, 167),
     (240, 228, 66),
 )
+#: Strokes of a band lie several deep on each pixel: wide and faint ones give an even area, without stripes.
+_BAND_ALPHA: Final = 10
+_BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
 
 
@@ -86,14 +96,14 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb
         _plot("load", "Load on the head"),
         rrb.Tabs(
             *([_plot("what_if", "What if: largest force [kN]")] if what_if else []),
-            _plot("growth", "Growth by wear [um]", rrb.Corner2D.LeftTop),
-            _plot("clearance", "Clearance [mm]"),
+            _plot("growth", "Growth by wear [um]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
+            _plot("clearance", "Clearance [mm]", contents=_WITHOUT_BOUNDS),
             _plot("residual", "Residual"),
             _plot("penetration", "Penetration [mm]"),
-            _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop),
+            _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        row_shares=[5, 1.8, 2.4, 4],
+        row_shares=[4.6, 1.5, 2.5, 4.6],
     )
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -105,8 +115,13 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb
     )
 
 
-def _plot(origin: str, name: str, legend: rrb.Corner2D = rrb.Corner2D.RightTop) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(origin=origin, name=name, plot_legend=legend)
+def _plot(
+    origin: str,
+    name: str,
+    legend: rrb.Corner2D = rrb.Corner2D.RightTop,
+    contents: Sequence[str] = ("$origin/**",),
+) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(origin=origin, contents=list(contents), name=name, plot_legend=legend)
 
 
 def style_curves(stream: rr.RecordingStream) -> None:
@@ -114,21 +129,28 @@ def style_curves(stream: rr.RecordingStream) -> None:
     for entities in (FORCE, FORCE_AT_STAMP, PENETRATION):
         for entity, name, color in zip(entities, PAIR_NAMES, PAIR_COLORS, strict=True):
             _style(stream, entity, name, color, AggregationPolicy.MinMax)
-    for entity, name, color in zip(LOAD, _LOAD_NAMES, _LOAD_COLORS, strict=True):
+    style_load(stream, (0.0, 0.0, 0.0))
+    for entity, name, color in zip((*AGE, *INTERVAL), ("age of a sample", "time between two"), _QUALITY, strict=True):
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
-    for entity in (*AGE, *INTERVAL):
-        _style(stream, entity, entity.rpartition("/")[2], (200, 200, 200), AggregationPolicy.MinMax)
     for entity, name, color in zip(RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
-        way = entity.split("/")[1]
-        _style(stream, entity, f"{way} 5..95 %", (*_CLEARANCE_COLORS[way], 60), AggregationPolicy.MinMax)
+        way = entity.rpartition("/")[2]
+        faint = (*_CLEARANCE_COLORS[way], _BAND_ALPHA)
+        _style(stream, entity, f"{way} 5..95 %", faint, AggregationPolicy.MinMax, _BAND_WIDTH)
     for entity in (*TOTAL, *GROWTH, *WEAR):  # the bounds of an interval thinner than the value that they belong to
         base, _, bound = entity.partition("/")[2].partition("/")
-        pair = base.removeprefix("pad_")
-        color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(pair)]
+        base = base.removeprefix("pad_")
+        color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(base)]
         shade = tuple(round(0.6 * part) for part in color) if bound else color
         _style(stream, entity, f"{base} {bound}".strip(), shade, AggregationPolicy.MinMax, 1.0 if bound else 2.5)
+
+
+def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
+    """Name the curves of the load with their largest values: the axis of a low plot names only powers of ten."""
+    for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
+        named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
+        _style(stream, entity, named, color, AggregationPolicy.MinMax)
 
 
 def what_if_curves(stream: rr.RecordingStream, names: Sequence[str]) -> tuple[str, ...]:
@@ -161,9 +183,10 @@ def _style(
 def about(scene: Scene, header: RunHeader, source: Path) -> str:
     """Return, in Markdown, what was run and how to read the picture."""
     contact = scene.contact
+    frame = "fixed frame" if scene.support is None else "frame, on springs, from which all is seen here,"
     return f"""# {source.name}
 
-The head ({scene.head.mass_kg:g} kg) moves about the fixed frame of the guide
+The head ({scene.head.mass_kg:g} kg) moves about the {frame} of the guide
 ({1e3 * scene.frame.width_m:g} x {1e3 * scene.frame.height_m:g} mm) inside the clearance of its cavity
 ({1e3 * scene.clearance.horizontal_m:g} mm horizontal, {1e3 * scene.clearance.vertical_m:g} mm vertical in total).
 Where a corner of the frame meets a wall of the cavity, an arrow shows the force on the head (100 kN are

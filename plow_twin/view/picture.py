@@ -109,7 +109,7 @@ def _clearance_row(message: JointState) -> NDArray[np.float64]:
 def _draw_section(
     axis: Any, section: Section, pose: tuple[float, float, float], force: NDArray[np.float64], largest: float
 ) -> None:
-    axis.plot(*section.frame_strip().T, color="0.5", label="frame (fixed)")
+    axis.plot(*section.frame_strip().T, color="0.5", label=section.frame_name)
     for number, strip in enumerate(section.head_strips(pose)):
         axis.plot(*strip.T, color="k", lw=1.0, label="" if number else "head")
     if largest > 0.0:
@@ -121,7 +121,7 @@ def _draw_section(
             axis.annotate(text, origin + 1.25 * vector, color=color, ha="center", va="center", fontsize=8)
     axis.set(aspect="equal", title=f"Cross-section [mm] at the largest force, {largest / 1e3:.1f} kN")
     axis.margins(0.1)
-    axis.legend(loc="upper left", fontsize=7)
+    axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.06), ncols=2, fontsize=7)
     _y_upwards(axis)
 
 

@@ -27,7 +27,7 @@ BODY_MARGIN_MM: Final = 60.0
 PAD_MM_PER_MM: Final = 200.0
 _PAD_MM: Final = 60.0
 #: A label stands so far below its place [mm].
-_LABEL_MM: Final = 16.0
+LABEL_MM: Final = 16.0
 
 #: One hue per corner; the pair with the vertical wall in the lighter shade (Okabe and Ito's palette).
 _HUES: Final = ((0, 114, 178), (230, 159, 0), (213, 94, 0), (0, 158, 115))
@@ -46,6 +46,8 @@ class Section:
     frame: Array
     cavity: Array
     labels: tuple[str, ...]
+    #: what to call the frame: with springs under it all is seen from it
+    frame_name: str = "frame (fixed)"
 
     @classmethod
     def of(cls, scene: Scene) -> Section:
@@ -53,7 +55,8 @@ class Section:
         frame = _MM * np.array([scene.frame.width_m, scene.frame.height_m])
         gaps = _MM * np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
         letters = {corner: letter for letter, corner in scene.frame.labels.items()}
-        return cls(frame, frame + gaps, tuple(letters.get(corner, "") for corner in CORNER_NAMES))
+        name = "frame (fixed)" if scene.support is None else "frame (on springs)"
+        return cls(frame, frame + gaps, tuple(letters.get(corner, "") for corner in CORNER_NAMES), name)
 
     @property
     def half_view(self) -> Array:
@@ -107,13 +110,16 @@ class Section:
         along = (np.abs(outwards) < 0.5) * np.sign(corners)
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * outwards - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        labels = (corners - 22.0 * outwards * (1.0 + np.abs(outwards[:, :1])) - 75.0 * along) * _FLIP
-        labels[:, 1] -= _LABEL_MM
+        # well inside the frame, where no wall comes: two rows to a corner, that of its vertical wall nearer the middle
+        inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(outwards[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
+        labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(outwards) + _PAD_MM * np.abs(along)), labels
 
     def head_points(self, pose: Iterable[float]) -> Array:
         """Centre of the cavity and the place of the head's name, shape (2, 2)."""
-        return _placed(np.array([[0.0, 0.0], [0.0, 0.5 * self.cavity[1] + 0.5 * BODY_MARGIN_MM]]), pose)
+        places = _placed(np.array([[0.0, 0.0], [0.0, 0.5 * self.cavity[1] + 0.5 * BODY_MARGIN_MM]]), pose)
+        places[1, 1] -= LABEL_MM
+        return places
 
     def arrows(self, theta: float, force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
         """Origins and vectors of the forces on the head, shape (k, 2), and the pairs that they belong to, (k,)."""

@@ -60,7 +60,7 @@ def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) ->
     RecordingError
         It is not installed or does not answer.
     """
-    port, web_port = free_port(), free_port() if web_port == 0 else web_port
+    port, web_port = free_port(), None if web_port is None else page_port(web_port)
     command = [viewer_program(), "--bind", LOOPBACK, "--port", str(port), "--memory-limit", _MEMORY, *options]
     if web_port is not None:
         command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
@@ -93,6 +93,27 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
+
+
+def page_port(asked: int) -> int:
+    """Return the port for a page: the one asked for, any for 0.
+
+    Raises
+    ------
+    RecordingError
+        Another program uses it.
+    """
+    if not asked:
+        return free_port()
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((LOOPBACK, asked))
+        except OSError as error:
+            raise RecordingError(
+                f"web port: got {asked}, expected one that is free, or 0 ({error.strerror})"
+            ) from error
+    return asked
 
 
 def _answers(port: int) -> bool:
