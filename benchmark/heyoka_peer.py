@@ -72,37 +72,45 @@ def _begin_of(tol: float) -> float:
     return min(1e-6, max(1e-9, 1e-4 * tol ** (2.0 / 3.0)))
 
 
+def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:
+    """Return the terminal events that set the modes: whether a pair touches, and whether its force would pull.
+
+    A batch tells its callbacks at which of its places the event fired; `inside` has the shape of the modes.
+    """
+
+    def touches(pair: int) -> Callable[..., bool]:
+        def callback(integrator: Any, sign: int, *place: int) -> bool:
+            inside[(pair, *place)] = sign > 0
+            integrator.pars[(pair, *place)] = float(sign > 0)
+            return True
+
+        return callback
+
+    def pulls(pair: int) -> Callable[..., bool]:
+        def callback(integrator: Any, sign: int, *place: int) -> bool:
+            integrator.pars[(pair, *place)] = float(sign > 0 and inside[(pair, *place)])
+            return True
+
+        return callback
+
+    events = []
+    for i, (depth, law) in enumerate(guards):
+        events += [
+            event(depth, callback=touches(i), cooldown=_COOLDOWN),
+            event(law, callback=pulls(i), cooldown=_COOLDOWN),
+        ]
+    return events
+
+
 @cache
 def _integrator(numbers: tuple[float, ...], tol: float) -> Any:
     """Return an integrator, compiled once for both outputs, and which pairs are inside their walls."""
     import heyoka as hy
 
     p = np.array(numbers)
-
     inside = np.zeros(8, dtype=bool)
-
-    def touches(pair: int) -> Callable[[Any, int], bool]:
-        def callback(integrator: Any, sign: int) -> bool:
-            inside[pair] = sign > 0
-            integrator.pars[pair] = float(sign > 0)
-            return True
-
-        return callback
-
-    def pulls(pair: int) -> Callable[[Any, int], bool]:
-        def callback(integrator: Any, sign: int) -> bool:
-            integrator.pars[pair] = float(sign > 0 and inside[pair])
-            return True
-
-        return callback
-
     system, guards = _equations(p, _begin_of(tol))
-    events = []
-    for i, (depth, law) in enumerate(guards):
-        events += [
-            hy.t_event(depth, callback=touches(i), cooldown=_COOLDOWN),
-            hy.t_event(law, callback=pulls(i), cooldown=_COOLDOWN),
-        ]
+    events = _events(guards, inside, hy.t_event)
     pars = np.zeros(10)
     pars[_GX], pars[_GY] = p[2], p[3]
     return hy.taylor_adaptive(system, np.zeros(6), tol=tol, pars=pars, t_events=events), inside
@@ -136,28 +144,8 @@ def prepare_batch(p: Array, clearances: Array, tol: float, output_dt: float) -> 
     width = int(hy.recommended_simd_size())
     inside = np.zeros((8, width), dtype=bool)
 
-    def touches(pair: int) -> Callable[[Any, int, int], bool]:
-        def callback(integrator: Any, sign: int, place: int) -> bool:
-            inside[pair, place] = sign > 0
-            integrator.pars[pair, place] = float(sign > 0)
-            return True
-
-        return callback
-
-    def pulls(pair: int) -> Callable[[Any, int, int], bool]:
-        def callback(integrator: Any, sign: int, place: int) -> bool:
-            integrator.pars[pair, place] = float(sign > 0 and inside[pair, place])
-            return True
-
-        return callback
-
     system, guards = _equations(p, _begin_of(tol))
-    events = []
-    for i, (depth, law) in enumerate(guards):
-        events += [
-            hy.t_event_batch(depth, callback=touches(i), cooldown=_COOLDOWN),
-            hy.t_event_batch(law, callback=pulls(i), cooldown=_COOLDOWN),
-        ]
+    events = _events(guards, inside, hy.t_event_batch)
     integrator = hy.taylor_adaptive_batch(
         system, np.zeros((6, width)), tol=tol, pars=np.zeros((10, width)), t_events=events
     )
