@@ -32,7 +32,8 @@ from plow_twin.record.messages import JointState
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
 from plow_twin.record.recorder import JOURNAL, Recorder
 from plow_twin.record.replay import replay
-from plow_twin.record.writer import RunWriter
+from plow_twin.record.ring import RingWriter
+from plow_twin.record.writer import RunWriter, in_free_folder
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -139,12 +140,15 @@ def check_killed(folder: Path, lines: list[str], flush_s: float) -> None:
     stamps = [r.entry.stamp_ns for r in records if isinstance(r, EntryRecord) and isinstance(r.entry, Sample)]
     assert stamps == [BASE_NS + index * STEP_NS for index in range(len(stamps))]
     messages = [r.message() for r in records if isinstance(r, OutputRecord)]
-    assert abs(len(messages) - len(stamps)) <= 1
-    assert len(stamps) <= last_index + 2
-    # what came in up to one flush period before the kill is there; the slack is the machine's, not the recorder's
+    assert [m.stamp_ns for m in messages] == [BASE_NS + index * STEP_NS for index in range(len(messages))]
+    assert len(messages) <= len(stamps) <= last_index + 2
+    # What came in up to one flush period before the kill is there, and messages up to one more: a journal's chunk is
+    # written before theirs. The slack is the machine's, not the recorder's.
     first_ns = int(lines[0].split()[1])
-    newest_ns = max((record.log_time_ns for record in records), default=first_ns)
-    assert last_ns - newest_ns <= max(1.5, flush_s + 0.5) * 1e9, f"{last_index + 1} written, {len(stamps)} read"
+    for kind, periods in ((EntryRecord, 1), (OutputRecord, 2)):
+        newest_ns = max((r.log_time_ns for r in records if isinstance(r, kind)), default=first_ns)
+        lost = f"{last_index + 1} written, {len(stamps)} samples and {len(messages)} messages read"
+        assert last_ns - newest_ns <= max(1.5, periods * flush_s + 0.5) * 1e9, lost
 
 
 def test_killed_writers_lose_at_most_the_last_second(tmp_path: Path) -> None:
@@ -289,11 +293,23 @@ def test_a_recording_goes_on_when_the_disk_has_room_again(
     assert report.lost[JOURNAL] == loss.lost[JOURNAL] and report.compared["contact_peaks"] > 500
 
 
-def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(tmp_path: Path) -> None:
+def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dump = RingWriter.dump
+
+    def dump_after_another(ring: RingWriter, folder: Path, loss: Mapping[str, int]) -> None:
+        if folder.name == "ring_2":  # another process takes it first
+            Recorder(folder, HEADER).close()
+        dump(ring, folder, loss)
+
+    monkeypatch.setattr(RingWriter, "dump", dump_after_another)
     scene = load_scene(scene_path("paper"))
     folder = tmp_path / "runs" / "ring"
+    twin = Twin(scene, excitation="sampled")
+    twin.warm_up()
     recorder = Recorder(folder, RunHeader(dump_scene(scene)), flush_period_s=0.01, ring_s=0.4)
-    session = Session(Twin(scene, excitation="sampled"), on_entry=recorder.journal)
+    session = Session(twin, on_entry=recorder.journal)
     session.start()
     marked: list[Path | None] = []
     index = 0
@@ -314,14 +330,15 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(tmp_path: Path)
             assert recorder.mark() == marked[-1]
     loss = recorder.close()
     assert loss.complete and marked == [folder, folder.with_name("ring_2")]
-    for path in (folder, folder.with_name("ring_2")):
+    written = (folder, folder.with_name("ring_3"))
+    for path in written:
         report = replay(path)
         assert (report.exit_code, report.divergences) == (0, 0) and report.messages_compared
         assert 0.1 < report.span_s < 0.7 * index * 1e-3
     # what lies between the two is in neither, or in one
     stamps = [
         {int(stamp) for batch in RunReader(path).batches() for stamp in batch.entries.stamp_ns[batch.entries.sample]}
-        for path in (folder, folder.with_name("ring_2"))
+        for path in written
     ]
     assert stamps[0].isdisjoint(stamps[1])
 
@@ -346,10 +363,11 @@ def test_what_callers_lose_while_the_file_is_closed_does_not_disturb_it(
     assert reader.lost == {} and reader.status is FileStatus.STOPPED_EARLY
 
 
-def test_a_removed_file_is_noticed(tmp_path: Path) -> None:
+@pytest.mark.parametrize("whole", [False, True], ids=["file", "folder"])
+def test_a_removed_file_is_noticed(whole: bool, tmp_path: Path) -> None:
     errors: list[str] = []
     with Recorder(tmp_path / "run", HEADER, flush_period_s=0.05, on_error=errors.append) as recorder:
-        recorder.path.unlink()
+        shutil.rmtree(recorder.path.parent) if whole else recorder.path.unlink()
         deadline = time.monotonic() + 20
         while not errors and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -374,6 +392,29 @@ def test_an_earlier_recording_is_never_written_over(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="exists already"):
         Recorder(folder, HEADER)
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_of_recorders_that_want_one_folder_each_gets_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quicker: list[Recorder] = []
+
+    def make(folder: Path) -> Recorder:
+        if not quicker:
+            quicker.append(Recorder(folder, HEADER))
+        elif len(quicker) == 1:  # its folder was there already, empty
+            monkeypatch.setattr("plow_twin.record.writer._is_free", lambda folder: True)
+            quicker.append(Recorder(folder, HEADER))
+        else:
+            monkeypatch.undo()
+        return Recorder(folder, HEADER)
+
+    own = in_free_folder(tmp_path / "run", make)
+    recorders = [*quicker, own]
+    for index, recorder in enumerate(recorders):
+        assert recorder.journal(paper_sample(index)) and recorder.close().complete
+    assert [recorder.path.parent.name for recorder in recorders] == ["run", "run_2", "run_3"]
+    for index, recorder in enumerate(recorders):
+        (record,) = RunReader(recorder.path)
+        assert isinstance(record, EntryRecord) and record.entry == paper_sample(index)
 
 
 def test_a_message_of_another_type_stops_the_recording_with_its_topic(tmp_path: Path) -> None:
