@@ -37,6 +37,8 @@ LOAD_COLOR: Final = (204, 121, 167)
 
 _SQUARE: Final[Array] = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
 _FLIP: Final[Array] = np.array([1.0, -1.0])
+_SIGNS: Final[Array] = np.stack((CORNER_X, CORNER_Y), axis=1)
+_OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Section:
 
     def corners(self) -> Array:
         """Corners of the frame in the order of `CORNER_NAMES`, shape (4, 2)."""
-        return (0.5 * self.frame * np.stack((CORNER_X, CORNER_Y), axis=1) * _FLIP)[::2]
+        return (0.5 * self.frame * _SIGNS * _FLIP)[::2]
 
     def head_strips(self, pose: Iterable[float]) -> Array:
         """Outlines of the cavity and of the body at a pose x, y [m], theta [rad], shape (2, 5, 2)."""
@@ -87,16 +89,7 @@ class Section:
         Walls in the order top, right, bottom, left; each is drawn through its two places beside the frame's corners, so
         that wear is part of it.
         """
-        corners = 0.5 * self.frame * np.stack((CORNER_X, CORNER_Y), axis=1)
-        outwards = (
-            np.stack((NORMAL_X, NORMAL_Y), axis=1)
-            * np.where(
-                (np.stack((NORMAL_X, NORMAL_Y), axis=1) * np.stack((CORNER_X, CORNER_Y), axis=1)).sum(axis=1) > 0.0,
-                1.0,
-                -1.0,
-            )[:, None]
-        )
-        places = (corners - outwards * (_MM * factor * penetration)[:, None]) * _FLIP
+        places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
         return places[walls], (penetration[walls] > 0.0).any(axis=1)
 
@@ -105,15 +98,14 @@ class Section:
 
         A bar lies along the wall that its pair touches, from the corner on. Each has shape (8, 2).
         """
-        corners = 0.5 * self.frame * np.stack((CORNER_X, CORNER_Y), axis=1)
-        outwards = np.abs(np.stack((NORMAL_X, NORMAL_Y), axis=1)) * np.sign(corners)
-        along = (np.abs(outwards) < 0.5) * np.sign(corners)
+        corners = 0.5 * self.frame * _SIGNS
+        along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
-        middles = (corners - 0.5 * depth * outwards - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
+        middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
         # well inside the frame, where no wall comes: two rows to a corner, that of its vertical wall nearer the middle
-        inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(outwards[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
+        inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
-        return middles, 0.5 * (depth * np.abs(outwards) + _PAD_MM * np.abs(along)), labels
+        return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels
 
     def head_points(self, pose: Iterable[float]) -> Array:
         """Centre of the cavity and the place of the head's name, shape (2, 2)."""
