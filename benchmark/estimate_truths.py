@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin import Clearance, Contact, Scene, Table, Wear, simulate
+from plow_twin import Clearance, Contact, Initial, Scene, Table, Wear, simulate
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.model.loads import compile_loads
 from plow_twin.scene_file import dump_scene, load_scene
@@ -173,11 +173,12 @@ def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array
     first = simulate(scene, _FROM * end, _FINE, 1e-6)
     table = scene.loads[0]
     assert isinstance(table, Table)
+    (qx, qy, theta), (vx, vy, omega) = first.q[-1].tolist(), first.v[-1].tolist()
     later = replace(
         scene,
         clearance=Clearance(scene.clearance.horizontal_m - group.jam_m, scene.clearance.vertical_m - group.jam_m),
         loads=(Table("later", table.t - _FROM * end + 1e-12, table.wrench),),
-        initial=replace(scene.initial, q=tuple(map(float, first.q[-1])), v=tuple(map(float, first.v[-1]))),
+        initial=Initial((qx, qy, theta), (vx, vy, omega)),
     )
     second = simulate(later, end - _FROM * end, _FINE, 1e-6)
     t = np.concatenate([first.t, second.t[1:] + _FROM * end])

@@ -31,9 +31,9 @@ def _force_function(sx: int, sy: int, p: Array, esym: Any) -> Callable[..., Any]
             force = k * inside * esym.sqrt(inside) * (1.0 + c * rate)
         return esym.IfThenElse(depth > 0.0, esym.max(zero, force), zero)
 
-    def function(
+    def function(  # type: ignore[no-untyped-def]
         mbs, t, itemNumber, displacement, rotation, velocity, angularVelocity, stiffness, damping, rotJ0, rotJ1, offset
-    ):  # type: ignore[no-untyped-def]
+    ):
         x, y, om = displacement[0], displacement[1], angularVelocity[2]
         fx = sx * push(sx * x - far_x, sx * (velocity[0] - om * y))
         fy = sy * push(sy * y - far_y, sy * (velocity[1] + om * x))

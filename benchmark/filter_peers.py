@@ -40,7 +40,6 @@ from plow_twin.solve.state import (
     STATE,
     TOTALS,
     WORK,
-    Parts,
     new_record,
     new_records,
     new_work,
@@ -60,7 +59,7 @@ _UNKNOWN_NOISE = 3e-4
 
 
 @kernel(entry=True)
-def move(params, parts, states, saved, work, totals, times, wrench, rows, pace) -> None:
+def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):  # type: ignore[no-untyped-def]
     """Let all members settle and advance them; arrays as `advance_batch` takes them."""
     for m in range(states.size):
         settle_modes(params[m], states[m], parts.terms.stick)
@@ -88,7 +87,7 @@ class Members:
         others = [compile_scene(replace(scene, clearance=one), TOLERANCE, sampled=True).params for one in wider]
         self._by_clearance = [(np.array(one["penetration_rows"]) - self._rows) / 1e-3 for one in others]
         self._nominal = np.array([clearance.horizontal_m, clearance.vertical_m])
-        self._parts = Parts(compiled.parts.terms, None, np.zeros(1, SEGMENT), new_implicit())
+        self._parts = compiled.parts._replace(segments=np.zeros(1, SEGMENT), implicit=new_implicit(support=False))
         self._work, self._totals = new_records(WORK, 1), new_records(TOTALS, 1)
         self._work[0] = new_work()
         self._masses = inertias(scene)
@@ -134,7 +133,8 @@ class Members:
 def seen(point: Array) -> Array:
     """Return the pose that the sensor tells at a state: late, and with its bias."""
     unknown = point[_FIRST:]
-    return point[:3] + unknown[7:10] - point[3:6] * unknown[10]
+    pose: Array = point[:3] + unknown[7:10] - point[3:6] * unknown[10]
+    return pose
 
 
 class Ukf(UnscentedKalmanFilter):  # type: ignore[misc]
@@ -158,6 +158,8 @@ class Ukf(UnscentedKalmanFilter):  # type: ignore[misc]
 
 class Enkf(EnsembleKalmanFilter):  # type: ignore[misc]
     """filterpy's EnKF, all members moved in one call."""
+
+    sigmas: Array
 
     def __init__(self, truth: Truth, seed: int) -> None:
         np.random.seed(seed)  # noqa: NPY002  filterpy draws from the global generator
@@ -196,9 +198,9 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     deviation = np.sqrt(np.maximum(np.diag(one.P)[_FIRST:], 0.0))
     row["cpu_s"] = time.process_time() - begin
     for axis, index in (("h", GX), ("v", GY)):
-        error = float(one.x[_FIRST + index] - truth.clearance[index])
-        inside = int(abs(error) <= NORMAL_P95 * deviation[index])
-        row |= {f"{axis}_error_m": error, f"{axis}_sd_m": float(deviation[index]), f"{axis}_inside": inside}
+        off = float(one.x[_FIRST + index] - truth.clearance[index])
+        inside = int(abs(off) <= NORMAL_P95 * deviation[index])
+        row |= {f"{axis}_error_m": off, f"{axis}_sd_m": float(deviation[index]), f"{axis}_inside": inside}
     return row
 
 

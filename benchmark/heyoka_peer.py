@@ -8,7 +8,8 @@ that. The batch integrator takes as many scenes side by side as a SIMD vector ha
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
 
@@ -22,9 +23,10 @@ _COOLDOWN = 1e-7
 _GX, _GY = 8, 9
 
 
-def _pairs(p: Array, x: Any, y: Any, th: Any, vx: Any, vy: Any, om: Any, hy: Any) -> list[tuple[Any, ...]]:
+def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
     """Return penetration, its rate, and the wrench in body axes per newton, of each pair (see `lean`)."""
     a, b, far_x, far_y = 0.5 * p[0], 0.5 * p[1], 0.5 * (p[0] + hy.par[_GX]), 0.5 * (p[1] + hy.par[_GY])
+    x, y, th, vx, vy, om = state
     c, s = hy.cos(th), hy.sin(th)
     bx, by, bvx, bvy = c * x + s * y, c * y - s * x, c * vx + s * vy, c * vy - s * vx
     pairs = []
@@ -47,7 +49,7 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
     fy: Any = 0.0
     torque: Any = 0.0
     guards = []
-    for i, (d, rate, along_x, along_y, arm) in enumerate(_pairs(p, *state, hy)):
+    for i, (d, rate, along_x, along_y, arm) in enumerate(_pairs(p, state, hy)):
         if p[9] == 1.0:
             law = p[8] * d + p[10] * rate
             force = hy.par[i] * law
@@ -69,7 +71,7 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
 
 def _begin_of(tol: float) -> float:
     """Return the penetration in m at which a force d^1.5 begins: its impulse until there is what a touch loses."""
-    return min(1e-6, max(1e-9, 1e-4 * tol ** (2.0 / 3.0)))
+    return min(1e-6, max(1e-9, 1e-4 * math.pow(tol, 2.0 / 3.0)))
 
 
 def _events(guards: list[tuple[Any, Any]], inside: Array, event: Any) -> list[Any]:

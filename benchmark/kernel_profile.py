@@ -27,7 +27,8 @@ SHOWN = 24
 
 def _collect() -> None:
     """Keep every library of compiled code together with its object code, fresh or from the cache."""
-    fresh, cached = codegen.JITCodeLibrary._finalize_specific, codegen.JITCodeLibrary._unserialize.__func__
+    kind: Any = codegen.JITCodeLibrary
+    fresh, cached = kind._finalize_specific, kind._unserialize.__func__
 
     def finalize(self: Any) -> None:
         fresh(self)
@@ -38,8 +39,8 @@ def _collect() -> None:
         _libraries.append((library, state[2][0] if isinstance(state[2], tuple) else b""))
         return library
 
-    codegen.JITCodeLibrary._finalize_specific = finalize
-    codegen.JITCodeLibrary._unserialize = classmethod(unserialize)
+    kind._finalize_specific = finalize
+    kind._unserialize = classmethod(unserialize)
 
 
 def _write_map() -> None:

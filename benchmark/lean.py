@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any, Final
 
 from cases import Array
 from numba import njit
+
+#: Numba's own types of its decorator do not let what it compiles be called.
+compiled: Final[Callable[[Any], Any]] = njit
+fast: Final[Callable[[Any], Any]] = njit(fastmath=True)
+inlined: Final[Callable[[Any], Any]] = njit(inline="always", fastmath=True)
 
 
 @njit(inline="always")
@@ -16,7 +23,7 @@ def _push(d: float, rate: float, k: float, n: float, c: float) -> float:
     return max(f, 0.0)
 
 
-@njit(inline="always", fastmath=True)
+@inlined
 def accelerations(t: float, x: float, y: float, th: float, vx: float, vy: float, om: float, p: Array):  # type: ignore[no-untyped-def]
     """Return x'', y'', theta'' of a bench scene with constants `p` (see `bench_scenes.constants`)."""
     c, s = math.cos(th), math.sin(th)
@@ -45,14 +52,14 @@ def accelerations(t: float, x: float, y: float, th: float, vx: float, vy: float,
     )
 
 
-@njit
+@compiled
 def rhs_into(t: float, y: Array, out: Array, p: Array) -> None:
     """Write the rate of y = (x, y, theta, vx, vy, omega)."""
     out[0], out[1], out[2] = y[3], y[4], y[5]
     out[3], out[4], out[5] = accelerations(t, y[0], y[1], y[2], y[3], y[4], y[5], p)
 
 
-@njit(fastmath=True)
+@fast
 def rk4(p: Array, dt: float, steps: int, stride: int, q: Array) -> None:
     """March from rest at the origin; row i of `q` is the pose after i stride steps."""
     x = y = th = vx = vy = om = 0.0

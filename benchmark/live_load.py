@@ -78,7 +78,7 @@ def echo(raw: bool = False) -> None:
             reply[4:12] = data[4:12]
             publisher.publish(bytes(reply))
 
-    profile = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    profile = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)  # type: ignore[no-untyped-call]
     how = answer_raw if raw else answer
     node.create_subscription(WrenchStamped, "/live_load/excitation", how, profile, raw=raw)
     executor = EventsExecutor()
@@ -146,7 +146,7 @@ class Probe:
     def close(self) -> None:
         """Take the node down."""
         self._executor.remove_node(self.node)
-        self.node.destroy_node()
+        self.node.destroy_node()  # type: ignore[no-untyped-call]
         self.context.try_shutdown()
 
 
@@ -313,7 +313,8 @@ def main() -> None:
     options = parser.parse_args()
     if options.role:
         role, *numbers = options.role
-        {"echo": echo, "raw_echo": partial(echo, True), "send": send}[role](*map(float, numbers))
+        roles: dict[str, Callable[..., None]] = {"echo": echo, "raw_echo": partial(echo, True), "send": send}
+        roles[role](*map(float, numbers))
         return
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", "91")

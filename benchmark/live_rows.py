@@ -25,7 +25,7 @@ _TWIN, _TWINS = "plow_twin Twin", "plow_twin TwinBatch"
 
 def sampled_rows(repeats: int, notify: Notify) -> Iterator[Row]:
     """Yield one twin in one call (`value`: times real time), then 256 together (`value`: share of a core)."""
-    scene, t = bench_scene("kv"), np.arange(1, 20_001) * 1e-3
+    scene, t = bench_scene("kv"), 1e-3 * np.arange(1.0, 20_001.0)
     p = constants(scene)
     wrench = np.sin(p[14] * t)[:, None] * p[11:14]
     notify("sampled load")

@@ -13,8 +13,11 @@ from collections.abc import Callable
 import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
-from numba import njit
+from lean import compiled, fast, inlined
+from numpy.typing import NDArray
 from scipy.integrate._ivp import dop853_coefficients as table
+
+Indexes = NDArray[np.int64]
 
 _STAGES = table.N_STAGES
 _A = np.ascontiguousarray(table.A)
@@ -29,7 +32,7 @@ _LOOKS = 4
 _AT_ONE_INSTANT = 64
 
 
-@njit(inline="always", fastmath=True)
+@inlined
 def _pair(i, c, s, bx, by, bvx, bvy, om, p):  # type: ignore[no-untyped-def]
     """Return penetration and rate of a pair, its normal in body axes and its arm (see `lean`)."""
     corner = i // 2
@@ -41,8 +44,8 @@ def _pair(i, c, s, bx, by, bvx, bvy, om, p):  # type: ignore[no-untyped-def]
     return sx * px - 0.5 * (p[0] + p[2]), sx * (-bvx + om * py), sx, 0.0, -sx * py
 
 
-@njit(fastmath=True)
-def _rate(t: float, y: Array, mode: Array, p: Array, out: Array) -> None:
+@fast
+def _rate(t: float, y: Array, mode: Indexes, p: Array, out: Array) -> None:
     """Write the rate of y = (x, y, theta, vx, vy, omega); pairs that are on act by their law, also where it pulls."""
     c, s, om = math.cos(y[2]), math.sin(y[2]), y[5]
     bx, by, bvx, bvy = c * y[0] + s * y[1], c * y[1] - s * y[0], c * y[3] + s * y[4], c * y[4] - s * y[3]
@@ -62,8 +65,8 @@ def _rate(t: float, y: Array, mode: Array, p: Array, out: Array) -> None:
     out[5] = (p[13] * load + torque) / p[5] - p[4] * p[6] * p[7] / p[5]
 
 
-@njit(fastmath=True)
-def _guards(y: Array, mode: Array, p: Array, out: Array) -> None:
+@fast
+def _guards(y: Array, mode: Indexes, p: Array, out: Array) -> None:
     """Write two numbers of each pair that stay positive while its mode lasts."""
     c, s, om = math.cos(y[2]), math.sin(y[2]), y[5]
     bx, by, bvx, bvy = c * y[0] + s * y[1], c * y[1] - s * y[0], c * y[3] + s * y[4], c * y[4] - s * y[3]
@@ -79,7 +82,7 @@ def _guards(y: Array, mode: Array, p: Array, out: Array) -> None:
                 out[2 * i] = 1.0
 
 
-@njit(fastmath=True)
+@fast
 def _dense(f: Array, y: Array, x: float, out: Array) -> None:
     """Write the state at the share x of a step from its seven interpolation terms, shape (7, 6)."""
     for j in range(6):
@@ -89,8 +92,10 @@ def _dense(f: Array, y: Array, x: float, out: Array) -> None:
         out[j] = y[j] + value
 
 
-@njit(fastmath=True)
-def _stages(t: float, y: Array, h: float, mode: Array, p: Array, k: Array, trial: Array, first: int, last: int) -> None:
+@fast
+def _stages(
+    t: float, y: Array, h: float, mode: Indexes, p: Array, k: Array, trial: Array, first: int, last: int
+) -> None:
     for s in range(first, last):
         for j in range(6):
             total = 0.0
@@ -100,7 +105,7 @@ def _stages(t: float, y: Array, h: float, mode: Array, p: Array, k: Array, trial
         _rate(t + _C[s] * h, trial, mode, p, k[s])
 
 
-@njit(fastmath=True)
+@fast
 def _error(y: Array, new: Array, h: float, k: Array, rtol: float) -> float:
     fifth = third = 0.0
     for j in range(6):
@@ -116,7 +121,7 @@ def _error(y: Array, new: Array, h: float, k: Array, rtol: float) -> float:
     return h * fifth / math.sqrt((fifth + 0.01 * third) * 6.0)
 
 
-@njit(fastmath=True)
+@fast
 def _interpolate(y: Array, new: Array, h: float, k: Array, f: Array) -> None:
     for j in range(6):
         change = new[j] - y[j]
@@ -129,8 +134,8 @@ def _interpolate(y: Array, new: Array, h: float, k: Array, f: Array) -> None:
             f[3 + r, j] = h * total
 
 
-@njit
-def _first_change(y: Array, f: Array, mode: Array, p: Array, at: Array, guards: Array):  # type: ignore[no-untyped-def]
+@compiled
+def _first_change(y: Array, f: Array, mode: Indexes, p: Array, at: Array, guards: Array):  # type: ignore[no-untyped-def]
     """Return the share of the step at which a guard first turns negative and its number, or (2, -1)."""
     for look in range(_LOOKS):
         low, high = look / _LOOKS, (look + 1) / _LOOKS
@@ -152,7 +157,7 @@ def _first_change(y: Array, f: Array, mode: Array, p: Array, at: Array, guards: 
     return 2.0, -1
 
 
-@njit
+@compiled
 def integrate(p: Array, rtol: float, output_dt: float, q: Array) -> tuple[int, int, int]:
     """Integrate from rest at the origin, fill the rows of q; return steps, evaluations, changes of contact."""
     k, f = np.zeros((_ROWS, 6)), np.zeros((7, 6))

@@ -18,7 +18,7 @@ Rhs = Callable[[float, Array], Array]
 
 
 def _grid(output_dt: float) -> Array:
-    return np.arange(round(T_END / output_dt) + 1) * output_dt
+    return np.arange(0.0, round(T_END / output_dt) + 1.0) * output_dt
 
 
 def _rhs(p: Array) -> Rhs:

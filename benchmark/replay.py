@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 from mcap.reader import make_reader
+from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 
 from plow_twin.record.chunks import ChunkReader
@@ -66,9 +67,10 @@ def least(work: Callable[[], object]) -> float:
     return min(times)
 
 
-def _wrenches(index: np.ndarray) -> np.ndarray:
+def _wrenches(index: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the loads of samples, shape (n, 3)."""
-    return np.sin(2e-3 * index)[:, None] * _AMPLITUDE
+    wrenches: NDArray[np.float64] = np.sin(2e-3 * index)[:, None] * _AMPLITUDE
+    return wrenches
 
 
 def move(seconds: float, rows: bool) -> None:
@@ -77,7 +79,8 @@ def move(seconds: float, rows: bool) -> None:
     index = np.arange(round(1000 * seconds))
     for begin in range(0, len(index), _BATCH):
         here = index[begin : begin + _BATCH]
-        twin.advance_marked(1e-3 * here, _wrenches(here), np.zeros(0, np.int64), rows=rows)
+        stamps = 1e-3 * here.astype(np.float64)
+        twin.advance_marked(stamps, _wrenches(here), np.zeros(0, np.int64), rows=rows)
 
 
 def decompress_all(path: Path) -> None:

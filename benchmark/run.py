@@ -109,8 +109,8 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
     if "start" in chosen:
         rows += live_rows.start_rows(notify)
     if "ensemble" in chosen:
-        size = (3, 2, ()) if quick else (ensemble_rows.COLUMNS, ensemble_rows.ROWS, (1e-3, 1e-4))
-        rows += ensemble_rows.ensemble_rows(*size, repeats=min(repeats, 3), notify=notify)
+        columns, lines, steps = (3, 2, ()) if quick else (ensemble_rows.COLUMNS, ensemble_rows.ROWS, (1e-3, 1e-4))
+        rows += ensemble_rows.ensemble_rows(columns, lines, steps, min(repeats, 3), notify)
     if "random_scenes" in chosen:
         rows += random_rows.random_rows(quick, notify)
     return rows

@@ -10,7 +10,7 @@ from bench_scenes import SPARSE, T_END, bench_scene, error_scale
 from cases import Array, Case, Row, pose_error
 from work_precision import OURS, OURS_BARE, prepare_bare, prepare_simulate
 
-from plow_twin import Friction, Gravity, Initial, Scene
+from plow_twin import Friction, Gravity, Harmonic, Initial, Scene
 
 TOL = 1e-6
 HOUR_S = 3600.0
@@ -49,10 +49,16 @@ def flight_scene() -> Scene:
     return dataclasses.replace(still_scene(), gravity=Gravity(0.0), initial=Initial(v=(1e-7, 1e-7, 0.0)))
 
 
+def _harmonic(scene: Scene) -> Harmonic:
+    (load,) = scene.loads
+    assert isinstance(load, Harmonic)
+    return load
+
+
 def swaying_scene() -> Scene:
     """Return the KV scene weightless under a load too small to carry the head to a wall: driven flight."""
     scene = bench_scene("kv")
-    (load,) = scene.loads
+    load = _harmonic(scene)
     omega = 20.0
     # at rest in the mean: x = -(F / m omega^2) sin(omega t)
     force = (200.0, 50.0)
@@ -86,7 +92,7 @@ def add_steps_per_hour(rows: Sequence[Row]) -> None:
 def event_cases(quick: bool) -> Iterator[Case]:
     """Yield scenes with few and many contact events over the same 20 s."""
     scene = bench_scene("kv")
-    (load,) = scene.loads
+    load = _harmonic(scene)
     if not quick:
         yield _event_case("free flight", flight_scene())
         yield _event_case("falls and comes to rest", still_scene())

@@ -23,7 +23,7 @@ class Units(Extension):
 
 
 def _text(function: str, call: ast.Call) -> str | None:
-    words = [argument.value for argument in call.args if isinstance(argument, ast.Constant)]
+    words = [str(argument.value) for argument in call.args if isinstance(argument, ast.Constant)]
     if function == "_quantity":
         bounds = {word.arg: ast.unparse(word.value) for word in call.keywords}
         signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}

@@ -32,7 +32,7 @@ def start_viewer(port: int) -> subprocess.Popen[bytes]:
     rerun = Path(sys.executable).with_name("rerun")
     subprocess.run([rerun, "analytics", "disable"], check=True, capture_output=True)
     window = f"{SIZE[0]}x{SIZE[1]}"
-    command = [rerun, "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", window]
+    command = [str(rerun), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", window]
     return subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
