@@ -17,6 +17,7 @@ from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import ROOT, bench, value
 from rosgraph_msgs.msg import Clock
@@ -204,6 +205,43 @@ def test_one_publisher_is_followed_and_a_second_said_until_a_switch_is_asked_for
     senders = [found["sender"] for found in unused]
     assert all(name.startswith(f"{running.namespace}/probe ") for name in senders)
     assert senders[0] == senders[39] != senders[40]
+
+
+def test_of_several_publishers_of_an_optional_input_one_is_followed(tmp_path: Path) -> None:
+    kinds = {"travel": TwistStamped, "head_pose": PoseStamped, "gaps": JointState}
+    with bench(tmp_path, record_path=tmp_path / "run") as running:
+        probe, node = running.probe, running.probe.node
+
+        def publish(topic: str, publisher: Publisher, index: int, number: float) -> None:
+            message = kinds[topic]()
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(T0 + index * MS, 10**9)
+            if topic == "travel":
+                message.twist.linear.z = number
+            elif topic == "head_pose":
+                message.pose.position.x = number
+            else:
+                message.name, message.position = ["top_left_top"], [number]
+            publisher.publish(message)
+
+        for topic, kind in kinds.items():
+            first, second = probe.publisher(kind, topic), probe.publisher(kind, topic)
+            for index in range(20):
+                publish(topic, first, 2 * index, 0.001)
+                probe.pause(0.002)
+                publish(topic, second, 2 * index + 1, 0.002)
+            probe.until_figure("input", f"{topic}_not_followed", "20")
+            assert probe.figures("input")[f"{topic}_used"] == "20"
+            said = f"another publisher of {topic} sends too and is not followed"
+            probe.until(lambda text=said: text in probe.status[-1].message, said)
+            node.destroy_publisher(first)
+            probe.until(lambda key=f"publishers_{topic}": value(probe.status[-1], key) == "1", "the end of the first")
+            publish(topic, second, 100, 0.002)
+            probe.until_figure("input", f"{topic}_used", "21")
+            node.destroy_publisher(second)
+        assert running.twin.stop() == 0
+    unused = list(unused_messages(tmp_path / "run"))
+    assert [found["input"] for found in unused] == [topic for topic in kinds for _ in range(20)]
+    assert {(found["reason"], *found["values"][:1]) for found in unused} == {("not_followed", 0.002)}
 
 
 def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(tmp_path: Path) -> None:

@@ -105,10 +105,12 @@ def test_a_late_burst_after_a_long_silence_is_dropped_and_the_model_goes_on() ->
     assert "Reset" not in bench.kinds()
     assert driver.session.twin.digest() == digest
     assert bench.sample(T0 + 3000 * MS, LOAD, now_ns=3000 * MS) is not None
-    # repeated just after a jump, it is a duplicate and not late
-    assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is not None
+    # one that jumps is no step of the clock because it came twice, and a duplicate just after one is not late
     assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
-    assert counters(driver)["dropped_duplicate"] == 1
+    assert bench.sample(T0 - 60 * NS_PER_S, LOAD, now_ns=3001 * MS) is None
+    assert bench.sample(T0 - 60 * NS_PER_S + MS, LOAD, now_ns=3001 * MS) is not None
+    assert bench.sample(T0 - 60 * NS_PER_S + MS, LOAD, now_ns=3001 * MS) is None
+    assert counters(driver)["dropped_duplicate"] == 2 and bench.kinds().count("Reset") == 1
 
 
 def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_reset() -> None:
@@ -182,18 +184,50 @@ def test_batches_give_the_bits_of_single_samples_and_a_journal_that_repeats_them
         assert np.asarray(getattr(one, name)).tobytes() == np.asarray(getattr(other, name)).tobytes(), name
 
 
-@pytest.mark.parametrize("every", [100, 2])
-def test_wrong_stamps_among_right_ones_keep_no_right_one_out(every: int) -> None:
+@pytest.mark.parametrize("batch", [1, 40])
+@pytest.mark.parametrize("every", [900, 100, 2])
+def test_single_wrong_stamps_move_nothing_and_keep_no_right_one_out(every: int, batch: int) -> None:
+    right, bench = Bench(every_sample=False), Bench(every_sample=False)
+    arrived, wrong = [], 0
+    for index in range(2000):
+        if index % every == every - 1:
+            wrong += 1
+            arrived.append((T0 + (index + (86_400_000 if wrong % 2 else -3_600_000)) * MS, LOAD))
+        arrived.append((T0 + index * MS, LOAD))
+    for begin in range(0, len(arrived), batch):
+        list(bench.driver.samples(arrived[begin : begin + batch], now_ns=begin * MS))
+    list(right.driver.samples([arrival for arrival in arrived if 0 <= arrival[0] - T0 < 2000 * MS], now_ns=0))
+    counted = counters(bench.driver)
+    assert (counted["resets"], counted["dropped_stray"], counted["samples_used"]) == (0, wrong, 2000)
+    assert bench.journal == right.journal
+    assert bench.driver.unsteady(len(arrived) * MS) == (wrong >= 5)
+
+
+def test_wrong_stamps_one_after_another_reset_no_more_than_five_times_and_keep_no_right_one_out() -> None:
     bench = Bench()
     for index in range(2000):
-        wrong = index % every == every - 1
-        ahead_ns = (86_400 if index % 3 else -3600) * NS_PER_S if wrong else 0
+        ahead_ns = (86_400 if index % 3 else -3600) * NS_PER_S if index % 100 >= 97 else 0
         bench.sample(T0 + index * MS + ahead_ns, LOAD, now_ns=index * MS)
+    bench.driver.pause()
     counted = counters(bench.driver)
     # five in ten seconds may be a step of the clock, each with the way back
-    assert counted["resets"] == 10
-    assert counted["dropped_unsteady"] == 2000 // every - 5
-    assert counted["samples_used"] + counted["dropped_unsteady"] == 2000
+    assert counted["resets"] <= 10
+    assert counted["samples_used"] >= 1900
+    assert counted["samples_used"] + counted["dropped_unsteady"] + counted["dropped_stray"] == 2000
+
+
+def test_a_sample_that_jumps_is_used_when_none_follows_and_counted_when_the_twin_is_paused() -> None:
+    bench = Bench(Policy(excitation_timeout_s=0.1))
+    bench.sample(T0, LOAD, now_ns=0)
+    assert bench.sample(T0 + 60 * NS_PER_S, LOAD, now_ns=MS) is None
+    assert bench.driver.silence(50 * MS) is None and bench.kinds() == ["Sample"]
+    published = bench.driver.silence(102 * MS)
+    assert published is not None and published.stamp_ns == T0 + 60 * NS_PER_S
+    assert bench.kinds() == ["Sample", "Reset", "Sample"]
+    assert bench.sample(T0, LOAD, now_ns=103 * MS) is None
+    bench.driver.pause()
+    counted = counters(bench.driver)
+    assert (counted["samples_in"], counted["samples_used"], counted["dropped_stray"]) == (3, 2, 1)
 
 
 @pytest.mark.parametrize("every_sample", [True, False])

@@ -155,7 +155,8 @@ def test_wear_outlives_resets_failures_and_clock_steps_and_a_held_load_wears_not
     live.driver.reset(T0, "service")
     live.send((T0 + 5, (0.0, 0.0, 0.0)), (T0 + MS, (1e200, 0.0, 0.0)), (T0 + 2 * MS, (1e200, 0.0, 0.0)))
     assert live.driver.resets == 2
-    live.send((T0 + 3 * MS, (0.0, 0.0, 0.0)), (T0 - 3000 * MS, (0.0, 0.0, 0.0)), (T0 + 60_000 * MS, (0.0, 0.0, 0.0)))
+    for stamp_ms in (3, -3000, -2999, 60_000, 60_001):
+        live.send((T0 + stamp_ms * MS, (0.0, 0.0, 0.0)))
     assert live.driver.resets == 4
     assert (live.wear >= worn).all() and (live.wear - worn).max() < 1e-3 * worn.max()
     pads = tuple(1e-4 * index for index in range(8))
@@ -206,16 +207,17 @@ def test_a_hold_without_end_ends() -> None:
 
 def test_clocks_out_of_step_end_in_an_error_and_not_in_resets_for_ever() -> None:
     live = Live()
-    for index in range(200):
-        live.send(_arrival(2000 + index), _arrival(index), now_ns=index * MS)
+    for index in range(0, 200, 2):
+        for behind in (2000, 0):
+            live.send(_arrival(behind + index), _arrival(behind + index + 1), now_ns=index * MS)
     assert live.driver.resets == 5
     assert live.driver.unsteady(200 * MS)
     counted = counters(live.driver)
     dropped = sum(count for key, count in counted.items() if key.startswith("dropped_"))
-    assert counted["samples_used"] + dropped == 400
-    assert counted["dropped_unsteady"] > 150
+    assert counted["samples_used"] + dropped + (live.driver._steps._jumped is not None) == 400
+    assert counted["dropped_unsteady"] > 50
     # once it is steady again, a step is a step
-    live.send(_arrival(60_000), now_ns=20_000 * MS)
+    live.send(_arrival(60_000), _arrival(60_001), now_ns=20_000 * MS)
     assert live.driver.resets == 6 and not live.driver.unsteady(20_000 * MS)
 
 

@@ -104,6 +104,7 @@ def test_stamps_of_any_size_are_counted_and_move_nothing(tmp_path: Path) -> None
     found = analyse(file, scene=PAPER, mapping=tmp_path / "map.yaml")
     dropped = sum(count for name, count in found.input.items() if name.startswith("dropped_"))
     assert found.input["samples_in"] == COUNT + len(odd) == found.input["samples_used"] + dropped
+    assert found.input["dropped_stray"] == 1 and "jump_forward" not in found.input
     assert found.lossy and found.predictions[0].loads.largest.max() < 1e6
 
 

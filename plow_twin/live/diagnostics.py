@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Final
 
-from plow_twin.live.inputs import TOPICS
+from plow_twin.live.inputs import OPTIONAL, TOPICS
 from plow_twin.live.part import Part
 from plow_twin.stream.driver import StreamState, counters
 from plow_twin.stream.intake import Intake, Verdict
@@ -52,6 +52,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "dropped_late": "dropped: newer than the sample before, but behind the model and all it keeps",
         "dropped_implausible": "dropped: larger, or changed faster, than limit_force and the others allow",
         "dropped_unsteady": "dropped: the stamps jump again and again, and the model is not reset each time",
+        "dropped_stray": "dropped: the stamp jumped, and the next one went on from before it",
         "dropped_malformed": "dropped: names do not match the loads of the scene",
         "dropped_not_selected": "ignored: not the selected excitation source",
         "dropped_inactive": "ignored: the node was not active",
@@ -64,12 +65,15 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "travel_dropped": "speeds along the face dropped",
         "travel_misplaced": "speeds used that act from the time reached on: their stamps are of another clock",
         "travel_implausible": "of these, beyond limit_travel or what the damping allows, or changed faster than it can",
+        "travel_not_followed": "speeds of other publishers than the one followed; not used",
         "head_pose_used": "measured poses used",
         "head_pose_dropped": "measured poses dropped",
         "head_pose_implausible": "of these, larger than limit_pose, or changed faster than it can",
+        "head_pose_not_followed": "poses of other publishers than the one followed; not used",
         "gaps_used": "measurements of gaps used",
         "gaps_dropped": "measurements of gaps dropped",
         "gaps_implausible": "of these, larger than limit_gap, or changed faster than it can",
+        "gaps_not_followed": "gaps of other publishers than the one followed; not used",
         "head_pose_residual": "model minus newest measured pose: x, y [m], theta [rad]; empty without one",
         "refused_publishers": "publishers that cannot connect: quality of service or type is incompatible",
     },
@@ -169,8 +173,9 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         return OK, lifecycle, values
     level = _LEVELS[state]
     said = [f"{state.value}: {runtime.driver.failure}" if state is StreamState.FAILED else state.value]
+    others = runtime.inputs.other_senders()
     troubles = [
-        (ERROR, runtime.unsteady, "the stamps jump again and again: too many resets, samples are dropped"),
+        (ERROR, runtime.unsteady, "the stamps jump again and again: samples are dropped"),
         (ERROR, values["recorder"] == "trouble", "the recording has lost something or has stopped"),
         (ERROR, bool(runtime.wear_error), runtime.wear_error),
         (WARN, estimation is not None and bool(estimation.error), estimation.error if estimation else ""),
@@ -181,7 +186,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         ),
         (OK, runtime.clock == "paused", "/clock is paused"),
         (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
-        (WARN, runtime.inputs.other_sender, "another publisher sends too and is not followed"),
+        (WARN, bool(others), f"another publisher of {', '.join(others)} sends too and is not followed"),
         (WARN, bool(runtime.inputs.silent()), f"silent: {', '.join(runtime.inputs.silent())}"),
     ]
     for trouble_level, there, text in troubles:
@@ -260,12 +265,14 @@ class Health:
             "head_pose_dropped": str(inputs.head_pose.arrived - inputs.head_pose.used),
             "head_pose_residual": "" if residual is None else "{:.6g} {:.6g} {:.6g}".format(*residual),
             "refused_publishers": str(inputs.refused_publishers),
+            **{f"{topic}_not_followed": str(one.ignored) for topic, one in inputs.optional.items()},
         }
         more = {
             "samples_lost": inputs.senders.lost,
             "samples_not_followed": inputs.senders.ignored,
             "messages_lost": inputs.lost,
-            **{f"{topic}_dropped": _refused(getattr(inputs, topic)) for topic in ("travel", "head_pose", "gaps")},
+            **{f"{topic}_dropped": _refused(getattr(inputs, topic)) for topic in OPTIONAL},
+            **{f"{topic}_not_followed": one.ignored for topic, one in inputs.optional.items()},
         }
         grown = self._grown({**counted, **more}, _TROUBLE)
         if peak > inputs.depth // 2:
@@ -359,6 +366,7 @@ _TROUBLE: Final = (
     "dropped_late",
     "dropped_implausible",
     "dropped_unsteady",
+    "dropped_stray",
     "rolled_back",
     "dropped_malformed",
     "dropped_not_selected",
@@ -373,6 +381,9 @@ _TROUBLE: Final = (
     "travel_misplaced",
     "head_pose_dropped",
     "gaps_dropped",
+    "travel_not_followed",
+    "head_pose_not_followed",
+    "gaps_not_followed",
 )
 
 

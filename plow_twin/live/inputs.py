@@ -13,10 +13,12 @@ from plow_twin.live.unused import UnusedMessages
 from plow_twin.stream.history import RecentStamps
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.limits import Limits
-from plow_twin.stream.senders import Senders
+from plow_twin.stream.senders import OneSender, Senders
 
 #: The inputs, as topics are named.
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
+#: Those besides the load.
+OPTIONAL: Final = ("travel", "head_pose", "gaps")
 #: Another sender counts as there for so long after its last sample [ns].
 _OTHER_SENDER_NS: Final = 3_000_000_000
 #: An optional input that has been heard counts as silent after so long [ns].
@@ -68,11 +70,13 @@ class Inputs:
         self.without_clock: Callable[[], bool] = lambda: False
         #: senders of the selected source
         self.senders = Senders()
-        #: called when it may be that the followed sender has gone
-        self.look_for_senders: Callable[[], None] = lambda: None
+        #: senders of the optional inputs
+        self.optional = {topic: OneSender() for topic in OPTIONAL}
+        #: called with the input when it may be that its followed sender has gone
+        self.look_for_senders: Callable[[str], None] = lambda topic: None
         self._queue_peak = (0, 0.0)
         self._heard_ns: dict[str, int] = {}
-        self._other_heard_ns = -_OTHER_SENDER_NS
+        self._other_heard_ns: dict[str, int] = {}
         #: messages that were sent and could not be read, as far as the transport tells
         self.lost = 0
         self.travel, self.head_pose, self.gaps = Intake(), Intake(), Intake()
@@ -94,10 +98,10 @@ class Inputs:
         """Set what is used of speeds along the face [m/s], of poses (x, y [m], theta [rad]) and of gaps [m]."""
         self.travel.limits, self.head_pose.limits, self._gap_limits = travel, pose, gap
 
-    @property
-    def other_sender(self) -> bool:
-        """Whether another sender than the one followed sends on the selected source."""
-        return time.monotonic_ns() - self._other_heard_ns < _OTHER_SENDER_NS
+    def other_senders(self) -> list[str]:
+        """Return the inputs on which another sender than the one followed sends too."""
+        now_ns = time.monotonic_ns()
+        return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
     def silent(self) -> list[str]:
         """Return the optional inputs that have been heard and are silent now."""
@@ -122,18 +126,32 @@ class Inputs:
         followed = self.senders.hear(sender, number)
         self.unused.note_lost(self._source, sender, self.senders.lost - lost)
         if not followed:
-            if not self.other_sender:
-                self.look_for_senders()
-            self._other_heard_ns = time.monotonic_ns()
-            self.unused.note(self._source, sender, "not_followed", stamp_ns, values)
+            self._other_heard(self._source, sender, stamp_ns, values)
         elif not self.active:
             self._intake.refuse(Verdict.INACTIVE, stamp_ns, values)
         elif not fits:
             self._intake.refuse(Verdict.MALFORMED, stamp_ns, values)
         return followed and self.active and fits
 
+    def _other_heard(self, topic: str, sender: bytes, stamp_ns: int, values: Sequence[float]) -> None:
+        """Take note of a message of a sender that is not followed."""
+        if topic not in self.other_senders():
+            self.look_for_senders(topic)
+        self._other_heard_ns[topic] = time.monotonic_ns()
+        self.unused.note(topic, sender, "not_followed", stamp_ns, values)
+
+    def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
+        """Tell whether the sender of the message on an optional input is the one followed; counted, when it is not."""
+        sender = self.arriving[1]
+        followed = self.optional[topic].hear(sender, time.monotonic_ns())
+        if not followed:
+            self._other_heard(topic, sender, stamp_ns, values)
+        return followed
+
     def take_travel(self, stamp_ns: int, speed_m_s: float) -> None:
         """Take in a speed along the face."""
+        if not self._follows("travel", stamp_ns, (speed_m_s,)):
+            return
         if self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used:
             self._on_travel(stamp_ns, speed_m_s)
 
@@ -142,6 +160,8 @@ class Inputs:
 
         A component that was not measured is NaN, not all of them.
         """
+        if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
+            return
         missing = [math.isnan(value) for value in pose]
         # what was not measured breaks no limit
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
@@ -161,6 +181,8 @@ class Inputs:
     def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
         """Take in measured gaps [m] by number of their pairs."""
         values = tuple(gaps.values())
+        if not self._follows("gaps", stamp_ns, values):
+            return
         if self.active and self._is_implausible(stamp_ns, gaps):
             self.gaps.refuse(Verdict.IMPLAUSIBLE, stamp_ns, values)
             return

@@ -237,6 +237,7 @@ class Runtime:
     def deactivate(self) -> None:
         """Stop taking samples."""
         self.inputs.active = False
+        self.driver.pause()
         self._journal_unused()
 
     def close(self) -> list[str]:
@@ -326,7 +327,7 @@ class Runtime:
         """Go on without samples when they have been missing for too long."""
         holds = self.driver.holds
         publication = self.driver.silence(time.monotonic_ns())
-        if self.driver.holds != holds:
+        if publication is not None or self.driver.holds != holds:
             # what is published next answers no message
             self.publishing.received_ns = 0
             self.publishing.publish(publication)
@@ -440,7 +441,7 @@ class Runtime:
             if self._front.follows_samples and self.recording.behind:
                 # nothing is late: a bounded pause lets the recorder's thread catch up
                 time.sleep(_CATCH_UP_S)
-        seen = (self.driver.state, self.inputs.other_sender, self.unsteady)
+        seen = (self.driver.state, tuple(self.inputs.other_senders()), self.unsteady)
         if seen != self._seen:
             self._seen = seen
             self._front.changed()

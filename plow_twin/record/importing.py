@@ -23,6 +23,7 @@ from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.journal import Digest, Entry, Loss, Reset, SetWear, Snapshot, Travel
 from plow_twin.stream.outputs import Publications
 from plow_twin.stream.session import DIGEST_INTERVAL, Session
+from plow_twin.stream.steps import Steps
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
@@ -230,6 +231,9 @@ class Feed:
     _log_times: list[int] = field(default_factory=list)
     _reached_ns: int | None = None
 
+    def __post_init__(self) -> None:
+        self._steps = Steps(self.intake)
+
     def run(self, messages: Iterable[Arrived]) -> None:
         """Take in all messages.
 
@@ -245,6 +249,7 @@ class Feed:
                 self.intake.refuse(Verdict.MALFORMED)
             else:
                 self.unfit += 1
+        self._steps.end()
         self.flush()
         if not self.intake.used:
             topic = self.roles["excitation"].topic if "excitation" in self.roles else "none"
@@ -265,7 +270,9 @@ class Feed:
                     # at once: a speed of the future would have to wait for its time
                     walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":
-            self._sample(stamp_ns, (values["fx"], values["fy"], values["m"]), log_time_ns)
+            wrench = (values["fx"], values["fy"], values["m"])
+            for settled in self._steps.settle(stamp_ns, wrench, log_time_ns, self._reached_ns):
+                self._sample(*settled)
         elif stamp_ns > 0:
             self.measured(name, stamp_ns, values)
         else:

@@ -89,13 +89,16 @@ class Subscriptions:
         with self._turns:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
-            if self._source in present:
-                self._look_for_senders()  # anew: samples may have been taken since
+            for topic in present:
+                self._look_for_senders(topic)  # anew: messages may have been taken since
         self._on_changed()
 
-    def _look_for_senders(self) -> None:
-        """Find out whether the followed publisher is still there."""
-        self._inputs.senders.alive(self._present(self._source))
+    def _look_for_senders(self, topic: str) -> None:
+        """Find out whether the followed publisher of an input is still there."""
+        if topic == self._source:
+            self._inputs.senders.alive(self._present(topic))
+        elif topic in self._inputs.optional:
+            self._inputs.optional[topic].alive(self._present(topic))
 
     def _present(self, topic: str) -> list[bytes]:
         """Return the publishers of an input that there are."""

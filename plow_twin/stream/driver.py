@@ -6,7 +6,7 @@ import json
 import math
 from bisect import insort
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -33,6 +33,7 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
+from plow_twin.stream.steps import Steps
 
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
 Arrival = tuple[int, tuple[float, float, float]]
@@ -102,6 +103,7 @@ class Driver:
         #: steady times of the latest resets [ns], and of the latest one refused
         self._resets_ns: deque[int] = deque()
         self._unsteady_ns: int | None = None
+        self._steps = Steps(intake)
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
         self._failures_in_row = 0
         self._received_ns = 0
@@ -122,7 +124,17 @@ class Driver:
         """Judge samples in order of arrival, advance to those that are used, and yield what is to be published.
 
         The caller publishes each publication before it asks for the next, so that a recording holds them in order.
+        A sample whose stamp jumps waits for the next one.
         """
+        yield from self._samples(self._settled(arrived, now_ns), now_ns)
+
+    def _settled(self, arrived: Sequence[Arrival], now_ns: int) -> Iterator[Arrival]:
+        settle, session = self._steps.settle, self.session
+        for stamp_ns, wrench in arrived:
+            for settled in settle(stamp_ns, wrench, now_ns, session.stamp_ns):
+                yield settled[:2]
+
+    def _samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Publication]:
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
             late = bool(run) and self._is_late(run[0])
@@ -155,7 +167,12 @@ class Driver:
         """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
         if self._newest_ns is None:
             return None
-        silent_ns = now_ns - self._received_ns - round(self.policy.excitation_timeout_s * NS_PER_S)
+        timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
+        jumped = self._steps.unopposed(now_ns, timeout_ns)
+        if jumped is not None:
+            published = list(self._samples([jumped[:2]], now_ns))
+            return published[-1] if published else None
+        silent_ns = now_ns - self._received_ns - timeout_ns
         if silent_ns <= 0:
             return None
         limit_ns = round(self.policy.hold_limit_s * NS_PER_S)
@@ -266,8 +283,9 @@ class Driver:
         self.clock.restart()
 
     def unsteady(self, now_ns: int) -> bool:
-        """Tell whether a reset was refused lately because there were too many."""
-        return self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
+        """Tell whether stamps jumped again and again lately: resets were refused, or many stamps were stray."""
+        refused = self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
+        return refused or self._steps.unsteady(now_ns)
 
     def reset(self, stamp_ns: int, reason: str) -> None:
         """Put the motion back to its initial state, the wear stays; the next sample starts the time anew."""
@@ -279,6 +297,10 @@ class Driver:
         """Let silence and the clock count from now on: the time spent inactive is not caught up."""
         self._received_ns = now_ns
         self._resumed = True
+
+    def pause(self) -> None:
+        """No sample comes for now: one that waits for the next is counted."""
+        self._steps.end()
 
     def close(self) -> None:
         """End the journal."""

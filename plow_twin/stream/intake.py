@@ -46,6 +46,8 @@ class Verdict(Enum):
     IMPLAUSIBLE = "implausible"
     #: the stamps jump again and again: the model is not reset each time
     UNSTEADY = "unsteady"
+    #: the stamp jumped, and the next one went on from before: it was wrong, no step of the sender's clock
+    STRAY = "stray"
     #: names or lengths of the message do not fit the scene
     MALFORMED = "malformed"
     #: came on a topic that is not the selected excitation source
@@ -166,6 +168,18 @@ class Intake:
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
             self._newest_ns, self._newest_values = stamp_ns, values
         return verdict
+
+    def jumps(self, stamp_ns: int, reached_ns: int | None = None) -> bool:
+        """Tell whether a stamp is a step of the sender's clock away from those before, as `judge` would find."""
+        newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
+        if newest_ns is None or stamp_ns <= 0:
+            return False
+        return not self.near(stamp_ns, newest_ns, reached_ns)
+
+    def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
+        """Tell whether a stamp may come after the newest one and the time reached without a step of the clock."""
+        ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
+        return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
         """Count a sample that was dropped before it could be judged; what could not be read has no values."""

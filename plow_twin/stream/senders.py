@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
+#: Silence after which another sender is followed, where nobody can ask for a switch [ns].
+_SILENT_NS = 10_000_000_000
 #: Senders whose numbers are remembered; the oldest is forgotten.
 _MOST_SENDERS = 64
 
@@ -75,3 +77,31 @@ class Senders:
     def _follow(self, sender: bytes) -> None:
         self.switches += bool(self._next)
         self.followed = sender
+
+
+class OneSender:
+    """Follow the first sender heard until it has gone, or has been silent for 10 s while another sends."""
+
+    def __init__(self) -> None:
+        #: the sender followed; None before the first message and after it has gone
+        self.followed: bytes | None = None
+        #: messages of the other senders, which are not used
+        self.ignored = 0
+        self._heard_ns = 0
+        self._listed: set[bytes] = set()
+
+    def hear(self, sender: bytes, now_ns: int) -> bool:
+        """Take in the arrival of a message at a steady time [ns]; True when its sender is followed."""
+        if self.followed is None or now_ns - self._heard_ns > _SILENT_NS:
+            self.followed = sender
+        if sender != self.followed:
+            self.ignored += 1
+            return False
+        self._heard_ns = now_ns
+        return True
+
+    def alive(self, present: Collection[bytes]) -> None:
+        """Take note of the senders that there are, as of `Senders`."""
+        if self.followed in self._listed.difference(present):
+            self.followed = None
+        self._listed = set(present)

@@ -1,0 +1,77 @@
+"""Steps of a sender's clock, told from single wrong stamps: a sample whose stamp jumps waits for the next one."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
+
+#: As many stray stamps in that time [ns] are no accident any more.
+_MOST_STRAYS: Final = 5
+_WINDOW_NS: Final = 10 * NS_PER_S
+
+#: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample, and when it arrived [ns].
+Timed = tuple[int, tuple[float, float, float], int]
+
+
+class Steps:
+    """Keep back a sample whose stamp jumps until the next one goes on from it: a single wrong stamp moves nothing.
+
+    Parameters
+    ----------
+    intake
+        What judges the samples; a stray one is counted there.
+    """
+
+    def __init__(self, intake: Intake) -> None:
+        self._intake = intake
+        #: the latest sample, where its stamp jumped
+        self._jumped: Timed | None = None
+        #: when the latest stray stamps were found out [ns]
+        self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)
+
+    def settle(
+        self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, reached_ns: int | None
+    ) -> tuple[Timed, ...]:
+        """Take in a sample; return those that can be judged now, in order of arrival."""
+        jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
+        arrival = stamp_ns, wrench, now_ns
+        if jumped is None or stamp_ns <= 0:  # an unstamped one tells nothing
+            if not jumps:
+                return (arrival,)
+            self._jumped = arrival
+            return ()
+        if stamp_ns == jumped[0]:
+            self._intake.refuse(Verdict.DUPLICATE, stamp_ns, wrench)
+            return ()
+        self._jumped = None
+        if jumps and self._intake.near(stamp_ns, jumped[0]):
+            return jumped, arrival
+        self._intake.refuse(Verdict.STRAY, *jumped[:2])
+        self._strays_ns.append(now_ns)
+        if not jumps:
+            return (arrival,)
+        self._jumped = arrival
+        return ()
+
+    def unopposed(self, now_ns: int, silence_ns: int) -> Timed | None:
+        """Return the sample that waits, once nothing that speaks against it has come for so long."""
+        jumped = self._jumped
+        if jumped is None or now_ns - jumped[2] <= silence_ns:
+            return None
+        self._jumped = None
+        return jumped
+
+    def end(self) -> None:
+        """Count a sample that still waits: no next one comes."""
+        jumped, self._jumped = self._jumped, None
+        if jumped is not None:
+            self._intake.refuse(Verdict.STRAY, *jumped[:2])
+
+    def unsteady(self, now_ns: int) -> bool:
+        """Tell whether many stamps were stray lately."""
+        strays_ns = self._strays_ns
+        if len(strays_ns) < _MOST_STRAYS or now_ns - strays_ns[-1] >= _WINDOW_NS:
+            return False
+        return strays_ns[-1] - strays_ns[0] < _WINDOW_NS
