@@ -24,6 +24,7 @@ from plow_twin import (
     Initial,
     Scene,
     SceneError,
+    ToleranceWarning,
     Twin,
     TwinBatch,
     simulate,
@@ -276,3 +277,73 @@ def test_what_makes_no_friction_is_refused() -> None:
     ):
         with pytest.raises(SceneError, match=problem):
             replace(preset("paper"), friction=friction)
+
+
+def held_scene(law: str, seed: int) -> Scene:
+    """A random head that a load of moderate size drags along its walls: light or heavy, soft or stiff grips."""
+    random = np.random.default_rng(seed)
+
+    def decades(low: float, high: float) -> float:
+        return float(10.0 ** random.uniform(math.log10(low), math.log10(high)))
+
+    def spread(*scale: float) -> tuple[float, ...]:
+        return tuple(random.uniform(-1.0, 1.0, len(scale)) * scale)
+
+    mass, size, share = decades(10.0, 1e4), decades(0.1, 1.0), decades(1e-3, 1.0)
+    weight, depth, mu = mass * G, size * decades(1e-6, 1e-3), random.uniform(0.05, 0.8)
+    stiffness = weight / depth
+    if law == "kelvin_voigt":
+        contact = Contact(law, stiffness, damping=2.0 * share * math.sqrt(stiffness * mass))
+    else:
+        exponent = 1.5 if law == "hertz" else 1.0
+        contact = Contact(
+            "exact_restitution", weight / depth**exponent, exponent, restitution=random.uniform(0.05, 0.95)
+        )
+    grip = stiffness * decades(0.1, 3.0)
+    damping = random.choice([0.0, 2.0]) * decades(1e-2, 1.0) * math.sqrt(grip * mass)
+    friction = Friction(
+        mu, stick_stiffness_n_m=grip, stick_damping_n_s_m=float(damping) or None,
+        static_coefficient=mu * float(random.choice([1.0, 1.3])),
+    )  # fmt: skip
+    gaps = size * decades(1e-3, 0.6), size * decades(1e-3, 0.6)
+    force = weight * decades(0.05, 2.0)
+    pull = spread(force, force)
+    load = Harmonic(
+        "pull", (pull[0], pull[1]), decades(1.0, 60.0), random.uniform(0.0, 6.28), *spread(0.3 * force * size)
+    )
+    return Scene(
+        Head(mass, mass * size**2 * decades(0.05, 1.0)), Frame(size, size * random.uniform(0.5, 1.0)), Clearance(*gaps),
+        contact, Gravity(G), (load,),
+        initial=Initial(spread(0.3 * gaps[0], 0.3 * gaps[1], 0.2 * min(gaps) / size), spread(0.1, 0.1, 0.1 / size)),
+        friction=friction,
+    )  # fmt: skip
+
+
+def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
+    """Return the largest error in tolerances of runs that are compared with a tight one."""
+    tight = simulate(scene, 1.0, output_dt=0.01, tol=1e-12)
+    runs = [(tol, simulate(scene, 1.0, output_dt=0.01, tol=tol)) for tol in tolerances]
+    return max(pose_error(scene, run.q, tight.q) / tol for tol, run in runs)
+
+
+@pytest.mark.parametrize(("law", "seed"), [("hertz", 8), ("hertz", 47), ("exact_restitution", 237)])
+def test_a_force_too_small_to_move_the_head_still_tells_whether_its_corner_holds(law: str, seed: int) -> None:
+    """Steps that follow the motion well enough had let corners go that hold, and moved where they are held."""
+    assert furthest_off(held_scene(law, seed), (1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
+
+
+@pytest.mark.stress
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("law", ["kelvin_voigt", "exact_restitution", "hertz"])
+def test_calm_random_scenes_keep_to_the_tolerance(law: str) -> None:
+    """Where a displacement grows less than 1e4 times."""
+    checked = 0
+    for seed in range(200):
+        scene = held_scene(law, seed)
+        if furthest_off(scene, (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)) < 10.0:
+            checked += 1
+            continue
+        with pytest.warns(ToleranceWarning):
+            grown = simulate(scene, 1.0, sensitivity=True).sensitivity
+        assert grown is not None and not grown.trusted, seed
+    assert checked > 100

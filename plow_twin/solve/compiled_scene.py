@@ -134,7 +134,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         position_tolerance=tol * length,
         weight=radius * speed / length,
         radius=radius,
-        release=0.0 if terms.fraction is None else _release(scene, tol * speed, speed),
+        release=0.0 if terms.fraction is None else _release(scene, tol, length, speed),
         wear_per_impulse=0.0 if scene.wear is None else wear_rate(scene.wear, scene.wear.travel_speed_m_s),
         offset=scene.head.com_offset_m,
         free=np.array([float(name not in scene.locked) for name in DOF_NAMES]),
@@ -262,15 +262,22 @@ def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
     return max(math.sqrt(length * total), initial, 1e-3 * length)
 
 
-def _release(scene: Scene, velocity_tolerance: float, speed: float) -> float:
+def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration from which the impulse to separation is below a share of the velocity tolerance.
 
     integral F dt = K d^(n+1) / ((n+1) v) at the speed v. Separations may be a hundred times slower than that, and many.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
-    impulse = share * velocity_tolerance * scene.head.mass_kg
-    return float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
+    impulse = share * tol * speed * scene.head.mass_kg
+    release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
+    friction = scene.friction
+    if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
+        # a corner that is released lets go of its wall: what its spring held by must not be seen either
+        stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
+        held = stretch * friction.stick_stiffness_n_m / friction.coefficient
+        release = min(release, float((held / scene.contact.stiffness) ** (1.0 / exponent)))
+    return release
 
 
 def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:

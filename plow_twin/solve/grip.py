@@ -20,8 +20,10 @@ from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value
 from plow_twin.solve.state import CLIPPED, COS, OFF, OMEGA, ON, SIN, SLIPS_BACKWARD, SLIPS_FORWARD, STICKS, VX, VY, X, Y
 
-#: Below this share of its terms a guard is zero but for rounding.
-_ROUNDING = 1e-10
+#: Below this share of its terms at the step's start, or of the largest over the step, a guard is zero but for rounding.
+_ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
+#: What rounding leaves of a corner's place along its wall, in shares of the frame, and of its rate.
+_FINEST = 4e-15
 
 
 @kernel(inline="code")
@@ -60,8 +62,8 @@ def _anchor(p, state, pair, force, place, rate) -> None:
 
 @kernel(inline="code")
 def _normal_force(p, state, pair, depth):
-    """Return N of a pair that pushes, for a penetration that may be negative by rounding."""
-    return max(law_force(p, state, pair, max(depth, 0.0), rate_of(p, pair, state.y)), 0.0)
+    """Return N of a pair that pushes, as the series will have it, for a penetration that is negative by its error."""
+    return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
 
 
 @kernel()
@@ -147,7 +149,11 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        size = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair])
+        # a pair that is on is not beyond its wall but by the error of the place at which it has touched
+        g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
+        size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
+        # it lets go by so much late, or rounding would have it let go again as soon as it holds
+        late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):
             spring = state.alpha * rate[k, pair]
@@ -157,8 +163,14 @@ def grip_guard(p, state, w, order, pair, side) -> int:
             g[k] = grip * (p.stick_stiffness * spring + damper) - p.friction * (k + 1) * force[k + 1, pair]
         size = p.stick_stiffness * abs(state.alpha * rate[0, pair])
         size += p.stick_damping * abs(rate[1, pair]) + p.friction * abs(force[1, pair])
-    if abs(g[0]) <= _ROUNDING * size:
+        noise, late, power = 0.0, 0.0, 1.0
+        for k in range(1, order):
+            power *= state.sigma_end
+            noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
+    # what it does next is then for its other terms to tell
+    if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
+    g[0] += late
     if grip != 0:
         return STICKS
     return SLIPS_FORWARD if side == 0 else SLIPS_BACKWARD

@@ -78,7 +78,9 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
         w,
         span,
         penetrating,
-    ) or taylor.lay_out(p, parts, terms.slip, terms.ramp, terms.fraction, parts.implicit, state, w, span, penetrating):
+    ) or taylor.lay_out(
+        p, parts, terms.slip, terms.ramp, terms.fraction, terms.stick, parts.implicit, state, w, span, penetrating
+    ):
         _end_at_event(p, state, w, span, penetrating, law_terms(terms), terms.stick)
         implicit.note_step(parts.implicit, state, w, state.step_size, state.event_pair >= 0)
     else:
@@ -124,8 +126,9 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
     state.time = state.step_start
     state.step_size = -1.0
     state.elapsed = 0.0
-    state.last_step_size = state.step_start - before
     at_once = state.step_start - before <= _ONE_INSTANT * (1.0 + abs(before))
+    if not at_once:
+        state.last_step_size = state.step_start - before
     touching = state.touching if at_once else 0
     state.touching = 0
     if state.event_pair < 0:

@@ -20,7 +20,7 @@ from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate, acting
-from plow_twin.solve.grip import grip_terms
+from plow_twin.solve.grip import grip_guard, grip_terms
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
 from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y, new_record
 from plow_twin.solve.support import (
@@ -48,6 +48,8 @@ _WORTH = 30.0
 _GAIN = 100.0
 #: What rounding leaves undetermined of a velocity, in shares of the largest: no step is refused for less.
 _NOISE = 1e-12
+#: And of a guard of the corners' grip, in shares of its largest term.
+_GUARD_NOISE = 1e-6
 #: Attempts that fail stop doubling the wait for the next one here.
 _MOST_REFUSED = 12
 
@@ -445,9 +447,10 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
             set_row(w.wear, k, worn)
             penetration = penetration - worn
         set_row(w.penetration, k, penetration)
+    size = grip = 0.0
     if stick is not None:
         _write_grip(p, state, h, w, implicit, _seen(support, implicit), seen)
-    size = 0.0
+        grip = _last_of_guards(p, state, w, h)
     if ramp is not None:
         size = _write_ramp(p, h, w, implicit)
     off = abs(w.series[0, VX] - body[0, VX]) + abs(w.series[0, VY] - body[0, VY])
@@ -461,7 +464,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
     size += 4.0 * (abs(last[VX]) + abs(last[VY]) + p.radius * abs(last[OMEGA]))
     size += scale * (abs(place[X]) + abs(place[Y]) + p.radius * abs(place[THETA])) + more
     # its share on [0, h] that polynomials of lower degree cannot take over
-    return size * h ** (s - 1) * 2.0 ** (1 - 2 * s)
+    return (size * h ** (s - 1) + grip * _GAIN * p.threshold[0]) * 2.0 ** (1 - 2 * s)
 
 
 @kernel()
@@ -477,6 +480,24 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
         y = series[k]
         place = row_values(p.slip_rows, y[COS], y[SIN], y[X], y[Y])
         set_row(w.slip[4], k, grip_terms(p, state, w, k, place, row(w.slip[0], k)))
+
+
+@kernel()
+def _last_of_guards(p, state, w, h) -> float:
+    """Return the largest share of a last term in its guard of a corner's grip; they tell of forces however small."""
+    guard, share = w.column[0], 0.0
+    for pair in range(PAIR_COUNT):
+        for side in range(2):
+            if grip_guard(p, state, w, STAGES, pair, side) != 0:
+                largest, last, power = 0.0, 0.0, 1.0
+                for k in range(STAGES):
+                    if guard[k] != 0.0:
+                        last = abs(guard[k]) * power
+                    largest = max(largest, last)
+                    power *= h
+                if last > _GUARD_NOISE * largest:
+                    share = max(share, last / largest)
+    return share
 
 
 @kernel()

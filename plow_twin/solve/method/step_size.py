@@ -8,16 +8,21 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.grip import grip_guard
 from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
 #: A pair that would part within so many steps like the last is looked at, by a series of this order.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
+#: The same with friction with stick, where the force that is left has its own measure and steps are shorter.
+_PARTING_REACH_STICK = 8.0
 #: Newton's steps to its root, and the relative change after which it is found: the next step mends the rest.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
 #: A term beyond this is not finite, or will not be when it is multiplied.
 _FINITE = 1e300
+#: How often a step is made shorter, for what is largest over it gets smaller too, and the change that is none.
+_SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
 @kernel()
@@ -84,16 +89,56 @@ def before_pushing_again(p, state, w, order, sigma) -> float:
 
 
 @kernel()
-def time_to_separation(p, parts, state, w, span, harmonics):
+def before_gripping(p, state, w, order, sigma) -> float:
+    """Return the part of `sigma` over which the guards of the corners' grip are accurate.
+
+    A force far too small to move the head still tells whether its corner holds: the same root test, relative to what
+    is largest in the guard.
+    """
+    guard = w.column[0]
+    share = math.log(p.threshold[p.order] / p.threshold[0]) / order
+    for pair in range(PAIR_COUNT):
+        for side in range(2):
+            if grip_guard(p, state, w, order, pair, side) != 0:
+                sigma = _relatively_accurate(guard, order, p.lacuna, share, sigma)
+    return sigma
+
+
+@kernel()
+def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
+    """Return the part of `sigma` over which the last terms of a polynomial g are small beside its largest one.
+
+    Term k may be exp(share k) of it.
+    """
+    for _ in range(_SHORTER):
+        largest, power = 0.0, 1.0
+        for k in range(order + 1):
+            largest = max(largest, abs(g[k]) * power)
+            power *= sigma
+        least = math.log(sigma)
+        for k in range(order, max(order - 2 - lacuna, 0), -1):
+            if g[k] != 0.0:
+                least = min(least, share + math.log(largest / abs(g[k])) / k)
+        shorter = math.exp(least)
+        if not shorter < _SHORT_ENOUGH * sigma:
+            return min(sigma, shorter)
+        sigma = shorter
+    return sigma
+
+
+@kernel()
+def time_to_separation(p, parts, state, w, span, harmonics, stick):
     """Return the time until the first pair parts, where that is what shortens steps; else 0.
 
     The root of a short series is enough: what it misses is left to the next step.
     """
-    near = False
+    near, reach = False, _PARTING_REACH
+    if stick is not None:
+        reach = _PARTING_REACH_STICK
     for pair in range(PAIR_COUNT):
         if state.mode[pair] == ON:
             penetration, rate = penetration_and_rate(p, state, pair)
-            if rate < 0.0 and penetration < -rate * _PARTING_REACH * state.last_step_size:
+            if rate < 0.0 and penetration < -rate * reach * state.last_step_size:
                 near = True
     if not near:
         return 0.0
@@ -107,7 +152,7 @@ def time_to_separation(p, parts, state, w, span, harmonics):
         if state.mode[pair] != ON or w.penetration[1, pair] >= 0.0:
             continue
         t = -w.penetration[0, pair] / w.penetration[1, pair]
-        if t > _PARTING_REACH * state.last_step_size:
+        if t > reach * state.last_step_size:
             continue
         for _ in range(_NEWTON_STEPS):
             value, slope = w.penetration[order, pair], 0.0

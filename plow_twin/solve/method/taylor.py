@@ -7,17 +7,23 @@ import math
 from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.method.implicit import at_most_stable
 from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
-from plow_twin.solve.method.step_size import accurate_step, before_pushing_again, before_sticking, time_to_separation
+from plow_twin.solve.method.step_size import (
+    accurate_step,
+    before_gripping,
+    before_pushing_again,
+    before_sticking,
+    time_to_separation,
+)
 
 #: A touch no farther back than so many steps like the last still shapes the series.
 _TOUCH_REACH = 2.5
 
 
 @kernel()
-def lay_out(p, parts, slip, ramp, fraction, implicit, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, penetrating) -> bool:
     """Lay out a step by Taylor series; False where it is not finite."""
     terms = parts.terms
-    limit, whole = _choose_map(p, parts, terms.fraction, state, w, span, penetrating)
+    limit, whole = _choose_map(p, parts, terms.fraction, stick, state, w, span, penetrating)
     _expand_load(p, parts.harmonics, terms.second, state, w)
     order = expand(p, state, w, p.order, penetrating, limit, *one_by_one(terms))
     state.evaluations += order
@@ -28,6 +34,9 @@ def lay_out(p, parts, slip, ramp, fraction, implicit, state, w, span, penetratin
         sigma = before_sticking(p, state, w, order, sigma)
     if ramp is not None and fraction is not None and penetrating:
         sigma = before_pushing_again(p, state, w, order, sigma)
+    if stick is not None and penetrating:
+        state.sigma_end = sigma
+        sigma = before_gripping(p, state, w, order, sigma)
     sigma = at_most_stable(p, implicit, state, w, sigma)
     state.sigma_end, state.order = sigma, order
     state.ends_at_stop = 1 if whole and sigma == limit else 0
@@ -35,7 +44,7 @@ def lay_out(p, parts, slip, ramp, fraction, implicit, state, w, span, penetratin
 
 
 @kernel()
-def _choose_map(p, parts, fraction, state, w, span, penetrating):
+def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
     """Choose how the series' variable runs in time; return its value after `span`, and whether a step may go so far."""
     if fraction is None:
         return span, True
@@ -45,7 +54,7 @@ def _choose_map(p, parts, fraction, state, w, span, penetrating):
         return math.sqrt(span), True
     if not penetrating or p.exponent != 1.5:
         return span, True
-    parting = time_to_separation(p, parts, state, w, span, parts.harmonics)
+    parting = time_to_separation(p, parts, state, w, span, parts.harmonics, stick)
     if parting > 0.0:
         # one that ends like d^1.5 is analytic in the root of the time left
         root = math.sqrt(parting)
