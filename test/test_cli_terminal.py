@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from plow_twin.cli import replay as replay_verb
 from plow_twin.cli import simulate as simulate_verb
 from plow_twin.cli import study_paper as paper_verb
 from plow_twin.cli.app import run
+from plow_twin.cli.console import progress
 from plow_twin.study.paper.rows import Row, Verdict
 
 WIDTH = 80
@@ -64,6 +66,20 @@ def test_a_recording_and_its_replay_are_shown_as_words(printed: Callable[..., li
         assert line in lines
     long = [line for line in lines if len(line) > WIDTH]
     assert all(str(tmp_path) in line for line in long)  # what is copied stays in one piece
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_ctrl_c_is_not_lost_in_a_destructor() -> None:
+    class Ends:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt), progress("replaying", quiet=True) as on_progress:
+        on_progress(0.1)
+        left = Ends()
+        del left  # Python drops the exception there
+        on_progress(0.2)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_the_paper_s_statements_fit(printed: Callable[..., list[str]]) -> None:

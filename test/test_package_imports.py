@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import plow_twin
 from plow_twin.build import NUMERIC_ROOMS
 from plow_twin.kernel.compiler import KERNEL_FOLDERS
 
@@ -146,7 +147,10 @@ def _imported_names(path: Path) -> set[str]:
 @pytest.mark.parametrize(
     ("statement", "unwanted"),
     [
-        ("import plow_twin", {*SCIPY, "jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"}),
+        (
+            "from plow_twin import Twin, simulate",
+            {*SCIPY, "jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"},
+        ),
         (
             "import plow_twin.stream.session",
             {*SCIPY, "jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"},
@@ -163,3 +167,35 @@ def test_heavy_libraries_are_imported_where_they_are_used(statement: str, unwant
     loaded = set(output.split())
     assert "numpy" in loaded
     assert not unwanted & loaded
+
+
+def test_every_public_name_is_found_and_none_is_imported_before_it_is_used() -> None:
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    typed = next(node for node in tree.body if isinstance(node, ast.If))
+    names = {alias.name for node in typed.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert {name for name in dir(plow_twin) if not name.startswith("_")} >= names
+    for name in names:
+        assert getattr(plow_twin, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        plow_twin.nonsense  # noqa: B018
+    code = (
+        "import plow_twin, plow_twin.cli, sys\nprint(*(name for name in sys.modules if name.startswith('plow_twin')))"
+    )
+    output = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+    assert output.split() == ["plow_twin", "plow_twin.cli"]
+
+
+@pytest.mark.parametrize("module", ["numpy", "numba.core.types", "plow_twin.kernel.compiler", "click", "rich.table"])
+def test_ctrl_c_during_the_imports_is_one_line(module: str) -> None:
+    code = f"""
+import os, signal, sys
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+from plow_twin.cli import main
+main(["info"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "plow-twin: interrupted\n")

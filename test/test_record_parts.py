@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,54 @@ def test_what_other_programs_would_stumble_over_is_named_and_repaired(tmp_path: 
     assert repair(run.folder) == [run.file] and examine(run.folder).problems == []
     with AnyReader([run.folder]) as reader:
         assert reader.message_count
+
+
+def test_a_part_that_stands_there_twice_is_named_and_read_once(tmp_path: Path) -> None:
+    run = record_run(
+        tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
+    )
+    second = run.folder / "run_1.mcap"
+    before = replay(run.folder)
+    last = RunReader(run.folder).parts[-1].name
+    for name in (f"run_{int(last[4:-5]) + 1}.mcap", "run_1 (copy).mcap", "again.mcap"):
+        copy = run.folder / name
+        shutil.copy(second, copy)
+        after = replay(run.folder)
+        assert after.repeated_parts == {name: "run_1.mcap"}
+        assert (after.exit_code, after.samples, after.compared) == (0, before.samples, before.compared)
+        assert f"{name}: repeats run_1.mcap (part 1): it is not read" in examine(run.folder).problems
+        assert repair(run.folder) == [copy] and examine(run.folder).problems == []
+        copy.with_name(f"{name}.repeated").unlink()
+
+
+def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), chunk_size=50_000)
+    whole, spans = run.file.read_bytes(), chunk_spans(run.file)
+    before = replay(run.folder)
+    head = 9 + 3 * 8 + 2 * 4 + len("zstd") + 8  # of a chunk's record, before its data
+    begin, end = spans[2][0] - head, spans[8][0] - head  # some chunks of the journal and of outputs
+    run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
+    after, found = replay(run.folder), examine(run.folder)
+    assert after.divergences == 0 and after.samples == before.samples and after.repeated == found.repeated > 0
+    assert found.gaps == 0 and any("more than once" in problem for problem in found.problems)
+
+
+def test_a_part_that_is_no_mcap_file_is_named_and_the_rest_is_read(tmp_path: Path) -> None:
+    run = record_run(
+        tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
+    )
+    parts = RunReader(run.folder).parts
+    for part in (parts[0], parts[1], parts[-1]):
+        good = part.read_bytes()
+        part.write_bytes(b"\0" * len(good))
+        found, after = examine(run.folder), replay(run.folder)
+        assert f"{part.name}: not an MCAP file: nothing of it can be read" in found.problems
+        assert found.entries[Sample.__name__] == after.samples < COUNT
+        assert (after.exit_code, after.divergences) == (3, 0) and after.status is FileStatus.DAMAGED
+        part.write_bytes(good)
+    parts[1].write_bytes(b"no recording")
+    assert repair(run.folder) == [parts[1]] and (run.folder / f"{parts[1].name}.damaged").exists()
+    assert replay(run.folder).divergences == 0
 
 
 def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:

@@ -4,4 +4,40 @@ Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss. 
 and errors to standard error.
 """
 
-from plow_twin.cli.app import main as main
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import NoReturn
+
+
+def main(arguments: Sequence[str] | None = None) -> NoReturn:
+    """Run the command line and leave with its exit code."""
+    with _ending_at_once():
+        # with all that compiles: an import that is interrupted may end in an error of its own making
+        import plow_twin.run.twin  # noqa: F401
+        from plow_twin.cli.app import main as run
+
+    run(arguments)
+
+
+@contextmanager
+def _ending_at_once() -> Iterator[None]:
+    """Let Ctrl-C end the process without a traceback: nothing has been begun yet."""
+
+    def end(*_: object) -> None:
+        os.write(2, b"plow-twin: interrupted\n")
+        os._exit(1)
+
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not ignored, nor somebody else's
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

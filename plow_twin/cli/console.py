@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any, Final
 
 import click
@@ -67,10 +70,34 @@ def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
     with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0)
 
-        def on_progress(share: float) -> None:
-            bar.update(task, completed=share)
+        with _interruption() as interrupted:
 
-        yield on_progress
+            def on_progress(share: float) -> None:
+                if interrupted():
+                    raise KeyboardInterrupt
+                bar.update(task, completed=share)
+
+            yield on_progress
+
+
+@contextmanager
+def _interruption() -> Iterator[Callable[[], bool]]:
+    """Remember Ctrl-C beside the exception, which is lost where it falls into a destructor."""
+    before, asked = signal.getsignal(signal.SIGINT), False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        signal.default_int_handler(number, frame)
+
+    if before is not signal.default_int_handler or threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: asked
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

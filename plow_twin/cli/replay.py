@@ -40,6 +40,10 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
     if report.build_differences:
         other = ", ".join(f"{key} {there} (here {here})" for key, (there, here) in report.build_differences.items())
         click.echo(f"plow-twin: warning: recorded by another build, which may round differently: {other}", err=True)
+    for file, read in report.repeated_parts.items():
+        click.echo(f"plow-twin: warning: {file} repeats {read}: it is not read", err=True)
+    if report.repeated:
+        click.echo(f"plow-twin: warning: {report.repeated} entries stand there more than once", err=True)
     if report.first_divergence is not None:
         click.echo(f"plow-twin: diverged: {report.first_divergence}", err=True)
     return report.exit_code
@@ -56,6 +60,7 @@ def _facts(report: ReplayReport) -> dict[str, Any]:
         "samples": report.samples,
         "steps": report.steps,
         "refused": report.refused,
+        "repeated": report.repeated,
         "digests_compared": report.digests_compared,
         "snapshots_compared": report.snapshots_compared,
         "messages_compared": dict(report.compared),
@@ -65,6 +70,7 @@ def _facts(report: ReplayReport) -> dict[str, Any]:
         "inputs": report.inputs,
         "lost": report.lost,
         "damaged_chunks": report.damaged_chunks,
+        "repeated_parts": report.repeated_parts,
         "build_differences": {key: list(pair) for key, pair in report.build_differences.items()},
         "span_s": report.span_s,
         "wall_s": report.wall_s,

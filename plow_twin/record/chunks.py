@@ -276,6 +276,15 @@ def is_begun(path: Path) -> bool:
     return len(head) == len(MAGIC) or not MAGIC.startswith(head)
 
 
+def is_mcap(path: Path) -> bool:
+    """Tell whether a file begins as MCAP does, as far as it goes; one that cannot be opened is left to its reader."""
+    try:
+        with path.open("rb") as stream:
+            return MAGIC.startswith(stream.read(len(MAGIC)))
+    except OSError:
+        return True
+
+
 def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield name and content of the metadata records of a file, wherever they stand; no chunk is opened."""
     from mcap.reader import make_reader

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
-from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_begun
+from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_begun, is_mcap
 from plow_twin.record.follow import is_claimed
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
 from plow_twin.record.journal_codec import Dropped
@@ -43,11 +43,13 @@ class PartReport:
     trailing_bytes: int = 0
     #: chunks that a repair before has left out
     left_out: int = 0
+    #: whether it begins as an MCAP file does
+    mcap: bool = True
 
     @property
     def healthy(self) -> bool:
         """Whether it has its end, nothing behind that, and no damage."""
-        return self.finished and not self.damaged_chunks and not self.trailing_bytes
+        return self.mcap and self.finished and not self.damaged_chunks and not self.trailing_bytes
 
 
 @dataclass
@@ -61,6 +63,8 @@ class RunReport:
     layout_version: str = ""
     entries: Counter[str] = field(default_factory=Counter)
     gaps: int = 0
+    #: entries that stand there more than once
+    repeated: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     span_s: float = 0.0
@@ -88,6 +92,7 @@ class RunReport:
             "span_s": self.span_s,
             "entries": dict(self.entries),
             "missing_entries": self.gaps,
+            "repeated_entries": self.repeated,
             "lost": self.lost,
             "inputs": self.inputs,
             "parts": parts,
@@ -108,13 +113,18 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     first = last = None
+    in_a_row = 0  # entries before the expected one without a gap
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         inputs.add(entries)
         for index, sequence in enumerate(entries.sequence.tolist()):
+            if expected is not None and 0 < expected - sequence <= in_a_row:
+                report.repeated += 1
+                continue
             if expected is not None and sequence > expected:
                 report.gaps += sequence - expected
+            in_a_row = in_a_row + 1 if sequence == expected else 1
             expected = sequence + 1
             entry = None if entries.sample[index] else entries.others[index]
             report.entries[Sample.__name__ if entry is None else type(entry).__name__] += 1
@@ -140,12 +150,15 @@ def _layout(reader: RunReader) -> str:
         if name == HEADER_RECORD:
             found.append(record.get("layout_version", ""))
 
-    for _ in ChunkReader(reader.path, on_metadata):
+    readable = (part for part in reader.parts if is_begun(part) and is_mcap(part))
+    for _ in ChunkReader(next(readable), on_metadata):
         break
     return found[0] if found else ""
 
 
 def _part(path: Path) -> PartReport:
+    if not is_mcap(path):
+        return PartReport(path, path.stat().st_size, finished=False, damaged_chunks=0, messages={}, mcap=False)
     if not is_begun(path):
         return PartReport(path, path.stat().st_size, finished=False, damaged_chunks=0, messages={})
     reader = ChunkReader(path)
@@ -162,7 +175,9 @@ def _part(path: Path) -> PartReport:
 
 def _name_problems(report: RunReport, reader: RunReader) -> None:
     for part in report.parts:
-        if not part.finished:
+        if not part.mcap:
+            report.problems.append(f"{part.path.name}: not an MCAP file: nothing of it can be read")
+        elif not part.finished:
             report.problems.append(f"{part.path.name}: cut off: it has no end")
         if part.damaged_chunks:
             report.problems.append(f"{part.path.name}: {part.damaged_chunks} damaged chunk(s)")
@@ -170,7 +185,11 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
             report.problems.append(f"{part.path.name}: {part.left_out} chunk(s) left out by a repair")
         if part.trailing_bytes:
             report.problems.append(f"{part.path.name}: {part.trailing_bytes} B behind its end")
+    for file, read in reader.repeated.items():
+        report.problems.append(f"{file.name}: repeats {read.name} (part {reader.number(file)}): it is not read")
     report.problems += _metadata_problems(reader)
+    if report.repeated:
+        report.problems.append(f"{report.repeated} journal entries stand there more than once: the first ones are used")
     if report.gaps:
         report.problems.append(f"{report.gaps} journal entries are missing")
     for topic, count in report.lost.items():
@@ -201,7 +220,8 @@ def repair(path: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The parts that were rewritten; the old ones stay beside them as `<name>.damaged`, those that hold nothing too.
+        The parts that were rewritten; the old ones stay beside them as `<name>.damaged`, those that hold nothing too,
+        and those that repeat another part as `<name>.repeated`.
 
     Raises
     ------
@@ -213,9 +233,12 @@ def repair(path: Path) -> list[Path]:
         if is_claimed(stream.fileno()):
             raise RecordingError(f"{path}: is being written, expected a recording that has ended")
     rewritten, facts = [], []
+    for file in reader.repeated:
+        file.replace(file.with_name(f"{file.name}.repeated"))
+        rewritten.append(file)
     for part in reader.parts:
         report = _part(part)
-        if not is_begun(part):
+        if not (is_begun(part) and is_mcap(part)):
             part.replace(part.with_name(f"{part.name}.damaged"))
             rewritten.append(part)
             continue

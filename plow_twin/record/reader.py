@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
-from plow_twin.record.chunks import ChunkReader, Messages, is_begun, metadata_records
+from plow_twin.record.chunks import ChunkReader, Messages, is_begun, is_mcap, metadata_records
 from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, digest_in, from_message
@@ -187,7 +187,8 @@ class RunReader:
 
     `status`, `damaged_chunks`, `lost` (by topic, as the recorder counted), `stop_reason` (why it stopped early, if it
     did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
-    has been read, 0..1. `path` is the first file, `parts` are all.
+    has been read, 0..1. `path` is the first file, `parts` are all but those `repeated`: files that hold a part once
+    more, with the file that is read for it. A part that is no MCAP file counts as a damaged chunk.
 
     With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
     follows each time that all there is has been read.
@@ -202,6 +203,7 @@ class RunReader:
     tail: Tail | None = None
     header: RunHeader = field(init=False)
     parts: list[Path] = field(init=False)
+    repeated: dict[Path, Path] = field(default_factory=dict, init=False)
     status: FileStatus = field(default=FileStatus.UNREAD, init=False)
     damaged_chunks: int = field(default=0, init=False)
     lost: Mapping[str, int] = field(default_factory=dict, init=False)
@@ -211,14 +213,40 @@ class RunReader:
 
     def __post_init__(self) -> None:
         self._place = Path(self.path)
-        self.parts = run_parts(self._place)
+        self._headers: dict[Path, RunHeader] = {}
+        self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
-            header = None if len(self.parts) > 1 and not is_begun(part) else read_header(part)
-            if header is not None:
-                self.header = header
+            if part in self._headers:
+                self.header = self._headers[part]
                 return
         raise ForeignRecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
+
+    def _look_for_parts(self) -> None:
+        """Find the files there are, in the order of the parts by their headers; by their names without one."""
+        files = run_parts(self._place)
+        for file in files:
+            if file not in self._headers and (len(files) == 1 or (is_begun(file) and is_mcap(file))):
+                header = read_header(file)
+                if header is not None:
+                    self._headers[file] = header
+        self.parts, self.repeated = [], {}
+        read: dict[int, Path] = {}
+        for file in sorted(files, key=self._place_of):
+            if file not in self._headers or read.setdefault(self._headers[file].part, file) is file:
+                self.parts.append(file)
+            else:
+                self.repeated[file] = read[self._headers[file].part]
+
+    def number(self, file: Path) -> int:
+        """Return the number of a part, by its header where that can be read."""
+        return self._headers[file].part if file in self._headers else _part_number(file)[0]
+
+    def _place_of(self, file: Path) -> tuple[int, bool, str]:
+        """Return where a file stands among the parts; of two of the same number the one that is named so is first."""
+        named = _part_number(file)[0]
+        number = self.number(file)
+        return number, named != number, file.name
 
     def __iter__(self) -> Iterator[Record]:
         for batch in self.batches():
@@ -237,6 +265,9 @@ class RunReader:
             cut = False
             if self.tail is None and len(self.parts) > 1 and not is_begun(part):
                 finished, cut = False, True
+                continue
+            if len(self.parts) > 1 and not is_mcap(part):
+                self.damaged_chunks += 1
                 continue
             reader = ChunkReader(
                 part,
@@ -273,7 +304,7 @@ class RunReader:
             if self.tail is None or left[0].exists():  # the oldest may have been removed meanwhile
                 yield left[0]
             if self.tail is not None and not self.tail.stopped:
-                self.parts = run_parts(self._place)
+                self._look_for_parts()
 
     def duration_s(self) -> float:
         """Return the span of the receive times [s] by the index of the parts; a guess by their size without one."""

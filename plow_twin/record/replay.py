@@ -158,6 +158,7 @@ class _Replay:
         )
         self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS}
         self.next_sequence = 0
+        self.in_a_row = 0  # entries before that without a gap
         self.synced = False  # the session is where the live one was
         self.outputs_synced = False  # and so are its windows between two messages
         self.outputs_whole = True  # no message of the batch under way may be missing unsaid
@@ -265,6 +266,7 @@ class _Replay:
         ]
         self.report.digests_compared += len(digests)
         self.next_sequence = (int(entries.sequence[-1]) + 1) & _SEQUENCE_MASK
+        self.in_a_row += len(entries)
         if self.sink is not None and found.rows is not None:
             self._write_run(entries, stamps, found.rows)
             self._messages(sent, begin, end)
@@ -382,7 +384,11 @@ class _Replay:
             self.next_sequence = record.sequence  # the parts before it are not here
             self.alarms.give_up()
         missing = (record.sequence - self.next_sequence) & _SEQUENCE_MASK
+        if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # it stands there once more
+            self.report.repeated += 1
+            return
         if missing:
+            self.in_a_row = 0
             self.gaps += missing
             self.alarms.give_up()
             self.synced = self.outputs_synced = False
@@ -390,6 +396,7 @@ class _Replay:
             # from the scene's own initial state
             self.synced, self.outputs_synced = True, self.all_outputs and self.outputs_whole
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
+        self.in_a_row += 1
         if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one publication
             self.messages = self.publications = None
         self.report.entries += 1
@@ -498,6 +505,7 @@ class _Replay:
                 self._note(Divergence(*difference))
         report.compared += Counter({ALARMS: self.alarms.compared})
         report.not_compared += Counter({ALARMS: self.alarms.not_compared})
+        report.repeated_parts = {file.name: read.name for file, read in reader.repeated.items()}
         report.stop_reason, report.inputs = reader.stop_reason, self.inputs.facts()
         report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
         if self.gaps > self.noted["journal"]:

@@ -31,7 +31,8 @@ class Divergence:
 class ReplayReport:
     """What a replay found. `compared` and `not_compared` count messages by base name of their topic.
 
-    `inputs` counts what came, by input, used and not used.
+    `inputs` counts what came, by input, used and not used. `repeated` counts entries that stand there more than once;
+    `repeated_parts` names files that hold a part once more, which are not read, each with the file that is.
     """
 
     path: Path
@@ -39,6 +40,7 @@ class ReplayReport:
     samples: int = 0
     steps: int = 0
     refused: int = 0
+    repeated: int = 0
     digests_compared: int = 0
     snapshots_compared: int = 0
     compared: Counter[str] = field(default_factory=Counter)
@@ -48,6 +50,7 @@ class ReplayReport:
     status: FileStatus = FileStatus.UNREAD
     stop_reason: str | None = None
     damaged_chunks: int = 0
+    repeated_parts: dict[str, str] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     build_differences: dict[str, tuple[str, str]] = field(default_factory=dict)
