@@ -17,7 +17,9 @@ import llvmlite.ir
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
-from numba.core.typed_passes import AnnotateTypes
+from numba.core.typed_passes import IRLegalization
+
+from plow_twin.kernel.quick import leave_out_unused, remembering
 
 _ENVIRONMENT = "_ZN08NumbaEnv"
 
@@ -89,9 +91,13 @@ class _LowerForPython(_ChooseLibrary):
 class _Compiler(CompilerBase):
     choice: type[_ChooseLibrary]
 
+    def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, local: Any) -> None:
+        super().__init__(remembering(typing, flags), target, library, args, result, flags, local)
+
     def define_pipelines(self) -> list[Any]:
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(self.choice, AnnotateTypes)
+        leave_out_unused(passes)
+        passes.add_pass_after(self.choice, IRLegalization)
         passes.finalize()
         return [passes]
 

@@ -1,0 +1,51 @@
+"""What is left out of numba's work when kernels are compiled."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numba
+import pytest
+from numba.core.compiler import DefaultPassBuilder, Flags
+from numba.core.registry import cpu_target
+from numba.core.typing.context import Context
+
+from plow_twin.kernel.compiler import FASTMATH
+from plow_twin.kernel.quick import UNUSED, leave_out_unused, remembering
+
+
+def _flags(fastmath: bool) -> Flags:
+    flags = Flags()
+    flags.fastmath = set(FASTMATH) if fastmath else False
+    return flags
+
+
+def test_numba_has_every_pass_that_is_left_out() -> None:
+    """A pass of another name would come back, and cost its time, unseen."""
+    state = type("State", (), {"flags": _flags(False), "func_ir": None})()
+    assert set(leave_out_unused(DefaultPassBuilder.define_nopython_pipeline(state))) == UNUSED
+
+
+def test_a_sum_of_two_numbers_is_looked_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_up, resolve = [], Context.resolve_function_type
+
+    def count(self: Context, func: Any, args: Any, kws: Any) -> Any:
+        looked_up.append(func)
+        return resolve(self, func, args, kws)
+
+    monkeypatch.setattr(Context, "resolve_function_type", count)
+    cpu_target.target_context.refresh()
+    context = remembering(cpu_target.typing_context, Flags())
+    context._given.clear()
+    for kind in (numba.float64, numba.float64, numba.int64):
+        assert context.resolve_function_type(operator.add, (kind, kind), {}).return_type == kind
+    assert looked_up == [operator.add] * 2
+
+
+def test_what_numba_made_for_fast_kernels_is_not_remembered_for_exact_ones() -> None:
+    """Numba compiles its own `max` for the flags of the kernel that asks: its code may be reordered for one alone."""
+    context = cpu_target.typing_context
+    exact, fast = (remembering(context, _flags(fastmath)) for fastmath in (False, True))
+    assert exact is not fast
+    assert remembering(context, _flags(False)) is exact and remembering(context, _flags(True)) is fast
