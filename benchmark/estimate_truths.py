@@ -70,6 +70,7 @@ GROUPS = {
     "worn": Group("wear of some 0.1 mm in the window", wear_m2_n=5e-13),
     "middle": Group("K 3e7 .. 3e8", stiffness=(3e7, 3e8)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
+    "hard_sensor": Group("hard, with bias, delay, gaps", stiffness=(1e9, 1e11), bias_m=5e-3, delay_s=0.05, gaps=True),
     "kelvin_voigt": Group("truth: Kelvin-Voigt", law="kelvin_voigt", model="suspect"),
     "hard_kelvin_voigt": Group("hard, truth: Kelvin-Voigt", stiffness=(1e9, 1e11), law="kelvin_voigt", model="suspect"),
     "hard_shape": Group("hard, truth: third harmonic", stiffness=(1e9, 1e11), third_harmonic=0.15, model="suspect"),

@@ -10,19 +10,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from record_support import STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin
 from scenes import ROOT, gaps_at, preset
 from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
 from plow_twin import Scene, Table, Twin, Wear, simulate
-from plow_twin.estimate.bouncing import _regress
-from plow_twin.estimate.estimate import _with_gaps, estimate
+from plow_twin.estimate import estimate as estimating
+from plow_twin.estimate.bouncing import Bounced, _regress, bias_of_hard
+from plow_twin.estimate.estimate import _with_gaps, estimate, summarise_bounced
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.gaps import Gaps, GapsError, tell
-from plow_twin.estimate.measurements import EstimateError, Load, Poses
+from plow_twin.estimate.measurements import EstimateError, Load, Poses, believed
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.unknowns import GAIN, Spread, Unknowns
 from plow_twin.model.loads import compile_loads
+from plow_twin.record.measured import read_recording
+from plow_twin.stream.journal import Entry, Pose, SetWear
 
 __all__ = ["motion"]  # a fixture
 
@@ -145,6 +149,43 @@ def test_a_hard_contact_is_told_by_what_its_bounces_are_like() -> None:
     assert result.stiffness.p05 < truth.scene.contact.stiffness < result.stiffness.p95
 
 
+@pytest.mark.parametrize("turn", [0.0, -0.1])
+def test_a_biased_sensor_behind_a_hard_contact_is_found_out(turn: float) -> None:
+    """Half a degree of bias had the estimate withdrawn, 9 mm along y made the horizontal clearance 1 mm too large."""
+    truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
+    bias = np.array([1e-3, -9e-3, turn])
+    found = bias_of_hard(Unknowns(truth.nominal), truth.poses.moved(bias))
+    assert (np.abs(found - bias) < [5e-4, 5e-4, 1.5e-3]).all()
+
+
+def test_behind_a_soft_contact_the_fit_tells_the_bias(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, _ = known[0]
+    assert not bias_of_hard(Unknowns(truth.nominal), truth.poses).any()
+    moved = estimate(truth.nominal, truth.load, truth.poses.moved(np.array([5e-3, -5e-3, 0.1])))
+    assert moved.bias_theta is not None and moved.bias_theta.mean == pytest.approx(0.1, abs=3e-3)
+    for value, true in zip((moved.horizontal, moved.vertical), truth.clearance, strict=True):
+        assert abs(value.mean - true) < value.p95 - value.p05 < 6e-4
+
+
+@pytest.mark.stress
+def test_a_hard_contact_is_told_by_a_sensor_with_bias_delay_and_gaps() -> None:
+    truth = draw(GROUPS["hard_sensor"], 25_003)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert (result.model, result.sensor) == ("ok", "ok"), result.reasons
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert abs(value.mean - true) < 2e-4
+
+
+def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
+    """A regression that extrapolates said a softness of e^800 m, which is no number in JSON."""
+    unknowns = Unknowns(preset("paper"))
+    poses, _ = Poses.of(np.arange(100) * 0.01, np.zeros((100, 3)))
+    two = np.full(2, 1e-2)
+    bounced = Bounced(two, two, two, two, (-8.0, 500.0), (0.0, 1.0), np.ones(3), 1.0, 1.0)
+    text = json.dumps(summarise_bounced(unknowns, poses, bounced, 0, 0).as_dict(), allow_nan=False)
+    assert json.loads(text)["stiffness"]["p95"] > 1e9
+
+
 def test_the_regression_of_bounces_gives_the_value_at_what_was_measured() -> None:
     rng = np.random.default_rng(5)
     features = rng.standard_normal((200, 3))
@@ -247,6 +288,94 @@ def test_numbers_that_can_be_no_pose_or_load_are_left_out_and_counted() -> None:
     assert (poses.t.tolist(), lost) == ([0.0, 2.0], 1)
     load, lost = Load.of([0.0, 1.0, 2.0], [[0.0, 0.0, 0.0], [1e5, 0.0, 1e300], [0.0, 0.0, 0.0]])
     assert (load.t.tolist(), lost) == ([0.0, 2.0], 1)
+
+
+def test_what_poses_say_of_themselves_is_believed() -> None:
+    """A covariance of 1e6 says `not measured`: it made all the others useless."""
+    q, own = np.ones((40, 3)), np.full((40, 3), 1e-3)
+    own[7], own[8, 0], own[9] = 1e3, 0.02, np.nan
+    kept, deviation = believed((0.0, 0.0, 4e-3), q, own)
+    assert deviation == pytest.approx((1e-3, 1e-3, 4e-3))
+    assert np.argwhere(np.isnan(kept)).tolist() == [[7, 0], [7, 1], [7, 2], [8, 0]]
+    for wrong in ((np.nan, 0.0, 0.0), (0.0, -1.0, 0.0), (np.inf, 0.0, 0.0)):
+        with pytest.raises(EstimateError, match="poses: got the deviations"):
+            Poses.of(np.arange(40.0), q, wrong)
+        with pytest.raises(EstimateError, match="load: got the deviations"):
+            Load.of(np.arange(40.0), q, wrong)
+
+
+def test_a_pose_stated_to_be_useless_is_no_suspect_model(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, _ = known[0]
+    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t, truth.poses.q, (1.0, 1e-3, 1e-3)))
+    assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE and result.model == "ok"
+    assert result.reasons == ("x: stated deviation 1, expected at most 0.05",)
+
+
+def test_spikes_and_repetitions_of_a_sensor_are_left_out(known: list[tuple[Truth, Estimate]]) -> None:
+    poses = known[0][0].poses
+    level = np.array([5e-4, 5e-4, 2e-3])
+    assert poses.without_spikes(level)[1] == 0 and poses.fresh() is poses
+    q = poses.q.copy()
+    q[30::60, 1] += 5.0
+    clean, count = Poses(poses.t, q).without_spikes(level)
+    assert (
+        count == len(q[30::60]) and np.isnan(clean.q[30::60, 1]).all() and np.isfinite(clean.q).sum() == q.size - count
+    )
+    q[::4] += 5.0
+    assert Poses(poses.t, q).without_spikes(level)[1] == 0, "a bad sensor is not made a good one"
+    # five rows of each value: a sensor of 20 Hz sent at 100 Hz
+    slow = Poses(poses.t, poses.q[np.arange(len(poses.t)) // 5 * 5])
+    assert np.array_equal(slow.fresh().q, poses.q[::5]) and np.array_equal(slow.fresh().t, poses.t[::5])
+    slow.q[700:] = slow.q[700]
+    assert slow.fresh() is slow, "one that has stopped is not hidden"
+
+
+def test_a_silence_of_the_load_is_not_bridged(known: list[tuple[Truth, Estimate]]) -> None:
+    """A line across a lost period had the sensor taken for a bad one."""
+    truth, _ = known[0]
+    there = (truth.load.t < 11.0) | (truth.load.t > 14.0)
+    load = Load(truth.load.t[there], truth.load.wrench[there])
+    assert load.longest_stretch().t[-1] < 11.0
+    result = estimate(truth.nominal, load, truth.poses)
+    assert (result.model, result.sensor, result.horizontal_state) == ("ok", "ok", State.ESTIMATED)
+    assert result.t_end < 11.0 and result.lost > 400
+    few = Load(np.array([0.0, 3.0, 4.0, 20.0]), np.ones((4, 3)))
+    assert few.longest_stretch() is few, "a load given by few knots"
+
+
+def test_a_load_that_never_changes_is_none_and_of_long_data_the_newest_are_taken() -> None:
+    nominal = preset("paper")
+    t = np.arange(0.0, 300.0, 0.02)
+    q = np.stack([0.01 * np.sin(2.0 * t), 0.01 * np.cos(2.0 * t), 0.0 * t], axis=1)
+    q += np.random.default_rng(1).standard_normal(q.shape) * 1e-4
+    result = estimate(nominal, Load.of(t, np.zeros((len(t), 3)))[0], Poses.of(t, q)[0])
+    assert (result.model, result.horizontal_state) == ("suspect", State.WITHDRAWN)
+    assert result.reasons == ("load: the same value throughout, while the head moves",)
+    assert (result.t_start, result.t_end) == (pytest.approx(t[-1] - 60.0, abs=0.03), pytest.approx(t[-1]))
+
+
+def test_a_fit_that_cannot_be_computed_is_withdrawn(
+    known: list[tuple[Truth, Estimate]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def singular(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(estimating, "_from_motion", singular)
+    truth, _ = known[0]
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.horizontal_state is State.WITHDRAWN and "Singular matrix" in result.reasons[0]
+
+
+def test_what_was_before_new_skids_is_not_estimated_from(tmp_path: Path) -> None:
+    entries: list[Entry] = [paper_sample(index) for index in range(200)]
+    entries.insert(20, Pose(entries[10].stamp_ns, (1e-3, 0.0, 0.0), (1e-3, 1e-3, 1e-3)))
+    last = entries[-1].stamp_ns
+    entries += [SetWear(last, (0.0,) * 8, "new pads"), Pose(last + STEP_NS, (2e-3, 0.0, 0.0))]
+    entries += [paper_sample(index) for index in range(200, 260)]
+    record_run(tmp_path / "run", entries, wear=Wear(0.0, 1.0, 0.0))
+    measured = read_recording(tmp_path / "run")
+    assert len(measured.load) == 60 and measured.poses[:, 1].tolist() == [2e-3]
+    assert measured.pose_deviation == (0.0, 0.0, 0.0)
 
 
 def test_a_component_never_measured_is_said_and_nothing_is_estimated(known: list[tuple[Truth, Estimate]]) -> None:

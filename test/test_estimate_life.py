@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Table, Wear, simulate
+from plow_twin import Clearance, Table, Wear, simulate
 from plow_twin.cli.app import run as cli
 from plow_twin.estimate.coefficient import History, coefficient
 from plow_twin.estimate.forecast import Plan, Scenario, forecast, with_estimate
@@ -161,6 +161,43 @@ def test_a_history_of_clearances_tells_the_coefficient(tmp_path: Path, capsys: p
     capsys.readouterr()
     assert cli(["forecast", str(file), *limits]) == 0
     assert json.loads(capsys.readouterr().out)["coefficient_m2_n"]["mean"] == pytest.approx(found.mean)
+
+
+def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> None:
+    """From a clearance of a micrometre 400 steps went nowhere, which was told as `not reached`."""
+    scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
+    tight = replace(scene, clearance=Clearance(1e-6, 0.030))
+    found = forecast(tight, Plan(0.002, 0.034, 1e3, draws=50))
+    assert 0.0 < (found.quantile(0.5) or 0.0) < 1e3
+    assert forecast(scene, Plan(0.02, 0.02, 1e3, stop_h=0.0, draws=50)).as_dict()["probability_before_stop"] == 1.0
+    with pytest.raises(LifeError, match="mm at the end of the path, expected ones with which the model runs"):
+        mean_forces(scene, np.full(8, 0.5))
+
+
+def test_a_clearance_hardly_known_is_none_below_zero() -> None:
+    """Drawn from its prior it was -70 mm: the path to the limit from there left the model's range."""
+    scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
+    found = forecast(scene, Plan(0.026, 0.031, 1e3, draws=50), (0.03, 0.03))
+    assert found.now.min() > 0.0
+    with pytest.raises(LifeError, match="deviations: got"):
+        forecast(scene, Plan(0.026, 0.031, 1e3), (float("nan"), 0.0))
+    for numbers in ((np.nan, 0.03, 1.0), (0.03, np.inf, 1.0), (0.03, 0.03, -1.0)):
+        with pytest.raises(LifeError, match="expected a finite number >= 0"):
+            Plan(*numbers)
+    for facts in ({}, {"horizontal": 3}, {"horizontal": {"state": "fine"}}):
+        with pytest.raises(LifeError, match="expected what `plow-twin estimate --json` prints"):
+            with_estimate(scene, facts)
+
+
+def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
+    """All of the posterior lay at the end of the grid: an interval of no width, and none of the truth."""
+    scene = replace(preset("paper"), wear=replace(FAST, prior_m2_n=(2.5e-10, 4e-9)))
+    travel = np.arange(5) * 10.0
+    still = np.tile([0.025, 0.030], (5, 1))
+    with pytest.raises(LifeError, match="expected a wider wear"):
+        coefficient(scene, History(travel, still, np.full((5, 2), 1e-6)))
+    with pytest.raises(LifeError, match="not above zero"):
+        History(travel, -still, np.full((5, 2), 1e-6))
 
 
 def test_a_history_that_cannot_be_used_is_refused() -> None:

@@ -75,6 +75,20 @@ def test_windows_do_not_depend_on_the_order_of_arrival() -> None:
             assert np.array_equal(first, second)
 
 
+def test_what_comes_without_a_load_does_not_pile_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A load that has stopped, or poses of a clock that is ahead by hours."""
+    monkeypatch.setattr("plow_twin.estimate.window.MOST_KEPT", 100)
+    windows = Windows(4.0, 1.0, 0.5)
+    for index in range(300):
+        windows.take_pose(START_NS + index, (0.0, 0.0, 0.0))
+        windows.take_gaps(START_NS + index, (1,), (0.0,))
+    assert len(windows._poses) == len(windows._gaps) == 100
+    windows.take_load(START_NS, (0.0, 0.0, 0.0))
+    windows.take_load(START_NS + 3_000_000_000, (0.0, 0.0, 0.0))
+    windows.take_pose(START_NS + 10, (0.0, 0.0, 0.0))
+    assert len(windows._poses) <= 100
+
+
 def test_a_window_begins_behind_a_silence_of_the_load() -> None:
     stamps = np.delete(START_NS + np.arange(0, 1200) * 10_000_000, slice(500, 600))
     rows = [(int(stamp), (0.0, 0.0, 0.0)) for stamp in stamps]

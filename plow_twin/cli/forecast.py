@@ -75,7 +75,10 @@ def forecast(
 
     model, facts_now = _scene(scene)
     if estimated is not None:
-        facts_now = json.loads(estimated.read_text(encoding="utf-8"))
+        try:
+            facts_now = json.loads(estimated.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise click.UsageError(f"{estimated}: {error}, expected JSON of an estimate") from error
     limits = 1e-3 * limit_horizontal, 1e-3 * limit_vertical
     others = tuple(Scenario.parse(text) for text in scenarios)
     plan = Plan(*limits, horizon, stop, face_length, seed=seed, scenarios=others)

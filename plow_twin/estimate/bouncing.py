@@ -31,6 +31,16 @@ Array = NDArray[np.float64]
 SURE, POSSIBLE = 3e-4, 1e-3
 #: Scatter of the largest reaches in units of the noise, and in m, below which they are all of one place: a hard wall.
 NARROW, NARROW_M = 1.58, 8e-4
+#: Biases of theta that are tried in rad, and about the best of them, by a parabola at last that reaches so far;
+#: quantiles of the reaches whose distance is to be least; what such a bias is wrong by in rad (set on seeds 25900 to
+#: 25907 of the benchmark).
+_TURNS: Final = np.linspace(-0.16, 0.16, 81)
+_NEAR_TURNS: Final = np.linspace(-3e-3, 3e-3, 13)
+_FINEST_TURN: Final = 3e-3
+_MIDDLE, _FARTHEST = (0.4, 0.7), (0.9, 0.99)
+TURN_DEVIATION = 4e-4
+#: Most rows that it is looked for in.
+_MOST_ROWS = 2000
 #: Quantiles between which reaches are averaged, from the wall's middle to the farthest.
 _WINDOWS: Final = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
 #: Parts of a period in which the scatter is told.
@@ -59,6 +69,8 @@ _OVERRATED: Final = np.array([0.8e-3, 1.0e-3])
 _NOISE_ROUNDS = 3
 #: Widening of the softness: what a regression says of the logarithm has long tails (set as `BOUNCED_MOST` was).
 _WIDENED_SOFTNESS = 1.6
+#: Fewest whole poses with which those that lack a component are left out.
+_FEWEST_WHOLE = 100
 #: Fewest draws that are regressed.
 _FEWEST = 30
 
@@ -89,21 +101,57 @@ class Bounced:
 
 def bounces(unknowns: Unknowns, poses: Poses, softness: float) -> bool:
     """Tell whether the contact is so hard that this way is the right one; `softness` is a first estimate in m."""
-    noise = _reach_noise(unknowns, filled(poses))
+    noise = _reach_noise(unknowns, _whole(poses))
     return softness < SURE or (_is_narrow(unknowns, poses) and (softness < POSSIBLE or noise < POSSIBLE))
 
 
 def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
     """Tell whether the head stops at one place, within the noise: the walls do not give way."""
-    q = filled(poses)
+    q = _whole(poses)
     reach = _reach(unknowns, q)
     return bool(np.median(reach[2] - reach[0]) < max(NARROW * _reach_noise(unknowns, q), NARROW_M))
+
+
+def _whole(poses: Poses) -> Array:
+    """Return the poses of which every component was measured, or all where these are few, bridged by straight lines."""
+    whole = np.isfinite(poses.q).all(axis=1)
+    return poses.q[whole] if whole.sum() > _FEWEST_WHOLE else filled(poses)
 
 
 def _reach_noise(unknowns: Unknowns, q: Array) -> float:
     """Return the standard deviation of a corner's reach in m."""
     level = noise_level(q)
     return math.hypot(level[0], level[2] * geometry.half_diagonal(unknowns.scene))
+
+
+def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
+    """Return the bias of a sensor behind a hard contact, x and y in m, theta in rad; zeros where the contact is soft.
+
+    A hard wall is at one place for both corners that touch it. Seen with a turn it is at two: the turn is the one with
+    which the farthest reaches lie closest together. A bias of y turns with the head into its reach along x.
+    """
+    q = _whole(poses)
+    q = q[:: len(q) // _MOST_ROWS + 1]
+    bias = np.zeros(3)
+    for turns in (_TURNS, _NEAR_TURNS, _NEAR_TURNS):
+        right, left, top, bottom = _reach(unknowns, q - bias)[2]
+        bias[:2] += 0.5 * np.array([left - right, bottom - top])
+        widths = [_width(unknowns, q - bias - [0.0, 0.0, turn]) for turn in turns]
+        bias[2] += turns[int(np.argmin(widths))]
+    curve, slope, _ = np.polyfit(_NEAR_TURNS, widths, 2)
+    if curve > 0.0:
+        bias[2] += float(np.clip(-0.5 * slope / curve, -_FINEST_TURN, _FINEST_TURN)) - turns[int(np.argmin(widths))]
+    return bias if _is_narrow(unknowns, poses.moved(-bias)) else np.zeros(3)
+
+
+def _width(unknowns: Unknowns, q: Array) -> float:
+    """Return how far apart the farthest reaches lie, all walls together, in m."""
+    ordered = np.sort(reaches(unknowns.scene, q), axis=0)
+    middle, farthest = (
+        ordered[int(low * len(q)) : max(int(high * len(q)), int(low * len(q)) + 1)].mean(axis=0).sum()
+        for low, high in (_MIDDLE, _FARTHEST)
+    )
+    return float(farthest - middle)
 
 
 def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0) -> Bounced | None:
@@ -265,13 +313,17 @@ class _Eye:
         """
         noise = self.noise
         for _ in range(_NOISE_ROUNDS):
-            noise = noise * self.noise / np.maximum(noise_level(q + noise * white), 1e-12)
-        return q + noise * white
+            noise = noise * self.noise / np.maximum(noise_level(self._bridged(q + noise * white)), 1e-12)
+        return self._bridged(q + noise * white)
+
+    def _bridged(self, q: Array) -> Array:
+        """Return a motion as it is seen where components are missing, bridged as those measured are."""
+        return q if self._there.all() else filled(Poses(self._t, np.where(self._there, q, np.nan)))
 
     def features(self, q: Array) -> Array:
         """Return reach of the clearances, half the difference of the reaches, then what the motion is like."""
         whole = self._there.all(axis=1)
-        reach = _reach(self._unknowns, q[whole] if whole.sum() > 100 else q)
+        reach = _reach(self._unknowns, q[whole] if whole.sum() > _FEWEST_WHOLE else q)
         right, left, top, bottom = reach[1]
         scatter = []
         for i in range(3):

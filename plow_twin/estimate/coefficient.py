@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 _POINTS, _REACH = 801, 4.0
 #: How much further than the history the path is followed, as a multiple of what the clearance has grown, and in m.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
+#: Most probability at an end of the grid: with more of it the history says something that the prior does not allow.
+_MOST_AT_END = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +44,12 @@ class History:
         shape, count = self.clearance.shape, len(self.travel)
         if shape != (count, 2) or self.deviation.shape != (count, 2) or count < 2:
             raise LifeError(f"history: got {count} travels and clearances {shape}, expected at least 2 rows of both")
-        if not (
-            np.isfinite(self.clearance).all() and (self.deviation > 0.0).all() and (np.diff(self.travel) >= 0.0).all()
-        ):
+        finite = all(np.isfinite(column).all() for column in (self.travel, self.clearance, self.deviation))
+        positive = (self.clearance > 0.0).all() and (self.deviation > 0.0).all()
+        if not (finite and positive and (np.diff(self.travel) >= 0.0).all()):
             raise LifeError(
-                "history: got a row that is not finite, without a deviation or back in travel, expected none"
+                "history: got a row that is not finite, not above zero, without a deviation or back in travel, "
+                "expected none"
             )
 
 
@@ -86,7 +89,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     Raises
     ------
     LifeError
-        Where the scene has no wear or no period, or the history cannot be used.
+        Where the scene has no wear or no period, or the history cannot be used or contradicts the prior.
     """
     wear = scene.wear
     if wear is None:
@@ -110,6 +113,12 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
         means[index] = start + grown[-1]
     share = np.exp(likely - likely.max())
     share /= share.sum()
+    ends = np.exp(grid[[0, -1]])
+    if max(share[0], share[-1]) > _MOST_AT_END:
+        raise LifeError(
+            f"history: got a growth that the prior of the coefficient does not allow, from {ends[0]:.2g} to "
+            f"{ends[1]:.2g} m^2/N, expected a wider wear.prior_m2_n"
+        )
     now = share @ means
     variance = share @ (means - now) ** 2 + 1.0 / weight.sum(axis=0)
     return Coefficient(np.exp(grid), share, now, np.sqrt(variance))

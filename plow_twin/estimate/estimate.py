@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.bouncing import Bounced, bounces, compare
+from plow_twin.estimate.bouncing import TURN_DEVIATION, Bounced, bias_of_hard, bounces, compare
 from plow_twin.estimate.fit import Fit, Problem
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, Told, tell
-from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses
+from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
 from plow_twin.estimate.pads import by_group, turned
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.search import candidate, refine
-from plow_twin.estimate.start import range_of_motion
+from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, MOVING, SIZE, SOFTNESS, Spread, Unknowns
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, sandwich
 from plow_twin.model.scene import Scene
@@ -29,6 +29,12 @@ Guess = tuple[float, ...]
 OBSERVED = 1e-3
 #: Longest distance of poses in s: where fewer lie in a flight, its start is guessed wrong and the fit with it.
 SPARSEST = 0.125
+#: Load periods and seconds of a window, whichever is longer; of more the newest are taken, since the work is bounded.
+MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
+#: What is looked at at all, in s: the longest window of a node.
+_LONGEST_S = 600.0
+#: Scatter of the last half of the poses, in that of their quick changes, from which on the head moves.
+_MOVES = 5.0
 #: The same of a group of pads: there is no other use of it than to see that a wall is worn askew.
 GROUP_OBSERVED = 5e-4
 #: Least time in contact in s of the walls of both sides.
@@ -55,6 +61,8 @@ MOST_LEFT = 25.0
 _MOST_FREED = 3.0
 #: How far gaps may be from each other, and from what the motion says, in standard deviations of theirs.
 MOST_CONTRADICTION = 5.0
+#: Logarithms of the penetrations under the reference force that a contact can have, in m.
+_LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
 #: Pairs of the left, right, top and bottom walls of the cavity.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
@@ -85,12 +93,26 @@ def estimate_window(
 
     Where the fit from `guess` does not hold, all is searched as without one.
     """
+    known, measured = len(load.t), len(poses.t)
+    load = load.longest_stretch()
+    lost += known - len(load.t)
     span = float(load.t[0]), float(load.t[-1])
     poses = poses.between(span[0], span[1] + 1e-9)
+    if len(load.t) < known:
+        lost += measured - len(poses.t)
+    load = load.newest(_LONGEST_S)
+    load = load.newest(max(MOST_PERIODS * (load.oscillation() or 0.0), MOST_SPAN_S))
+    span = float(load.t[0]), span[1]
+    poses = poses.between(span[0], span[1] + 1e-9).fresh()
+    poses, spikes = poses.without_spikes(noise_level(filled(poses)))
+    lost += spikes
     told = None if gaps is None else tell(scene, gaps.between(span[0], span[1] + 1e-9), poses)
     if told is not None and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
         poses = told.poses
-    result, following = _from_motion(scene, load, poses, lost, guess)
+    try:
+        result, following = _from_motion(scene, load, poses, lost, guess)
+    except (np.linalg.LinAlgError, OverflowError) as error:
+        result, following = _without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
     return (result, following) if told is None else (_with_gaps(result, told), following)
 
 
@@ -106,6 +128,8 @@ def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess
         nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
         unseen = State.NOT_OBSERVABLE
         return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=lacking), ()
+    if _is_dead(load, poses):
+        return _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves"), ()
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
     felt, broad = thinned(load, period)
     forward = Forward(scene, felt)
@@ -117,6 +141,21 @@ def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess
         if near and verdict and not (verdict.model or verdict.sensor) and near[1].gain_left < MOST_LEFT:
             return summarise(*near, verdict, lost), _next_guess(*near)
         forward = Forward(scene, felt)
+    bias = bias_of_hard(unknowns, poses)
+    if bias.any():
+        result, following = _searched(forward, unknowns, poses.moved(-bias), period, broad, lost)
+        if following:
+            numbers = np.array(following)
+            numbers[BIAS] += bias
+            following = tuple(numbers.tolist())
+        return _moved_back(result, bias, scene), following
+    return _searched(forward, unknowns, poses, period, broad, lost)
+
+
+def _searched(
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, broad: bool, lost: int
+) -> tuple[Estimate, Guess]:
+    """Estimate from the motion without a guess."""
     first = candidate(forward, unknowns, poses, period)
     if first is None:
         return _without_fit(unknowns, poses, lost), ()
@@ -135,6 +174,25 @@ def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess
             found, verdict = again, other
     result = summarise(*found, verdict, lost)
     return result, () if verdict.model or verdict.sensor else _next_guess(*found)
+
+
+def _moved_back(result: Estimate, bias: Array, scene: Scene) -> Estimate:
+    """Return an estimate from poses that a bias was taken out of."""
+    if "distance" in result.figures:
+        # what the turn is wrong by moves a corner along the wall's normal
+        levers = 0.5 * scene.frame.height_m, 0.5 * scene.frame.width_m
+        horizontal, vertical = (
+            Interval.normal(value.mean, math.hypot(value.deviation, lever * TURN_DEVIATION)).above(0.0)
+            for value, lever in zip((result.horizontal, result.vertical), levers, strict=True)
+        )
+        result = replace(result, horizontal=horizontal, vertical=vertical)
+    x, y, theta = (
+        None if told is None else Interval(told.mean + by, told.p05 + by, told.p95 + by)
+        for told, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
+    )
+    if theta is None and x is not None:
+        theta = Interval.normal(float(bias[2]), TURN_DEVIATION)
+    return replace(result, bias_x=x, bias_y=y, bias_theta=theta)
 
 
 def _with_gaps(result: Estimate, told: Told) -> Estimate:
@@ -201,6 +259,8 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(reasons), observed))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
+    # what a regression extrapolates has no end
+    log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]
     return Estimate(
@@ -397,6 +457,13 @@ def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estima
 
 def _lacking(poses: Poses) -> tuple[str, ...]:
     """Return which components were hardly measured: a corner's place follows from all three only."""
+    useless = tuple(
+        f"{name}: stated deviation {deviation:g}, expected at most {most:g}"
+        for name, deviation, most in zip(COMPONENTS, poses.deviation, USELESS, strict=True)
+        if deviation > most
+    )
+    if useless:
+        return useless
     counts = np.isfinite(poses.q).sum(axis=0).tolist()
     lacking = tuple(
         f"{name}: measured {count} times, expected at least {FEWEST_POSES}"
@@ -408,12 +475,20 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     return lacking
 
 
-def _without_fit(unknowns: Unknowns, poses: Poses, lost: int) -> Estimate:
-    """Return what can be said where no motion of the model comes near the measured one."""
+def _is_dead(load: Load, poses: Poses) -> bool:
+    """Tell whether a load that never changes is none: under a constant one the head comes to rest."""
+    late = filled(poses)[len(poses.t) // 2 :]
+    return not np.ptp(load.wrench, axis=0).any() and bool((late.std(axis=0) > _MOVES * noise_level(late)).any())
+
+
+def _without_fit(
+    unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model comes near the measured one"
+) -> Estimate:
+    """Return what can be said where there is no fit, and why."""
     return replace(
         prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost),
         horizontal_state=State.WITHDRAWN,
         vertical_state=State.WITHDRAWN,
         model="suspect",
-        reasons=("no motion of the model comes near the measured one",),
+        reasons=(why,),
     )

@@ -25,6 +25,8 @@ HOUR_S = 3600.0
 #: Relative standard deviation of the rate beside what a history tells: means over a few periods, a load whose share
 #: differs from pad to pad. Set on lives with seeds below 1000 (benchmark/lives.py).
 PATH_DEVIATION = 0.03
+#: Share of a clearance by which it may be smaller than believed.
+_LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,21 @@ class Plan:
     draws: int = 2000
     seed: int = 0
     scenarios: tuple[Scenario, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise LifeError for numbers that are none of a plan."""
+        numbers = {
+            "limit_horizontal_m": self.limit_horizontal_m,
+            "limit_vertical_m": self.limit_vertical_m,
+            "horizon_h": self.horizon_h,
+            "stop_h": self.stop_h or 0.0,
+            "face_length_m": self.face_length_m,
+            "shift_h": self.shift_h,
+            "load_deviation": self.load_deviation,
+        }
+        for name, value in numbers.items():
+            if not 0.0 <= value < math.inf:
+                raise LifeError(f"{name}: got {value}, expected a finite number >= 0")
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +208,8 @@ def _forecast(
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
         raise LifeError("wear: got none or no travel speed, expected both")
+    if not all(0.0 <= value < math.inf for value in deviation_m):
+        raise LifeError(f"deviations: got {deviation_m} m, expected two finite ones >= 0")
     low, high = (math.log(value) for value in wear.prior_m2_n)
     travel = plan.horizon_h * HOUR_S * wear.travel_speed_m_s
     rng = np.random.default_rng(plan.seed)
@@ -199,13 +218,14 @@ def _forecast(
     if known is not None:
         coefficient, load = known.draw(plan.draws, rng), 1.0 + PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
-    now = rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m
+    size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
+    # a clearance that is hardly known is none below zero
+    now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a clearance that is smaller now has further to go: the path must reach that far
     spare = tuple(float(value) for value in -now.min(axis=0))
     limit = (plan.limit_horizontal_m + spare[0], plan.limit_vertical_m + spare[1])
     path = wear_path(scene, limit, most)
-    size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
     grown = size + path.clearance_growth()
     needed = np.stack(
         [
@@ -255,11 +275,16 @@ def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[
     Raises
     ------
     LifeError
-        For a withdrawn one.
+        For a withdrawn one, or JSON of something else.
     """
     names = ("horizontal", "vertical")
-    withdrawn = [name for name in names if facts[name]["state"] == State.WITHDRAWN.value]
+    try:
+        states = {name: State(facts[name]["state"]) for name in names}
+        numbers = {name: [float(facts[name][key]) for key in ("mean_m", "p05_m", "p95_m")] for name in names}
+    except (KeyError, TypeError, ValueError) as error:
+        raise LifeError(f"estimate: got no {error}, expected what `plow-twin estimate --json` prints") from error
+    withdrawn = [name for name in names if states[name] is State.WITHDRAWN]
     if withdrawn:
         raise LifeError(f"estimate: got a withdrawn {withdrawn[0]} clearance, expected one that holds")
-    low, high = ((facts[name]["p95_m"] - facts[name]["p05_m"]) / (2.0 * NORMAL_P95) for name in names)
-    return with_clearances(scene, facts["horizontal"]["mean_m"], facts["vertical"]["mean_m"]), (low, high)
+    low, high = ((p95 - p05) / (2.0 * NORMAL_P95) for _, p05, p95 in numbers.values())
+    return with_clearances(scene, numbers["horizontal"][0], numbers["vertical"][0]), (low, high)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import PlowTwinError
+from plow_twin.errors import PlowTwinError, SolverError
 from plow_twin.estimate.measurements import Load
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
 from plow_twin.model.scene import Harmonic, Scene, Table, Wear
@@ -30,6 +30,8 @@ SETTLE_PERIODS, MEAN_PERIODS = 2, 4
 LARGEST_CHANGE, ERROR = 0.02, 1e-3
 #: Most steps of a path.
 _MOST_STEPS = 400
+#: Clearance in m as which smaller ones count in these shares: a path from none would have no end.
+_LEAST_CLEARANCE = 1e-3
 
 
 class LifeError(PlowTwinError):
@@ -85,13 +87,26 @@ def period_of(scene: Scene) -> float:
 
 
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
-    """Return the mean force of each pad in N with worn walls, shape (8,), and its standard error over the periods."""
+    """Return the mean force of each pad in N with worn walls, shape (8,), and its standard error over the periods.
+
+    Raises
+    ------
+    LifeError
+        Where the scene has no period, or the head leaves the model's range.
+    """
     period = period_of(scene)
     wear = scene.wear or Wear(0.0, 1.0, 0.0)
     worn = replace(scene, wear=replace(wear, coefficient_m2_n=0.0, initial_depth_m=tuple(map(float, depth))))
     impulses = []
     for count in range(SETTLE_PERIODS, SETTLE_PERIODS + MEAN_PERIODS + 1):
-        result = simulate(worn, count * period, count * period, tol)
+        try:
+            result = simulate(worn, count * period, count * period, tol)
+        except SolverError as error:
+            widest = [1e3 * value for value in _clearances(scene, depth)]
+            raise LifeError(
+                f"clearances: got {widest[0]:.1f} mm and {widest[1]:.1f} mm at the end of the path, expected ones with "
+                f"which the model runs: {error}"
+            ) from error
         impulses.append([values["impulse"] for values in result.statistics.values()])
     forces = np.diff(np.array(impulses), axis=0) / period
     return forces.mean(axis=0), forces.std(axis=0, ddof=1) / math.sqrt(len(forces))
@@ -103,12 +118,12 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
     Raises
     ------
     LifeError
-        Where the scene has no wear or no period.
+        Where the scene has no wear or no period, or the path does not come to its end.
     """
     if scene.wear is None:
         raise LifeError("wear: got none, expected its parameters")
     depth = np.array(scene.wear.initial_depth_m, dtype=np.float64)
-    smallest = min(scene.clearance.horizontal_m, scene.clearance.vertical_m)
+    smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
     force, deviation = mean_forces(scene, depth)
     rows = [(0.0, depth, force, deviation)]
     error, exposure = 0.0, 0.0
@@ -127,13 +142,23 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         exposure, depth, force, deviation = exposure + step, euler + change, ahead, ahead_deviation
         error += off * off * smallest + float(noise.max()) ** 2 / smallest
         rows.append((exposure, depth, force, deviation))
+        smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
         grow = 1.5 if off < 0.3 * ERROR else 1.0
         step = min(grow * step, LARGEST_CHANGE * smallest / max(float(force.max()), 1.0))
+    if exposure < most_exposure and not _beyond(scene, rows[-1][1], limit):
+        raise LifeError(f"path: got {len(rows)} steps and no end, expected at most {_MOST_STEPS}")
     columns = [np.array([row[i] for row in rows]) for i in range(4)]
     return Path(columns[0], columns[1], columns[2], columns[3], error)
 
 
 def _beyond(scene: Scene, depth: Array, limit: tuple[float, float]) -> bool:
-    horizontal = scene.clearance.horizontal_m + 0.5 * float(depth @ np.abs(NORMAL_X))
-    vertical = scene.clearance.vertical_m + 0.5 * float(depth @ np.abs(NORMAL_Y))
+    horizontal, vertical = _clearances(scene, depth)
     return horizontal >= limit[0] or vertical >= limit[1]
+
+
+def _clearances(scene: Scene, depth: Array) -> tuple[float, float]:
+    """Return the horizontal and the vertical clearance with worn walls in m."""
+    return (
+        scene.clearance.horizontal_m + 0.5 * float(depth @ np.abs(NORMAL_X)),
+        scene.clearance.vertical_m + 0.5 * float(depth @ np.abs(NORMAL_Y)),
+    )

@@ -23,6 +23,20 @@ _FINER = 8
 FEWEST_POSES = 20
 #: Beyond it a number is none of a head's pose, in m or rad, or of a load, in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
+#: Stated deviation of x, y [m], theta [rad] beyond which a component was not measured: a large one often says that.
+USELESS: Deviation = (0.05, 0.05, 0.2)
+#: The same as a multiple of the median of those that poses bring.
+_MUCH_WORSE = 10.0
+#: How far a spike is from the values about it, in noise from row to row; most of them, and fewest rows to look at.
+_SPIKE, _MOST_SPIKES, _SPIKED_ROWS = 20.0, 0.1, 50
+#: Share of rows that repeat the row before from which on a sensor may be slower than what sends it, and how much longer
+#: than the mean such a repetition may be: longer is a sensor that has stopped.
+_REPEATING, _LONGER = 0.25, 3.0
+#: Fewest different rows of such a sensor.
+_FEWEST_VALUES = 50
+#: Longest silence of the load in s: what acts meanwhile is not known; and in units of the median distance of samples,
+#: since a load may be given by few knots.
+LONGEST_GAP_S, _LONGEST_GAP = 0.5, 20.0
 
 
 class EstimateError(PlowTwinError):
@@ -57,8 +71,9 @@ class Poses:
         Raises
         ------
         EstimateError
-            For arrays of the wrong shape.
+            For arrays of the wrong shape, or a deviation that is none.
         """
+        _check_deviation("poses", deviation)
         times, rows = np.asarray(t, dtype=np.float64), np.array(q, dtype=np.float64)
         if times.ndim != 1 or rows.shape != (len(times), 3):
             raise EstimateError(f"poses: got t {times.shape} and q {rows.shape}, expected (n,) and (n, 3)")
@@ -76,6 +91,43 @@ class Poses:
         """Return the poses stamped in [start, end)."""
         inside = (self.t >= start) & (self.t < end)
         return Poses(self.t[inside], self.q[inside], self.deviation)
+
+    def moved(self, by: Array) -> Poses:
+        """Return the poses with `by`, shape (3,), added to each."""
+        return Poses(self.t, self.q + by, self.deviation)
+
+    def without_spikes(self, level: Array) -> tuple[Poses, int]:
+        """Leave out values far from all four about them; return how many. `level`, shape (3,): noise from row to row.
+
+        Where many are, the sensor is a bad one, and nothing is left out.
+        """
+        if len(self.t) < _SPIKED_ROWS:
+            return self, 0
+        about = np.stack([np.roll(self.q, shift, axis=0) for shift in (-2, -1, 1, 2)])
+        low, high = about.min(axis=0), about.max(axis=0)
+        far = _SPIKE * level + (high - low)
+        # no comparison with NaN holds
+        spikes = (self.q > high + far) | (self.q < low - far)
+        spikes[[0, 1, -2, -1]] = False
+        count = int(spikes.sum())
+        if not count or spikes.mean(axis=0).max() > _MOST_SPIKES:
+            return self, 0
+        return Poses(self.t, np.where(spikes, np.nan, self.q), self.deviation), count
+
+    def fresh(self) -> Poses:
+        """Leave out repetitions where a sensor is slower than what sends it: they are late, and their noise is one.
+
+        A value that stays for longer is that of a sensor that has stopped, and kept.
+        """
+        one, next_one = self.q[:-1], self.q[1:]
+        again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
+        if again.mean() < _REPEATING if len(again) else True:
+            return self
+        first = np.flatnonzero(np.append(True, ~again))
+        lengths = np.diff(np.append(first, len(self.t)))
+        if len(first) < _FEWEST_VALUES or lengths.max() > _LONGER * lengths.mean() + 1.0:
+            return self
+        return Poses(self.t[first], self.q[first], self.deviation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +157,9 @@ class Load:
         Raises
         ------
         EstimateError
-            For arrays of the wrong shape, or without two samples that can be used.
+            For arrays of the wrong shape, without two samples that can be used, or for a deviation that is none.
         """
+        _check_deviation("load", deviation)
         times, rows = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
         if times.ndim != 1 or rows.shape != (len(times), 3):
             raise EstimateError(f"load: got t {times.shape} and wrench {rows.shape}, expected (n,) and (n, 3)")
@@ -121,6 +174,23 @@ class Load:
         last = min(int(np.searchsorted(self.t, end, side="left")) + 1, len(self.t))
         return Load(self.t[first:last], self.wrench[first:last])
 
+    def longest_stretch(self) -> Load:
+        """Return the longest part without a silence."""
+        apart = np.diff(self.t)
+        silent = np.flatnonzero(apart > max(LONGEST_GAP_S, _LONGEST_GAP * float(np.median(apart))))
+        if not len(silent):
+            return self
+        bounds = np.concatenate([[0], silent + 1, [len(self.t)]])
+        spans = self.t[bounds[1:] - 1] - self.t[bounds[:-1]]
+        first, end = bounds[int(np.argmax(spans)) :][:2]
+        return Load(self.t[first:end], self.wrench[first:end], self.deviation)
+
+    def newest(self, span: float) -> Load:
+        """Return the samples of the last `span` s."""
+        first = int(np.searchsorted(self.t, self.t[-1] - span))
+        first = min(first, len(self.t) - 2)
+        return Load(self.t[first:], self.wrench[first:], self.deviation)
+
     def gain_deviations(self) -> Array:
         """Return the stated deviations as shares of the components' root mean squares, shape (3,); 0 without a load."""
         size = np.sqrt((self.wrench**2).mean(axis=0))
@@ -129,6 +199,10 @@ class Load:
 
     def period(self) -> float:
         """Return the period in s of the strongest oscillation, or a tenth of the span where there is none."""
+        return self.oscillation() or float(self.t[-1] - self.t[0]) / 10.0
+
+    def oscillation(self) -> float | None:
+        """Return the period in s of the strongest oscillation, None where there is none."""
         span = float(self.t[-1] - self.t[0])
         count = int(min(max(64, 4 * len(self.t)), 8192))
         grid = np.linspace(self.t[0], self.t[-1], count)
@@ -136,12 +210,12 @@ class Load:
         columns -= columns.mean(axis=1, keepdims=True)
         sizes = columns.std(axis=1)
         if not sizes.any():
-            return span / 10.0
+            return None
         columns /= np.where(sizes > 0.0, sizes, 1.0)[:, None]
         power = (np.abs(np.fft.rfft(columns * np.hanning(count), axis=1)) ** 2).sum(axis=0)
         power[:2] = 0.0
         peak = int(np.argmax(power))
-        return span / peak if power[peak - 1 : peak + 2].sum() > 0.3 * power.sum() else span / 10.0
+        return span / peak if power[peak - 1 : peak + 2].sum() > 0.3 * power.sum() else None
 
     def thinned(self, share: float = 1e-3) -> Load:
         """Leave out samples that straight lines give within `share` of the range (Ramer, Douglas and Peucker)."""
@@ -185,6 +259,36 @@ class Load:
                 np.bincount(left, (1.0 - share) * value, count) + np.bincount(left + 1, share * value, count)
             )
         return Load(knots, solveh_banded(bands, np.stack(columns, axis=1)))
+
+
+def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:
+    """Return poses without the components that they themselves say are hardly known, and the deviation of the others.
+
+    Parameters
+    ----------
+    stated : tuple of 3 float
+        Least deviation of each component.
+    q, own : ndarray, shape (n, 3)
+        Poses and the deviations that they bring, NaN where none.
+
+    Returns
+    -------
+    ndarray, tuple of 3 float
+        Poses, NaN where not to be believed; the root mean square of the own deviations of the others, at least what
+        is stated.
+    """
+    told = [column[np.isfinite(column)] for column in own.T]
+    usual = np.array([float(np.median(column)) if len(column) else 0.0 for column in told])
+    worse = own > np.minimum(USELESS, np.where(usual > 0.0, _MUCH_WORSE * usual, np.inf))
+    kept = np.where(worse | ~np.isfinite(own), 0.0, own)
+    count = np.maximum((np.isfinite(own) & ~worse).sum(axis=0), 1)
+    x, y, theta = np.maximum(stated, np.sqrt((kept**2).sum(axis=0) / count)).tolist()
+    return np.where(worse, np.nan, q), (x, y, theta)
+
+
+def _check_deviation(what: str, deviation: Deviation) -> None:
+    if len(deviation) != 3 or not all(0.0 <= value < math.inf for value in deviation):
+        raise EstimateError(f"{what}: got the deviations {deviation}, expected three finite ones >= 0")
 
 
 def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:

@@ -7,21 +7,23 @@ changes nothing, and the journal gives the same windows as the live node.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.gaps import Gaps
-from plow_twin.estimate.measurements import FEWEST_POSES, UNSTATED, Deviation, Load, Poses
+from plow_twin.estimate.measurements import FEWEST_POSES, LONGEST_GAP_S, UNSTATED, Deviation, Load, Poses, believed
 from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
-Row = tuple[int, float, float, float]
+#: A stamp in ns and what was measured.
+Row = tuple[int, tuple[float, ...]]
 
-#: Longest silence of the load in s within a window: what acts meanwhile is not known.
-LONGEST_GAP_S = 0.5
+#: Most poses, and gaps, that are kept: more come where the load has stopped, or another clock is ahead by hours.
+MOST_KEPT = 600_000
+_NONE = (np.nan, np.nan, np.nan)
 #: Share of the window's full length from which on it is worth an estimate.
 LEAST_SHARE = 0.5
 
@@ -76,9 +78,8 @@ class Windows:
     def restart(self) -> None:
         """Forget everything: stamps or machine are other ones from now on."""
         self._loads: list[Row] = []
-        self._poses: list[Row] = []
-        self._deviations: list[Row] = []
-        self._gaps: list[tuple[int, tuple[int, ...], tuple[float, ...]]] = []
+        self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
+        self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
 
@@ -88,9 +89,7 @@ class Windows:
 
     def take_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
         """Take in a measured pose x, y [m], theta [rad], NaN where not measured, with its deviations if known."""
-        self._poses.append((stamp_ns, *q))  # type: ignore[arg-type]
-        if deviation:
-            self._deviations.append((stamp_ns, *deviation))  # type: ignore[arg-type]
+        self._poses.append((stamp_ns, q, deviation))
 
     def take_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
         """Take in measured gaps in m of the pairs with these numbers."""
@@ -98,7 +97,7 @@ class Windows:
 
     def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
         """Take in a sample of the load Fx, Fy [N], M [N m]; return the window that is due now, if one is."""
-        self._loads.append((stamp_ns, *wrench))  # type: ignore[arg-type]
+        self._loads.append((stamp_ns, wrench))
         if self._newest_ns is not None and stamp_ns <= self._newest_ns:
             return None
         self._newest_ns = stamp_ns
@@ -114,9 +113,8 @@ class Windows:
         start_ns = end_ns - self._length_ns
         # what is older than this window is in none of those to come
         self._loads = [row for row in self._loads if row[0] >= start_ns]
-        self._poses = [row for row in self._poses if row[0] >= start_ns]
-        self._deviations = [row for row in self._deviations if row[0] >= start_ns]
-        self._gaps = [row for row in self._gaps if row[0] >= start_ns]
+        self._poses = deque((row for row in self._poses if row[0] >= start_ns), MOST_KEPT)
+        self._gaps = deque((row for row in self._gaps if row[0] >= start_ns), MOST_KEPT)
         stamps = np.sort(np.array([row[0] for row in self._loads if row[0] < end_ns], dtype=np.int64))
         gaps = np.flatnonzero(np.diff(stamps) > LONGEST_GAP_S * 1e9)
         if len(gaps):
@@ -130,8 +128,10 @@ class Windows:
             return None
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
         load, lost_load = Load.of(*_table(rows, start_ns), self._load_deviation)
-        own = [row[1:] for row in self._deviations if start_ns <= row[0] < end_ns]
-        pose, lost_poses = Poses.of(*_table(poses, start_ns), at_least(self._pose_deviation, own))
+        times, q = _table([(stamp, values) for stamp, values, _ in poses], start_ns)
+        own = np.array([deviation or _NONE for _, _, deviation in poses]).reshape(-1, 3)
+        q, deviation = believed(self._pose_deviation, q, own)
+        pose, lost_poses = Poses.of(times, q, deviation)
         tabled, lost_gaps = self._table_of_gaps(measured, start_ns)
         lost = lost_load + lost_poses + lost_gaps
         return Window(start_ns, end_ns, load, pose, len(rows), len(poses) + len(measured), lost, tabled)
@@ -148,16 +148,8 @@ class Windows:
         return Gaps.of(np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), table, self._gaps_deviation)
 
 
-def at_least(stated: Deviation, own: Sequence[tuple[float, ...]]) -> Deviation:
-    """Return for each component the root mean square of the poses' own deviations (n, 3); at least the stated one."""
-    if not own:
-        return stated
-    x, y, theta = np.maximum(stated, np.sqrt(np.mean(np.square(own), axis=0))).tolist()
-    return x, y, theta
-
-
 def _table(rows: list[Row], start_ns: int) -> tuple[Array, Array]:
     """Return times in s, shape (n,), and values, shape (n, 3)."""
     stamps = np.array([row[0] for row in rows], dtype=np.int64)
-    values = np.array([row[1:] for row in rows], dtype=np.float64).reshape(-1, 3)
+    values = np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 3)
     return np.multiply(stamps - start_ns, 1e-9, dtype=np.float64), values

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.estimate.measurements import UNSTATED, Deviation
-from plow_twin.estimate.window import at_least
+from plow_twin.estimate.measurements import UNSTATED, Deviation, believed
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
@@ -27,13 +26,14 @@ from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Gaps, PartOfPose, Pose, Spread, whole_pose
+from plow_twin.stream.journal import Gaps, PartOfPose, Pose, Reset, SetWear, Spread, whole_pose
 
 Array = NDArray[np.float64]
 
 SCENE_FILE, LOAD_FILE, POSE_FILE, GAPS_FILE = "scene.yaml", "load.csv", "pose.csv", "gaps.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
+_NONE: Final = (math.nan,) * 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,10 +100,11 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     else:
         given = scene is not None
         model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
-        loads, journalled, gaps, spread, own_deviations = _journal(own)
+        loads, journalled, gaps, spread, brought = _journal(own)
         gaps_deviation = float(own.header.parameters.get("gaps_deviation", 0.0))
         of_poses, of_load = stated(own.header.parameters)
-        deviations = at_least(of_poses, own_deviations), tuple(np.maximum(of_load, spread).tolist())
+        journalled[:, 1:], of_poses = believed(of_poses, journalled[:, 1:], brought)
+        deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
         rows, unfit = {"head_pose": journalled}, 0
         if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
@@ -119,30 +120,45 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     return Measured(model, loads, poses, unfit, *deviations, gaps, gaps_deviation)
 
 
-def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, list[tuple[float, ...]]]:
+def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
     """Return samples, poses and gaps of a journal, stamps in ns in front, and what it says of deviations.
 
-    Those are the largest of the load, (3,), and those that came with poses.
+    Those are the largest of the load, (3,), and those that came with each pose, (n, 3), NaN where none did. What was
+    before new skids, or a step of the clock, is of another machine or time: the last stretch counts.
     """
-    loads, poses, spread, deviations = [np.zeros((0, 4))], [], np.zeros(3), []
+    nothing = [np.zeros((0, 4))]
+    loads, spread = [*nothing], np.zeros(3)
+    poses: list[tuple[float, ...]] = []
+    brought: list[tuple[float, ...]] = []
     gaps: list[Array] = []
     for batch in reader.batches(outputs=False):
         entries = batch.entries
-        loads.append(np.column_stack([entries.stamp_ns, entries.wrench])[entries.sample])
-        for entry in entries.others.values():
-            if isinstance(entry, Pose):
+        rows, since = np.column_stack([entries.stamp_ns, entries.wrench]), 0
+        for index, entry in sorted(entries.others.items()):
+            if isinstance(entry, Reset | SetWear):
+                loads, since = [*nothing], index
+                poses.clear()
+                brought.clear()
+                gaps.clear()
+            elif isinstance(entry, Pose):
                 poses.append((entry.stamp_ns, *entry.pose))
-                deviations += [entry.deviation] if entry.deviation else []
+                brought.append(entry.deviation or _NONE)
             elif isinstance(entry, PartOfPose):
                 poses.append((entry.stamp_ns, *whole_pose(entry)))
+                brought.append(_NONE)
             elif isinstance(entry, Gaps):
                 row = np.full(1 + PAIR_COUNT, np.nan)
                 row[0], row[1 + np.array(entry.pairs)] = entry.stamp_ns, entry.gaps
                 gaps.append(row)
             elif isinstance(entry, Spread):
                 spread = np.maximum(spread, entry.deviation)
+        loads.append(rows[since:][entries.sample[since:]])
     measured = np.array(poses, dtype=np.float64).reshape(-1, 4)
-    return np.concatenate(loads), measured, np.array(gaps).reshape(-1, 1 + PAIR_COUNT), spread, deviations
+    return np.concatenate(loads), measured, np.array(gaps).reshape(-1, 1 + PAIR_COUNT), spread, _three(brought)
+
+
+def _three(rows: list[tuple[float, ...]]) -> Array:
+    return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 
 def _collect(
