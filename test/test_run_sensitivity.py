@@ -124,6 +124,34 @@ def test_a_live_twin_has_the_derivatives_too() -> None:
         TwinSensitivity(twin, ("loads.fx.scale",))
 
 
+@pytest.mark.parametrize("e", [1.0, 0.7])
+def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(e: float) -> None:
+    """At e = 1 the scene beside it is damped, and a contact under way keeps what it has read at its touch."""
+    scene = replace(preset("paper"), initial=Initial((0.001, 0.002, 0.003), (0.4, 0.1, 0.8)))
+    scene = replace(scene, contact=Contact("exact_restitution", scene.contact.stiffness, restitution=e))
+    twin = Twin(scene, excitation="sampled")
+    followed = TwinSensitivity(twin, ("contact.restitution",))
+    times = np.arange(1, 2001) * 1e-3
+    loads = np.array([2e4, -1e4, 3e3]) * np.cos(25.0 * times)[:, None]
+    for t, load in zip(times, loads, strict=True):
+        followed.advance(t, load)
+        if followed.t > 0.2:
+            break
+
+    def end(other: Scene) -> np.ndarray:
+        moved = Twin(other, excitation="sampled", tol=1e-12)
+        count = int(np.searchsorted(times, followed.t)) + 1
+        rows = moved.advance_samples(times[:count], loads[:count])
+        assert rows.makes.sum() > 2
+        return np.concatenate([rows.q[-1], rows.v[-1]])
+
+    # one-sided, and once more with half the step
+    ends = [end(with_parameters(scene, {"contact.restitution": e - d})) for d in (0.0, 1e-5, 2e-5)]
+    expected = (1.5 * ends[0] - 2.0 * ends[1] + 0.5 * ends[2]) / 1e-5
+    found = followed.by_parameter["contact.restitution"]
+    assert followed.t > 0.2 and found == pytest.approx(expected, abs=3e-3 * np.abs(expected).max())
+
+
 def test_a_scene_that_amplifies_is_told() -> None:
     hard = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times, largest Lyapunov exponent"):

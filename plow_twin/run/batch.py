@@ -26,7 +26,7 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 #: Terms without which a scene computes the same as with them, where their numbers are zero.
-_OPTIONAL = ("wear", "offset", "free", "slip")
+_OPTIONAL = ("hysteretic", "wear", "offset", "free", "slip")
 
 
 class TwinBatch:
@@ -35,9 +35,9 @@ class TwinBatch:
     Parameters
     ----------
     scenes : sequence of Scene
-        One for each twin; their own loads are not used. The contact laws must have the same terms: all without
-        damping, all with C d', all ramped or all with lambda, and exponents that are all 1, all integers of at least 2,
-        or all fractions.
+        One for each twin; their own loads are not used. The contact laws must have the same terms: all with C d', all
+        ramped, or all without damping or with lambda, and exponents that are all 1, all integers of at least 2, or all
+        fractions.
     tol : float
         As for `Twin`.
     start : float
@@ -175,7 +175,7 @@ class TwinBatch:
             self._states[index] = compiled.initial_state(t)
         self._wrench = np.zeros((len(self), 3))
 
-    def begin_beside(self, snapshot: bytes, moved: ArrayLike, damping: ArrayLike) -> None:
+    def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
         """Go on a little beside where one sampled twin stands, with its contacts, last sample and travel speed.
 
         Parameters
@@ -184,8 +184,9 @@ class TwinBatch:
             Of a `Twin` with `excitation="sampled"` whose scene has the record of state of these.
         moved : array_like, shape (m, 6)
             What is added to x, y [m], theta [rad] and their rates, for each twin.
-        damping : array_like, shape (m,)
-            Factor, for each twin, of the damping that the contacts under way have read at their touch.
+        again : bool
+            These went beside the twin before: the damping that a contact under way has read at its touch stays what
+            each has read, and is that of the first one for those that are displaced.
 
         Raises
         ------
@@ -194,16 +195,21 @@ class TwinBatch:
         """
         here, sample, speed = read_snapshot(snapshot, self._states.dtype)
         away = np.broadcast_to(np.asarray(moved, dtype=np.float64), (len(self), 6))
+        displaced = away.any(axis=1)
+        damping = self._states["damping_factor"].copy()
+        damping[displaced] = damping[0]
+        if not again:
+            damping[:] = here["damping_factor"]
         self._states[:], self._wrench[:] = here, sample
         self.set_travel_speed(speed)
         row = self.advance(self.time)
         pose = np.concatenate([row.q[0, 0], row.v[0, 0]])
         self._states[:] = here
-        for index in np.flatnonzero(away.any(axis=1)):
+        self._states["damping_factor"] = damping
+        for index in np.flatnonzero(displaced):
             there = pose + away[index]
             offset = self.scenes[index].head.com_offset_m
             self._states["y"][index] = geometry.body_state(there[:3], there[3:], offset)
-        self._states["damping_factor"] *= np.broadcast_to(np.asarray(damping, dtype=np.float64), len(self))[:, None]
 
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
         """Set the speed along the face from here on; only wear depends on it.
@@ -318,7 +324,7 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
     merged = first
     for index, one in enumerate(compiled):
         terms = one.parts.terms
-        for name in ("viscous", "hysteretic", "integer", "fraction", "ramp"):
+        for name in ("viscous", "integer", "fraction", "ramp"):
             if getattr(terms, name) != getattr(first, name):
                 raise ArgumentError(
                     f"scenes[{index}].contact: got law {one.scene.contact.law} with exponent "

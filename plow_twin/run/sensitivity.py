@@ -19,7 +19,7 @@ from plow_twin.errors import ArgumentError, SolverError
 from plow_twin.model import geometry
 from plow_twin.model.scene import DOF_NAMES, Load, Scene, Table
 from plow_twin.run.motion import Motion, run_events
-from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene, law_terms
+from plow_twin.solve.compiled_scene import TOLERANCE_RANGE, CompiledScene, compile_scene
 from plow_twin.solve.state import State, Status, Work, first_of, new_records, new_work
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ _RELATIVE_CHANGE: Final = 1e-6
 #: Walls are at least so many displacements away where a stretch begins. Where that leaves too little of them the one
 #: before goes on, unless so many in a row did.
 _CLEAR_OF_WALLS: Final = 100.0
-MOST_MERGED: Final = 20
+_MOST_MERGED: Final = 20
 #: Steps of one shadow over one stretch.
 _BUDGET: Final = 10**7
 #: Growth above which an error is no longer within ten tolerances (`docs/solver.md`).
@@ -142,7 +142,6 @@ class ChangedScene:
     path: str
     compiled: CompiledScene
     change: float
-    damping: float  # factor of the damping that pairs in contact remember
 
     @staticmethod
     def of(scene: Scene, path: str, tol: float) -> ChangedScene:
@@ -152,12 +151,7 @@ class ChangedScene:
         change = DISPLACEMENT * geometry.length_scale(scene) if length else _RELATIVE_CHANGE * value
         if path == "contact.restitution" and value + change > 1.0:
             change = -change
-        changed = _changed(scene, path, value + change)
-        numbers = [law_terms(one.contact)[1] for one in (changed, scene)]
-        ratio = numbers[0] / numbers[1] if numbers[1] > 0.0 else 1.0
-        if path == "contact.damping":
-            ratio = (value + change) / value
-        return ChangedScene(path, compile_scene(changed, tol), change, ratio)
+        return ChangedScene(path, compile_scene(_changed(scene, path, value + change), tol), change)
 
 
 def refuse_support(scene: Scene) -> None:
@@ -255,7 +249,8 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
     # where the stretch under way began, and the first one that counts for the exponent
     begun, first, moved, implicit = 0.0, None, DISPLACEMENT, 0
     scenes = [compiled] * (1 + size) + [one.compiled for one in changed]
-    states = _beside(compiled, compiled.initial_state(), moved * scale, free, changed, work)
+    first_states = [one.compiled.initial_state() for one in changed]
+    states = _beside(compiled, compiled.initial_state(), moved * scale, free, first_states, work)
     for end in _ends(t_end):
         followed = [_follow(one, state, end, work) for one, state in zip(scenes, states, strict=True)]
         states = [motion.state for motion in followed]
@@ -265,8 +260,11 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         changes = away[size:] / np.array([one.change for one in changed])[:, None]
         assert followed[0].penetration is not None
         held = int(states[0].implicit_steps) > implicit
-        possible = displacement_beside(followed[0].penetration[0, compiled.params.enabled == 1], scale[0], held)
-        if possible is None and merged < MOST_MERGED:
+        depths = followed[0].penetration[0, compiled.params.enabled == 1]
+        possible = displacement_beside(
+            depths, scale[0], held=held, reads_speed=bool(compiled.params.damping_number >= 0.0)
+        )
+        if possible is None and merged < _MOST_MERGED:
             # what grows meanwhile is told, though no stretch begins here
             merged += 1
             product.look(matrix, changes)
@@ -276,7 +274,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
                 first = begun if first is None else first
                 logs += stretched
             begun, merged, moved, implicit = end, 0, possible or DISPLACEMENT, int(states[0].implicit_steps)
-            states = _beside(compiled, states[0], moved * scale, free, changed, work)
+            states = _beside(compiled, states[0], moved * scale, free, states[1 + size :], work)
         times.append(end)
         growth.append(product.growth)
         from_start.append(product.total * scale[free][:, None] / scale[free][None, :])
@@ -302,7 +300,9 @@ def scale_of(compiled: CompiledScene) -> Array:
     return scale
 
 
-def displacement_beside(penetration: Array, length: float, held: bool = False) -> float | None:
+def displacement_beside(
+    penetration: Array, length: float, *, held: bool = False, reads_speed: bool = False
+) -> float | None:
     """Return by how much shadows may be displaced, in shares of the clearance, for a stretch that begins here.
 
     A spring makes a large velocity of a place that is displaced in its contact, as no step of the solver does: no
@@ -316,12 +316,17 @@ def displacement_beside(penetration: Array, length: float, held: bool = False) -
         The clearance in m that displacements are shares of.
     held : bool
         Whether overdamped contact holds the head.
+    reads_speed : bool
+        Whether a contact's damping depends on the speed of its touch, which is not displaced within the contact.
 
     Returns
     -------
     float or None
-        None where a pair is so near to its wall, inside or outside, that no displacement is small beside that.
+        None where a pair is so near to its wall, inside or outside, that no displacement is small beside that, or in a
+        contact that has read its speed.
     """
+    if reads_speed and bool((penetration > 0.0).any()):
+        return None
     room = float(np.abs(penetration).min(initial=np.inf)) / (_CLEAR_OF_WALLS * length)
     return min(DISPLACEMENT, room) if room >= (_LEAST_DISPLACEMENT if held else DISPLACEMENT) else None
 
@@ -337,12 +342,12 @@ def _beside(
     state: State,
     moved: Array,
     free: NDArray[np.int64],
-    changed: Sequence[ChangedScene],
+    before: Sequence[State],
     work: Work,
 ) -> list[State]:
     """Return a state and its shadows: for each free place or rate one beside it by `moved`, for each changed scene one.
 
-    Those of changed scenes are not displaced; a damping that was read at a touch is theirs.
+    Those of changed scenes are not displaced; a damping that was read at a touch is that of their own, in `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]
@@ -351,9 +356,9 @@ def _beside(
         displaced[index] += moved[index]
         shadow.y[:] = geometry.body_state(displaced[:3], displaced[3:], compiled.scene.head.com_offset_m)
         states.append(shadow)
-    for one in changed:
+    for own in before:
         shadow = _copy(state)
-        shadow.damping_factor *= one.damping
+        shadow.damping_factor[:] = own.damping_factor
         states.append(shadow)
     return states
 

@@ -12,7 +12,6 @@ from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.sensitivity import (
     DISPLACEMENT,
-    MOST_MERGED,
     SHADOW_TOLERANCE,
     ChangedScene,
     StretchProduct,
@@ -30,6 +29,8 @@ Array = NDArray[np.float64]
 
 #: Stretches begin anew after so many s, or sooner when a shadow is so many displacements away.
 _STRETCH_S, _FAR = 0.1, 100.0
+#: Where a contact is in the way of a new one, the stretch under way goes on for so many s.
+_LONGEST_S = 0.5
 
 
 class TwinSensitivity:
@@ -45,7 +46,8 @@ class TwinSensitivity:
     Attributes
     ----------
     t : float
-        Model time in s of all that is told: that of the last whole stretch, some 0.1 s behind at most.
+        Model time in s of all that is told: that of the last whole stretch, some 0.1 s behind, 0.5 s at most
+        where a contact lasts.
     from_start : ndarray, shape (k, k)
         Derivatives of the state at `t` by that at the beginning, of the k / 2 free degrees of freedom: places, then
         rates.
@@ -75,12 +77,13 @@ class TwinSensitivity:
         self._changed = [ChangedScene.of(scene, path, SHADOW_TOLERANCE) for path in parameters]
         compiled = compile_scene(scene, SHADOW_TOLERANCE, sampled=True)
         self._scale, self._free, self._enabled = scale_of(compiled), free_places(scene), compiled.params.enabled == 1
+        self._reads_speed = bool(compiled.params.damping_number >= 0.0)
         size = len(self._free)
         members = [scene] * (1 + size) + [one.compiled.scene for one in self._changed]
         self._shadows = TwinBatch(members, tol=SHADOW_TOLERANCE, start=twin.time)
         self.t = self._begin = twin.time
-        self._product, self._logs, self._merged = StretchProduct(size, len(parameters)), np.zeros(size), 0
-        self._start()
+        self._product, self._logs = StretchProduct(size, len(parameters)), np.zeros(size)
+        self._start(again=False)
 
     @property
     def from_start(self) -> Array:
@@ -133,21 +136,21 @@ class TwinSensitivity:
         away = (reached[1:] - reached[0])[:, self._free] / self._scale[self._free]
         size = len(self._free)
         if t - self.t >= _STRETCH_S or np.abs(away[:size]).max() > _FAR * DISPLACEMENT:
-            clear = displacement_beside(rows.penetration[0, 0, self._enabled], float(self._scale[0])) is not None
-            self._merged += 0 if clear else 1
-            if clear or self._merged > MOST_MERGED:
+            depths = rows.penetration[0, 0, self._enabled]
+            clear = displacement_beside(depths, float(self._scale[0]), reads_speed=self._reads_speed) is not None
+            if clear or t - self.t >= _LONGEST_S:
                 self._end(t, away[:size].T / DISPLACEMENT, away[size:])
         return told
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
         """End a stretch: `matrix` is its fundamental matrix, `changes` what the parameters did in it, scaled."""
         self._logs += self._product.add(matrix, changes / np.array([one.change for one in self._changed])[:, None])
-        self.t, self._merged = t, 0
+        self.t = t
         self._start()
 
-    def _start(self) -> None:
+    def _start(self, again: bool = True) -> None:
         """Begin a stretch: all shadows at the twin's state, the displaced ones a little beside it."""
-        size, changed = len(self._free), [one.damping for one in self._changed]
+        size = len(self._free)
         moved = np.zeros((len(self._shadows), 6))
         moved[np.arange(1, 1 + size), self._free] = DISPLACEMENT * self._scale[self._free]
-        self._shadows.begin_beside(self._twin.snapshot(), moved, np.array([1.0] * (1 + size) + changed))
+        self._shadows.begin_beside(self._twin.snapshot(), moved, again=again)
