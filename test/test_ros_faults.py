@@ -304,6 +304,63 @@ def test_the_scene_s_loads_follow_a_clock_that_is_paused_looped_and_fast(tmp_pat
         assert (figures["resets"], figures["solver_failures"]) == ("1", "0")
 
 
+@pytest.mark.parametrize("source", ["scene", "excitation"])
+def test_whatever_comes_on_clock_the_twin_lives_counts_all_and_the_journal_repeats_it(
+    source: str, tmp_path: Path
+) -> None:
+    rng = random.Random(f"clock {source}")
+    with bench(
+        tmp_path, use_sim_time="true", excitation_source=source, record_path=tmp_path / "run", **RELIABLE_INPUT
+    ) as running:
+        probe = running.probe
+        clock = probe.node.create_publisher(Clock, "/clock", 1000)
+        probe.until(lambda: clock.get_subscription_count() > 0, "a reader of /clock")
+        send = probe.excitation() if source == "excitation" else None
+        forces = probe.listen(JointState, "contact_forces")
+        message, time_ns, sent = Clock(), T0, 0
+
+        def show(time_ns: int) -> None:
+            message.clock.sec, message.clock.nanosec = divmod(time_ns, 10**9)
+            clock.publish(message)
+
+        for index in range(3000):
+            what = rng.random()
+            if what < 0.9:
+                steps = (0, 1, 10, 100, 100, 10, 1, -1, -100, -900, -5000, 1000, 11_000, 3_600_000)
+                time_ns += rng.choice(steps) * MS
+            elif what < 0.95:
+                show(rng.choice((0, -5 * 10**9, -(2**31) * 10**9, 1, (2**31 - 1) * 10**9)))
+            else:
+                time_ns = T0
+            show(time_ns)
+            if send is not None and rng.random() < 0.8:
+                send(max(1, time_ns + rng.choice((0, 0, 0, -5, -2000)) * MS), (30e3, 0.0, 0.0))
+                sent += 1
+            if rng.random() < 0.01:
+                service = rng.choice(("reset", "set_wear", "snapshot", "restore", "mark"))
+                probe.call(Trigger, f"{running.namespace}/plow_twin/{service}", Trigger.Request())
+            probe.pace(index)
+        # once it runs steadily again it is followed again
+        probe.pause(10.0)
+        time_ns, count = T0, len(forces)
+
+        def steadily() -> bool:
+            nonlocal time_ns, sent
+            time_ns += 10 * MS
+            show(time_ns)
+            if send is not None:
+                send(time_ns, (30e3, 0.0, 0.0))
+                sent += 1
+            return len(forces) >= count + 20
+
+        probe.until(steadily, "answers under a steady clock")
+        if sent:
+            _until_accounted(running, sent)
+        assert running.twin.stop() == 0 and "Traceback" not in running.twin.output()
+    report = replay(tmp_path / "run")
+    assert (report.exit_code, report.divergences) == (0, 0)
+
+
 @pytest.fixture
 def stepped_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Give the processes started from now on a clock of their own, and return what puts it off by so many seconds.

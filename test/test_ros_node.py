@@ -551,6 +551,10 @@ def test_under_sim_time_silence_moves_nothing(tmp_path: Path) -> None:
         assert (len(forces), probe.figures("recorder")["written"]) == (0, "0")
         clock = probe.node.create_publisher(Clock, "/clock", 10)
         message = Clock()
+        # a time before 0 is none
+        message.clock.sec = -5
+        probe.until(lambda: clock.publish(message) or "/clock: got -5 s" in running.twin.output(), "a wrong time said")
+        assert value(probe.status[-1], "clock") == "waiting" and not forces
         message.clock.sec = T0 // 10**9
         probe.until(lambda: clock.publish(message) or len(forces) == 200, "200 answers")
         for _ in range(2):

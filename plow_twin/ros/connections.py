@@ -7,7 +7,8 @@ for good, the interpreter with it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, Final
 
 from rclpy.duration import Infinite
@@ -16,23 +17,42 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock
 
 #: Looked up so often [s].
 LOOK_S: Final = 0.2
+#: A wrong time on `/clock` is said so often [s].
+_SAY_AGAIN_S: Final = 5.0
 
 
 class WithoutEvents(Node):
-    """A node that asks for no events of the middleware, neither for its own topics nor for those that rclpy makes."""
+    """A node that asks for no events of the middleware, neither for its own topics nor for those that rclpy makes.
+
+    A time before 0 on `/clock`, with which rclpy would end the program, is passed over and said.
+    """
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
         """As rclpy's."""
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return super().create_publisher(*arguments, **{"event_callbacks": events, **options})
 
-    def create_subscription(self, *arguments: Any, **options: Any) -> Subscription:
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[[Any], None], *arguments: Any, **options: Any
+    ) -> Subscription:
         """As rclpy's."""
+        if msg_type is Clock:
+            callback = partial(self._take_clock, callback)
         events = SubscriptionEventCallbacks(use_default_callbacks=False)
-        return super().create_subscription(*arguments, **{"event_callbacks": events, **options})
+        return super().create_subscription(
+            msg_type, topic, callback, *arguments, **{"event_callbacks": events, **options}
+        )
+
+    def _take_clock(self, take: Callable[[Clock], None], message: Clock) -> None:
+        if message.clock.sec < 0:
+            text = f"/clock: got {message.clock.sec} s, expected a time from 0 on: it is passed over"
+            self.get_logger().error(text, throttle_duration_sec=_SAY_AGAIN_S)
+        else:
+            take(message)
 
 
 class Connections:
