@@ -19,7 +19,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import IRLegalization
 
-from plow_twin.kernel.quick import leave_out_unused, remembering
+from plow_twin.kernel.quick import QuickPasses, remembering
 
 _ENVIRONMENT = "_ZN08NumbaEnv"
 
@@ -95,8 +95,7 @@ class _Compiler(CompilerBase):
         super().__init__(remembering(typing, flags), target, library, args, result, flags, local)
 
     def define_pipelines(self) -> list[Any]:
-        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        leave_out_unused(passes)
+        passes = QuickPasses(DefaultPassBuilder.define_nopython_pipeline(self.state))
         passes.add_pass_after(self.choice, IRLegalization)
         passes.finalize()
         return [passes]

@@ -1,6 +1,6 @@
 """Compile with less of numba's own work in Python, which is most of the time of compiling.
 
-Two means, neither of which changes what numba makes of a kernel: the same types, the same code.
+Three means, none of which changes what numba makes of a kernel: the same types, the same code.
 """
 
 from __future__ import annotations
@@ -32,11 +32,18 @@ UNUSED: Final = frozenset(
 )
 
 
-def leave_out_unused(passes: PassManager) -> list[str]:
-    """Take out the passes that kernels have no use for; return their names."""
-    unused = [entry for entry in passes.passes if entry[0].__name__ in UNUSED]
-    passes.passes = [entry for entry in passes.passes if entry not in unused]
-    return [entry[0].__name__ for entry in unused]
+class QuickPasses(PassManager):
+    """The passes of a pipeline of numba's that kernels need, without word of each: that writes all its types out."""
+
+    def __init__(self, whole: PassManager) -> None:
+        super().__init__(whole.pipeline_name)
+        self.passes = [entry for entry in whole.passes if entry[0].__name__ not in UNUSED]
+
+    def _runPass(self, index: int, pss: Any, internal_state: Any) -> None:
+        pss.analysis = self._analysis
+        pss.run_initialization(internal_state)
+        pss.run_pass(internal_state)
+        pss.run_finalizer(internal_state)
 
 
 class RememberingContext(Context):
