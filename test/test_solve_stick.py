@@ -320,16 +320,16 @@ def held_scene(law: str, seed: int) -> Scene:
 
 
 def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
-    """Return the largest error in tolerances of runs that are compared with a tight one."""
-    tight = simulate(scene, 1.0, output_dt=0.01, tol=1e-12)
-    runs = [(tol, simulate(scene, 1.0, output_dt=0.01, tol=tol)) for tol in tolerances]
+    """Return the largest error in tolerances of runs that are compared with a tight one; their work is bounded."""
+    tight = simulate(scene, 1.0, output_dt=0.01, tol=1e-12, max_steps=100_000)
+    runs = [(tol, simulate(scene, 1.0, output_dt=0.01, tol=tol, max_steps=100_000)) for tol in tolerances]
     return max(pose_error(scene, run.q, tight.q) / tol for tol, run in runs)
 
 
-@pytest.mark.parametrize(("law", "seed"), [("hertz", 8), ("hertz", 47), ("exact_restitution", 237)])
+@pytest.mark.parametrize(("law", "seed"), [("hertz", 8), ("hertz", 47), ("hertz", 81), ("exact_restitution", 237)])
 def test_a_force_too_small_to_move_the_head_still_tells_whether_its_corner_holds(law: str, seed: int) -> None:
     """Steps that follow the motion well enough had let corners go that hold, and moved where they are held."""
-    assert furthest_off(held_scene(law, seed), (1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
+    assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
 
 
 @pytest.mark.stress

@@ -108,7 +108,7 @@ def before_gripping(p, state, w, order, sigma) -> float:
 def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
     """Return the part of `sigma` over which the last terms of a polynomial g are small beside its largest one.
 
-    Term k may be exp(share k) of it.
+    Term k may be exp(share k) of it. Only the upper half counts: near a root the first terms are large beside the rest.
     """
     for _ in range(_SHORTER):
         largest, power = 0.0, 1.0
@@ -116,7 +116,7 @@ def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
             largest = max(largest, abs(g[k]) * power)
             power *= sigma
         least = math.log(sigma)
-        for k in range(order, max(order - 2 - lacuna, 0), -1):
+        for k in range(order, max(order - 2 - lacuna, order // 2), -1):
             if g[k] != 0.0:
                 least = min(least, share + math.log(largest / abs(g[k])) / k)
         shorter = math.exp(least)
