@@ -22,7 +22,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry, Pose, Travel
-from plow_twin.view import ViewSummary, to_rrd
+from plow_twin.view import ViewSummary, layout, to_rrd
 from plow_twin.view.columns import extremes
 from plow_twin.view.contact_sets import masks_of, set_color
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, Section
@@ -42,11 +42,13 @@ def view(run: Run) -> tuple[ViewSummary, dict[str, pa.Table]]:
 
 
 def read(path: Path) -> dict[str, pa.Table]:
-    """Return the rows in time of each entity of a .rrd."""
+    """Return the rows in time of each entity of a .rrd; colours that change in time stand under `<entity> colors`."""
     batches: dict[str, list[pa.RecordBatch]] = {}
     for chunk in RrdReader(str(path)).stream():
         if not chunk.is_static:
-            batches.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
+            batch = chunk.to_record_batch()
+            kind = " colors" if "SeriesLines:colors" in batch.schema.names else ""
+            batches.setdefault(chunk.entity_path + kind, []).append(batch)
     return {entity: pa.concat_tables([pa.Table.from_batches([b]) for b in rows]) for entity, rows in batches.items()}
 
 
@@ -116,6 +118,9 @@ def test_the_growth_of_the_clearance_is_drawn_in_micrometres(tmp_path: Path) -> 
         index = sent[0].name.index(name)
         np.testing.assert_allclose(best, [1e6 * (m.position[index] - new_m) for m in sent], rtol=0, atol=1e-9)
         assert 0.0 < low[-1] < 0.2 * best[-1] < best[-1] < 0.2 * high[-1]
+        # the legend shows the colour of the first stroke: that of a band is not faint
+        colors = tables[f"/growth/band/{name} colors"]["SeriesLines:colors"].to_pylist()
+        assert [color[0] & 0xFF for color in colors] == [255, layout._BAND_ALPHA]
 
 
 def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:

@@ -48,7 +48,7 @@ class Curves:
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, entities: Sequence[str], span_ns: int = 0) -> None:
         self._stream = stream
         self._axis = axis
-        self._span_ns = span_ns
+        self.span_ns = span_ns
         self.entities = tuple(entities)
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
         self._waiting = self.rows = self.sent = 0
@@ -56,7 +56,7 @@ class Curves:
     @property
     def thinned(self) -> bool:
         """Whether rows are left out."""
-        return self._span_ns > 0
+        return self.span_ns > 0
 
     def add(self, stamps: Indexes, steps: Indexes, values: Array) -> None:
         """Add rows, shapes (n,), (n,) and (n, number of entities)."""
@@ -74,7 +74,7 @@ class Curves:
         stamps, steps, values = (np.concatenate(part) for part in zip(*self._parts, strict=True))
         self._parts, self._waiting = [], 0
         indexes = self._axis.columns(stamps, steps)
-        kept = extremes(stamps // self._span_ns, values) if self._span_ns else None
+        kept = extremes(stamps // self.span_ns, values) if self.span_ns else None
         self.sent += len(stamps) if kept is None else int(kept[:, 0].sum())
         for entity, number in zip(self.entities, range(values.shape[1]), strict=True):
             column = np.ascontiguousarray(values[:, number])

@@ -245,6 +245,7 @@ class Drawing:
     def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
         """Draw the areas between the bounds: curves that change between them, row by row."""
         total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * (numbers[:, _BOUNDS] - self._bounds_new_m)), axis=1)
+        first = self._band_end is None
         if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)
             stamps, steps, total = (np.concatenate(pair) for pair in ends)
@@ -255,9 +256,19 @@ class Drawing:
             total = np.stack([np.interp(rows, known, column) for column in total.T], axis=1)
             stamps = stamps[0] + np.interp(rows, known, stamps - stamps[0]).astype(np.int64)
             steps = steps[rows.astype(np.int64)]
+        if first and len(stamps) > 1:
+            self._color_bands(stamps, steps)
         bound = np.arange(len(stamps)) % 2
         sides = total.reshape(len(stamps), len(layout.BAND), 2)
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
+
+    def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
+        """Colour the bands: full at the first stroke that is drawn, faint from the next one on."""
+        behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
+        changes = [0, min(max(1, behind), len(stamps) - 1)]
+        for entity in layout.BAND:
+            colors = rr.SeriesLines.columns(colors=layout.band_colors(entity))
+            rr.send_columns(entity, self._axis.columns(stamps[changes], steps[changes]), colors, recording=self.stream)
 
     def _pads(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
         """Draw the wear of the pads in the second cross-section."""

@@ -136,14 +136,19 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
         way = entity.rpartition("/")[2]
-        faint = (*_CLEARANCE_COLORS[way], _BAND_ALPHA)
-        _style(stream, entity, f"{way} 5..95 %", faint, AggregationPolicy.MinMax, _BAND_WIDTH)
+        _style(stream, entity, f"{way} 5..95 %", None, AggregationPolicy.MinMax, _BAND_WIDTH)
     for entity in (*TOTAL, *GROWTH, *WEAR):  # the bounds of an interval thinner than the value that they belong to
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(base)]
         shade = tuple(round(0.6 * part) for part in color) if bound else color
         _style(stream, entity, f"{base} {bound}".strip(), shade, AggregationPolicy.MinMax, 1.0 if bound else 2.5)
+
+
+def band_colors(entity: str) -> list[tuple[int, ...]]:
+    """Return the colours of a band's first strokes and of all others: the legend shows that of the first."""
+    color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
+    return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
@@ -166,12 +171,12 @@ def _style(
     stream: rr.RecordingStream,
     entity: str,
     name: str,
-    color: tuple[int, ...],
+    color: tuple[int, ...] | None,
     policy: AggregationPolicy,
     width: float = 1.5,
 ) -> None:
     lines = rr.SeriesLines(
-        colors=[color],
+        colors=None if color is None else [color],
         names=[name],
         widths=[width],
         aggregation_policy=policy,
