@@ -192,6 +192,9 @@ def test_a_browser_shows_the_run_at_the_address_that_view_names(served: str, tmp
             assert time.monotonic() < deadline, f"no picture: {page.errors}, {page.requests}"
             time.sleep(0.5)
         assert not page.errors
+        # in the dark theme, whatever the browser's: next to nothing is white
+        dots = np.asarray(Image.open(BytesIO(page.picture())).convert("L"))
+        assert (dots > 230).mean() < 0.05
         assert any("ReadMessages" in request for request in page.requests)
 
 

@@ -84,8 +84,11 @@ def _address(port: int) -> str:
 
 
 def page_address(web_port: int, port: int) -> str:
-    """Return the address of the page that shows the data on a port; without it the page is empty."""
-    return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}"
+    """Return the address of the page that shows the data on a port; without it the page is empty.
+
+    In the dark theme: the cross-section's names are not legible on the light one's labels.
+    """
+    return f"http://{LOOPBACK}:{web_port}/?url={quote(_address(port), safe='')}&theme=dark"
 
 
 def free_port() -> int:
