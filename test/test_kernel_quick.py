@@ -5,6 +5,7 @@ from __future__ import annotations
 import operator
 from typing import Any
 
+import llvmlite.binding as llvm
 import numba
 import pytest
 from numba.core.compiler import DefaultPassBuilder, Flags
@@ -12,7 +13,7 @@ from numba.core.registry import cpu_target
 from numba.core.typing.context import Context
 
 from plow_twin.kernel.compiler import FASTMATH
-from plow_twin.kernel.quick import UNUSED, QuickPasses, remembering
+from plow_twin.kernel.quick import UNUSED, QuickPasses, lock_untold, remembering
 
 
 def _flags(fastmath: bool) -> Flags:
@@ -51,3 +52,17 @@ def test_what_numba_made_for_fast_kernels_is_not_remembered_for_exact_ones() -> 
     exact, fast = (remembering(context, _flags(fastmath)) for fastmath in (False, True))
     assert exact is not fast
     assert remembering(context, _flags(False)) is exact and remembering(context, _flags(True)) is fast
+
+
+def test_who_listens_to_llvms_lock_is_told_again_afterwards() -> None:
+    told: list[str] = []
+    listener = (lambda: told.append("taken"), lambda: told.append("released"))
+    llvm.ffi.register_lock_callback(*listener)
+    try:
+        with pytest.raises(RuntimeError, match="parsing"), lock_untold():
+            llvm.parse_assembly("no module")
+        assert not told
+        llvm.parse_assembly("")
+        assert set(told) == {"taken", "released"}
+    finally:
+        llvm.ffi.unregister_lock_callback(*listener)

@@ -19,7 +19,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import IRLegalization
 
-from plow_twin.kernel.quick import QuickPasses, remembering
+from plow_twin.kernel.quick import QuickPasses, lock_untold, remembering
 
 _ENVIRONMENT = "_ZN08NumbaEnv"
 
@@ -114,7 +114,7 @@ class EntryCompiler(_Compiler):
 
     def compile_extra(self, func: Any) -> Any:
         """Compile, as numba's own."""
-        with _garbage_kept():
+        with _garbage_kept(), lock_untold():
             return super().compile_extra(func)
 
 
