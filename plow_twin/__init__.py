@@ -95,6 +95,8 @@ _NAMES = {
     "plow_twin.scene_file": ("dump_scene", "load_scene"),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
+#: For a star: names that `__getattr__` finds are not in the module before.
+__all__ = [*_HOMES]
 #: Names of version 0.1, and what they are now.
 _RENAMED = {"Twins": "TwinBatch", "AdvanceTogether": "AdvanceBatch"}
 

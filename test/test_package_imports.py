@@ -179,6 +179,7 @@ def test_every_public_name_is_found_and_none_is_imported_before_it_is_used() -> 
     assert {name for name in dir(plow_twin) if not name.startswith("_")} >= names
     for name in names:
         assert getattr(plow_twin, name) is not None
+    assert set(plow_twin.__all__) == names
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         plow_twin.nonsense  # noqa: B018
     code = (
