@@ -17,6 +17,7 @@ from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
 from plow_twin import Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate import estimate as estimating
+from plow_twin.estimate.answer import followed
 from plow_twin.estimate.bouncing import Bounced, _regress, bias_of_hard
 from plow_twin.estimate.estimate import _with_gaps, estimate, summarise_bounced
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
@@ -101,6 +102,22 @@ def test_forces_have_intervals_that_hold_peaks_and_impulses(known: list[tuple[Tr
         ForceEnsemble(truth.nominal, withdrawn)
     with pytest.raises(ForcesError, match="members: got 3"):
         ForceEnsemble(truth.nominal, result, 3)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_what_is_left_out_of_a_load_changes_no_force(known: list[tuple[Truth, Estimate]], noise: float) -> None:
+    truth, result = known[0]
+    t = np.arange(0.0, 6.0, 1e-3)
+    wrench = np.stack([np.interp(t, truth.load.t, column) for column in truth.load.wrench.T], axis=1)
+    wrench += noise * wrench.std(axis=0) * np.random.default_rng(1).standard_normal(wrench.shape)
+    load = Load(t, wrench)
+    few = followed(load, truth.load.period())
+    assert len(few.t) < 0.3 * len(t)
+    # beside each other: from 3.1 s on in both, whatever samples there are
+    each = [forces_of(truth.nominal, result, one, 20, 3.1, over_time=False) for one in (load, few)]
+    assert each[0].start == each[1].start == pytest.approx(3.1)
+    for one, other in ((each[0].peak, each[1].peak), (each[0].impulse, each[1].impulse)):
+        assert other == pytest.approx(one, rel=0.02, abs=1e-3 * float(one.max()))
 
 
 def test_members_are_drawn_with_the_estimate_s_correlation(known: list[tuple[Truth, Estimate]]) -> None:

@@ -17,6 +17,11 @@ from plow_twin.model.scene import Scene, Table
 
 #: Load periods in which the members of the forces forget where they began.
 _SETTLE_PERIODS: Final = 1.0
+#: Share of its range within which the load is followed: the forces of all members take a fifth of the time then.
+_FOLLOWED: Final = 2e-4
+#: Where nearly every sample is another one, the lines over so many s, or this share of the period, take their place: in
+#: two broad-band loads no point of a force moved by more than a ninth of its interval (9 ms: by all of it).
+_KNOT_S, _KNOT_SHARE = 4e-3, 1.0 / 400.0
 
 
 @dataclass(frozen=True)
@@ -70,9 +75,17 @@ def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
 def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[str, Any]:
     if State.PRIOR in (result.horizontal_state, result.vertical_state):
         raise ForcesError("estimate: got the prior, expected one to draw from")
-    settle = _SETTLE_PERIODS * load.period()
-    end = float(load.t[-1])
-    return forces_of(scene, result, load.between(end - asked.span_s - settle, end), asked.members, settle).as_dict()
+    period = load.period()
+    settle, end = _SETTLE_PERIODS * period, float(load.t[-1])
+    felt = followed(load.between(end - asked.span_s - settle, end), period)
+    return forces_of(scene, result, felt, asked.members, settle, over_time=False).as_dict()
+
+
+def followed(load: Load, period: float) -> Load:
+    """Return what the members of the forces follow of a load: the fewest samples that do."""
+    knots = int((load.t[-1] - load.t[0]) / min(_KNOT_S, _KNOT_SHARE * period))
+    thin = load.thinned(_FOLLOWED)
+    return load.averaged(knots) if len(thin.t) > knots else thin
 
 
 def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dict[str, Any]:

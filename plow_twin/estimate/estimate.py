@@ -301,9 +301,11 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
     """Leave out of a load what the motion does not feel; tell whether it is broad-band: nearly every sample counts."""
     most = KNOTS * max(1.0, float(load.t[-1] - load.t[0]) / period)
+    shares = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
+    significance = load.significance(shares[0])
     thin = load
-    for share in (5e-4, 1e-3, 2e-3, 4e-3, 8e-3):
-        thin = load.thinned(share)
+    for share in shares:
+        thin = load.kept(significance > share)
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most

@@ -31,8 +31,8 @@ FEWEST = 20
 #: Quantiles that are told.
 POINTS: Final = (0.05, 0.5, 0.95)
 _LEAST_CLEARANCE = 5e-4
-#: Samples that are advanced in one call: what it returns is kept for all members until the quantiles are taken.
-_CALL = 100
+#: Samples that are advanced in one call: what it returns for all members is to stay in the processor's cache.
+_CALL = 10
 
 
 class ForcesError(PlowTwinError):
@@ -43,12 +43,14 @@ class ForcesError(PlowTwinError):
 class Forces:
     """Quantiles over the members, in the order of `POINTS`.
 
+    start : from which on they count, in s
     t : (n,) in s
     force : (3, n, 8) of each pair at these times in N
-    peak, impulse : (3, 8) largest force in N and impulse in N s from the first to the last of them
+    peak, impulse : (3, 8) largest force in N and impulse in N s from `start` to the last of them
     members, left_out : twins behind it, and those that left the model's range
     """
 
+    start: float
     t: Array
     force: Array
     peak: Array
@@ -66,7 +68,7 @@ class Forces:
             for index, name in enumerate(PAIR_NAMES)
         }
         counts = {"members": self.members, "left_out": self.left_out}
-        return {**counts, "t_start": float(self.t[0]), "t_end": float(self.t[-1]), "pairs": pairs}
+        return {**counts, "t_start": self.start, "t_end": float(self.t[-1]), "pairs": pairs}
 
     def table(self) -> tuple[list[str], Array]:
         """Return the names of the columns and the rows of the forces over time."""
@@ -108,15 +110,17 @@ class ForceEnsemble:
     def __len__(self) -> int:
         return len(self._twins)
 
-    def advance(self, t: Array, wrench: Array) -> Forces:
+    def advance(self, t: Array, wrench: Array, *, over_time: bool = True) -> Forces:
         """Advance all members through samples of the load believed; `t` (n,) in s, `wrench` (n, 3).
+
+        Without `over_time` the forces at each sample are left at 0: they cost as much as the rest.
 
         Raises
         ------
         ForcesError
             Where fewer than 20 members are within the model's range.
         """
-        force = np.zeros((len(POINTS), len(t), PAIR_COUNT))
+        start, force = self._twins.time, np.zeros((len(POINTS), len(t), PAIR_COUNT))
         peak, impulse = np.zeros((len(self), PAIR_COUNT)), np.zeros((len(self), PAIR_COUNT))
         for first in range(0, len(t), _CALL):
             part = slice(first, first + _CALL)
@@ -126,11 +130,12 @@ class ForceEnsemble:
                 raise ForcesError(
                     f"t = {t[first]:.3f} s: got {self._good.sum()} members within the model's range, expected {FEWEST}"
                 )
-            force[:, part] = quantiles(batch.force[self._good])
+            if over_time:
+                force[:, part] = quantiles(batch.force[self._good])
             np.maximum(peak, batch.peak.max(axis=1), out=peak)
             impulse += batch.impulse.sum(axis=1)
         good, left = self._good, int((~self._good).sum())
-        return Forces(t, force, quantiles(peak[good]), quantiles(impulse[good]), len(self) - left, left)
+        return Forces(start, t, force, quantiles(peak[good]), quantiles(impulse[good]), len(self) - left, left)
 
 
 def quantiles(values: Array) -> Array:
@@ -143,15 +148,18 @@ def quantiles(values: Array) -> Array:
     return out
 
 
-def forces_of(scene: Scene, found: Estimate, load: Load, members: int, settle_s: float) -> Forces:
+def forces_of(
+    scene: Scene, found: Estimate, load: Load, members: int, settle_s: float, *, over_time: bool = True
+) -> Forces:
     """Return the forces under a load from `settle_s` after its first sample on: until then the members settle."""
     ensemble = ForceEnsemble(scene, found, members, start=float(load.t[0]))
-    first = int(np.searchsorted(load.t, load.t[0] + settle_s))
+    load = load.with_knot(float(load.t[0]) + settle_s)
+    first = int(np.searchsorted(load.t, load.t[0] + settle_s, side="right"))
     if first >= len(load.t):
         raise ForcesError(f"load: got {load.t[-1] - load.t[0]:g} s, expected more than the {settle_s:g} s to settle in")
     if first:
-        ensemble.advance(load.t[:first], load.wrench[:first])
-    return ensemble.advance(load.t[first:], load.wrench[first:])
+        ensemble.advance(load.t[:first], load.wrench[:first], over_time=False)
+    return ensemble.advance(load.t[first:], load.wrench[first:], over_time=over_time)
 
 
 def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Generator) -> tuple[list[Scene], Array]:

@@ -217,25 +217,47 @@ class Load:
         peak = int(np.argmax(power))
         return span / peak if power[peak - 1 : peak + 2].sum() > 0.3 * power.sum() else None
 
+    def with_knot(self, t: float) -> Load:
+        """Return the same load with a sample at `t`, in s, on the line there."""
+        place = int(np.searchsorted(self.t, t))
+        if not 0 < place < len(self.t) or self.t[place] == t:
+            return self
+        value = [np.interp(t, self.t, column) for column in self.wrench.T]
+        return Load(np.insert(self.t, place, t), np.insert(self.wrench, place, value, axis=0), self.deviation)
+
     def thinned(self, share: float = 1e-3) -> Load:
         """Leave out samples that straight lines give within `share` of the range (Ramer, Douglas and Peucker)."""
+        return self.kept(self.significance(share) > share)
+
+    def kept(self, keep: NDArray[np.bool_]) -> Load:
+        """Return the samples that `keep`, shape (n,), says."""
+        return Load(self.t[keep], self.wrench[keep])
+
+    def significance(self, share: float) -> Array:
+        """Return for each sample the share of the range from which on `thinned` leaves it out, shape (n,).
+
+        Infinite for the ends; 0 for those that are left out with `share` too.
+        """
         scale = np.ptp(self.wrench, axis=0)
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
-        keep = np.zeros(len(rows), dtype=bool)
-        keep[[0, -1]] = True
-        stack = [(0, len(rows) - 1)]
+        out = np.zeros(len(rows))
+        out[[0, -1]] = np.inf
+        stack = [(0, len(rows) - 1, np.inf)]
         while stack:
-            left, right = stack.pop()
+            left, right, least = stack.pop()
             if right - left < 2:
                 continue
             part = slice(left + 1, right)
             along = ((self.t[part] - self.t[left]) / (self.t[right] - self.t[left]))[:, None]
             error = np.abs(rows[part] - rows[left] - along * (rows[right] - rows[left])).max(axis=1)
             worst = int(np.argmax(error))
-            if error[worst] > share:
-                keep[left + 1 + worst] = True
-                stack += [(left, left + 1 + worst), (left + 1 + worst, right)]
-        return Load(self.t[keep], self.wrench[keep])
+            # what is within a part that is left out is left out
+            least = min(least, float(error[worst]))
+            if least > share:
+                middle = left + 1 + worst
+                out[middle] = least
+                stack += [(left, middle, least), (middle, right, least)]
+        return out
 
     def averaged(self, count: int) -> Load:
         """Return `count` knots at equal distances whose lines are nearest to this load (least squares).

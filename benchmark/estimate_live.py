@@ -1,0 +1,73 @@
+"""What the estimate beside a live node takes of a core: `answer` on windows of 32 s each 10 s, with 256 twins.
+
+    python benchmark/estimate_live.py
+
+The load comes at 1 kHz: harmonic, harmonic with 1 % of white noise, and another value each sample. The first window is
+estimated from nothing, the others from the one before, as the node does.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ |= dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")  # as `Worker` does
+
+import platform
+import time
+from dataclasses import replace
+
+import click
+import numpy as np
+from estimate_truths import GROUPS, Truth, draw
+
+from plow_twin.estimate.answer import Asked, answer
+from plow_twin.estimate.estimate import Guess, warm_up
+from plow_twin.estimate.measurements import Load
+from plow_twin.estimate.window import Windows
+
+WINDOW_S, INTERVAL_S = 32.0, 10.0
+#: Windows are as a node forms them; two later ones are measured.
+_END_S = 55.0
+
+
+def shares(truth: Truth, load: Load, members: int) -> list[float]:
+    """Return the share of a core that each window took."""
+    windows, found = Windows(WINDOW_S, INTERVAL_S, 2.0), []
+    guess: Guess = ()
+    poses = iter(zip(truth.poses.t, truth.poses.q, strict=True))
+    pose = next(poses, None)
+    for t, wrench in zip(load.t, load.wrench, strict=True):
+        while pose is not None and pose[0] <= t:
+            windows.take_pose(round(pose[0] * 1e9), tuple(pose[1].tolist()))
+            pose = next(poses, None)
+        window = windows.take_load(round(t * 1e9), tuple(wrench.tolist()))
+        if window is None or window.end_ns - window.start_ns < 0.9e9 * WINDOW_S:
+            continue
+        begin = time.process_time()
+        told = answer(truth.nominal, window, guess, Asked(members, INTERVAL_S))
+        found.append((time.process_time() - begin) / INTERVAL_S)
+        guess = told.following
+    return found
+
+
+@click.command()
+@click.option("--members", default=256, show_default=True)
+@click.option("--seed", default=25_000, show_default=True)
+def main(members: int, seed: int) -> None:
+    """Print the share of a core by load."""
+    rng = np.random.default_rng(seed)
+    click.echo(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores")
+    for name in ("plain", "stochastic"):
+        truth = draw(replace(GROUPS[name], load_step=1e-3, periods=_END_S / np.pi), seed)
+        warm_up(truth.nominal)
+        noisy = 0.01 * truth.load.wrench.std(axis=0) * rng.standard_normal(truth.load.wrench.shape)
+        loads = {name: truth.load}
+        if name == "plain":
+            loads["plain, 1 % of noise"] = Load(truth.load.t, truth.load.wrench + noisy)
+        for title, load in loads.items():
+            answer_shares = ", ".join(f"{share:.2f}" for share in shares(truth, load, members))
+            click.echo(f"{title}: {answer_shares} of a core")
+
+
+if __name__ == "__main__":
+    main()
