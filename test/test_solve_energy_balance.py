@@ -58,7 +58,7 @@ def test_the_balance_changes_no_bit_of_the_motion_and_costs_nothing_when_off() -
 def test_a_wrong_motion_does_not_balance() -> None:
     """The balance looks at forces of its own: a solver that takes another stiffness is found out."""
     compiled = compile_scene(PAPER, 1e-9)
-    motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)))
+    motion = Motion.start(compiled, np.zeros((1, 3)), np.zeros((1, 3)), outputs=True)
     motion.sums = new_balance()
     run_events(compiled, motion, np.zeros(1), 1.0, new_work(), 10**6)
     compiled.params.inverse_inertia *= 1.0 + 1e-6
