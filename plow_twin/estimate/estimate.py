@@ -20,6 +20,7 @@ from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, MOVING, SIZE, SOFTNESS, Spread, Unknowns
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, sandwich
 from plow_twin.model.scene import Scene
+from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 #: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: none.
@@ -43,6 +44,8 @@ TOUCHED = 0.02
 KNOTS = 120
 #: Beyond so many times that, the load is averaged instead: 9 ms at the period of the paper.
 _MOST_KNOTS = 3
+#: What a broad-band load does between its samples counts so many times: contacts turn it from pose to rate and back.
+_LEFT_OPEN = 4.0
 #: What a hard contact adds to the standard deviation of a clearance in m: the fit ends in one of many optima, and this
 #: is their scatter in the benchmark's own hard group.
 HARD_SCATTER = 4e-4
@@ -132,28 +135,29 @@ def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess
         return _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves"), ()
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
     felt, broad = thinned(load, period)
+    drift = _LEFT_OPEN * load.left_open() / np.asarray(inertias(scene)) ** 2 if broad else None
     forward = Forward(scene, felt)
     if guess:
         numbers = np.array(guess)
         shared, noise, turns = np.split(numbers, [SIZE, SIZE + 3])
-        near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, broad, turns)
+        near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, turns)
         verdict = judge(*near, period) if near else None
         if near and verdict and not (verdict.model or verdict.sensor) and near[1].gain_left < MOST_LEFT:
             return summarise(*near, verdict, lost), _next_guess(*near)
         forward = Forward(scene, felt)
     bias = bias_of_hard(unknowns, poses)
     if bias.any():
-        result, following = _searched(forward, unknowns, poses.moved(-bias), period, broad, lost)
+        result, following = _searched(forward, unknowns, poses.moved(-bias), period, drift, lost)
         if following:
             numbers = np.array(following)
             numbers[BIAS] += bias
             following = tuple(numbers.tolist())
         return _moved_back(result, bias, scene), following
-    return _searched(forward, unknowns, poses, period, broad, lost)
+    return _searched(forward, unknowns, poses, period, drift, lost)
 
 
 def _searched(
-    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, broad: bool, lost: int
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, drift: Array | None, lost: int
 ) -> tuple[Estimate, Guess]:
     """Estimate from the motion without a guess."""
     first = candidate(forward, unknowns, poses, period)
@@ -163,7 +167,7 @@ def _searched(
         bounced = compare(forward, unknowns, poses, period)
         if bounced is not None:
             return summarise_bounced(unknowns, poses, bounced, lost, forward.work), ()
-    found = refine(forward, unknowns, poses, period, first.shared, first.noise, broad)
+    found = refine(forward, unknowns, poses, period, first.shared, first.noise, drift)
     if found is None:
         return _without_fit(unknowns, poses, lost), ()
     verdict = judge(*found, period)
@@ -386,9 +390,9 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
     """Return the covariance of the shared unknowns: as the noise gives it, or as the swings scatter if that is more.
 
-    What scatters, a load that is not known between its samples, is one thing for all unknowns that move the head: the
-    ratio is the mean of theirs, since each by itself is a chance of some tens of swings. The fit has taken its own
-    freedom out of the scatter. Residuals beyond the noise are of one piece for long: the deviations grow with their
+    What scatters is one thing for all unknowns that move the head: the ratio is the mean of theirs, since each by
+    itself is a chance of some tens of swings. Linked swings have it in their links. The fit has taken its own freedom
+    out of the scatter. Residuals beyond the noise are of one piece for long: the deviations grow with their
     size, not with its root. The step that a fit would still take is no part of what it knows.
     """
     size = len(fit.shared)
@@ -396,7 +400,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
     scattered = np.diag(sandwich(fit, 1.0 / problem.deviation**2))
     swings, moving = problem.window.swings, list(MOVING)
     freed = swings / max(swings - len(moving), swings / _MOST_FREED)
-    ratio = max(1.0, freed * float((scattered / np.diag(plain))[moving].mean()))
+    ratio = 1.0 if len(problem.link) else max(1.0, freed * float((scattered / np.diag(plain))[moving].mean()))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else UNFINISHED)
     covariance: Array = plain * (widened**2 * ratio) + np.outer(fit.left[:size], fit.left[:size])

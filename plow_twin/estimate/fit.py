@@ -3,15 +3,19 @@
 The window is cut into swings, each begun in flight between the walls, where the state is best known and a small error
 of it does no harm. Each is simulated from a state of its own (multiple shooting), so neither the last bounces of a hard
 contact nor an error of the load's model can grow from swing to swing. Levenberg-Marquardt minimises Huber's function of
-the residuals and the prior. Runs from displaced starting states show which moments of a swing cannot be foretold: the
-measurements there get less weight by just that much.
+the residuals and the prior. Under a load that leaves open what it does between its samples the swings are short, and
+each is linked to the next by what such a load can have added on the way (weak constraints). Runs from displaced
+starting states show which moments of a swing cannot be foretold: the measurements there get less weight by just that
+much.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
-Optimization, ch. 10; Huber, Robust Statistics, ch. 7.
+Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -40,6 +44,8 @@ _START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
 #: Standard deviations of the displacements that probe what can be foretold.
 _PROBED_STATE = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
 _PROBED = np.array([5e-5, 5e-5, 2e-3, 5e-3, 2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0])
+#: A rate of 0.1 mm/s, or mrad/s, after a second: less of it no solver and no sensor tells.
+_LEAST_DRIFT = 1e-8
 #: Walls by their two pads: left, right (top pad first), top, bottom (left pad first).
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
 #: Longest step of the iteration in units of the prior's standard deviation.
@@ -73,6 +79,7 @@ class Point:
     residual : (n, 3) measured minus predicted; NaN where nothing was measured
     rate : (n, 3) predicted rates
     contact : (s, 8) time in contact of each pair in s
+    gap : (s - 1, 6) from the end of each swing to the start of the next; (0, 6) where they are not linked
     """
 
     shared: Array
@@ -81,7 +88,30 @@ class Point:
     residual: Array
     rate: Array
     contact: Array
+    gap: Array
     cost: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """Jacobians by the shared unknowns and the state of the own swing.
+
+    rows : (n, 3, 17) of the predicted measurements
+    ends : (s - 1, 6, 17) of the ends of linked swings
+    """
+
+    rows: Array
+    ends: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of the normal equations: places among the unknowns (k,), rows and weighted rows (m, k), residuals (m,)."""
+
+    places: NDArray[np.intp]
+    rows: Array
+    weighted: Array
+    residual: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +122,7 @@ class Fit:
     noise : (3,) standard deviation of the measurements
     variance : (n, 3) variance of each measurement as weighted
     jitter : (n, 3) variance of what cannot be foretold
-    jacobian : (n, 3, 17) of the predicted measurements by the shared unknowns and the state of the own swing
+    linear : its Jacobians
     left : (11 + 6 s,) the step that is still to be taken, linearised; none at an optimum
     gain_left : what that step would gain of the cost
     """
@@ -102,7 +132,7 @@ class Fit:
     noise: Array
     variance: Array
     jitter: Array
-    jacobian: Array
+    linear: Linear
     left: Array
     gain_left: float
     iterations: int
@@ -142,16 +172,18 @@ class Problem:
     """A window of measurements, the prior and the forward model together.
 
     `horizon` limits each swing to its first seconds; `turns` (4,) are by how much the first pad of each wall lies
-    further out than the second, in m (`WALLS`).
+    further out than the second, in m (`WALLS`); `drift` (3,) is the spectral density in m2/s3 and rad2/s3 of an
+    acceleration that nobody knows: with it the swings are linked.
     """
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, window: Window, prior: tuple[Array, Array] | None = None,
-        horizon: float = np.inf, turns: Array | None = None,
+        horizon: float = np.inf, turns: Array | None = None, drift: Array | None = None,
     ) -> None:  # fmt: skip
         self.forward, self.unknowns, self.window, self.horizon = forward, unknowns, window, horizon
         self.mean, self.deviation = prior or (unknowns.nominal(), unknowns.deviations())
         self.turns = np.zeros(len(WALLS)) if turns is None else turns
+        self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
 
     def evaluate(self, shared: Array, states: Array, turns: Array | None = None) -> Point | None:
         """Run the model, with other `turns` than the problem's if given; None where it leaves the model's range."""
@@ -163,16 +195,22 @@ class Problem:
         rows = np.flatnonzero(swing >= 0)
         # times rise, so a swing's rows lie together
         edges = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
+        asked, ends = times[rows], np.zeros(0, np.int64)
+        if len(self.link):  # each swing but the last goes on to the start of the next
+            ends = edges[1:-1] + np.arange(len(self.link))
+            asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
+            edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
         motions = self.forward.run(
-            self.unknowns.scene_of(shared), shared[GAIN], window.starts[:-1], states, edges, times[rows],
+            self.unknowns.scene_of(shared), shared[GAIN], window.starts[:-1], states, edges, asked,
             depth_of(self.turns if turns is None else turns),
         )  # fmt: skip
         if motions is None:
             return None
         residual, rate = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
-        residual[rows] = window.poses.q[rows] - motions.q - shared[BIAS]
-        rate[rows], contact = motions.v, motions.contact
-        return Point(shared, states, swing, residual, rate, contact)
+        residual[rows] = window.poses.q[rows] - np.delete(motions.q, ends, axis=0) - shared[BIAS]
+        rate[rows] = np.delete(motions.v, ends, axis=0)
+        gap = states[1 : len(ends) + 1] - np.hstack((motions.q[ends], motions.v[ends]))
+        return Point(shared, states, swing, residual, rate, motions.contact, gap)
 
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
@@ -184,20 +222,21 @@ class Problem:
         lacking = np.isnan(loss) & np.isfinite(self.window.poses.q)
         shift = (point.shared - self.mean) / self.deviation
         moved = (point.states - self.window.states) / _START_SPREAD
-        return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum())
+        linked = np.einsum("si,sij,sj->", point.gap, self.link, point.gap)
+        return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum() + linked)
 
-    def linearise(self, point: Point) -> Array:
-        """Return the Jacobian of the prediction, shape (n, 3, 17): shared unknowns, then the own swing's state."""
-        jacobian = np.zeros((len(point.residual), 3, SIZE + 6))
+    def linearise(self, point: Point) -> Linear:
+        """Return the Jacobians of the prediction and of the ends of the swings."""
+        rows, ends = np.zeros((len(point.residual), 3, SIZE + 6)), np.zeros((len(point.gap), 6, SIZE + 6))
         for j in (j for j in MOVING if j != DAMPING or self.unknowns.damped):
-            jacobian[:, :, j] = self._quotient(point, j)
-        jacobian[:, :, BIAS] = np.eye(3)
-        jacobian[:, :, DELAY] = -point.rate
+            rows[:, :, j], ends[:, :, j] = self._quotient(point, j)
+        rows[:, :, BIAS] = np.eye(3)
+        rows[:, :, DELAY] = -point.rate
         for j in range(6):
-            jacobian[:, :, SIZE + j] = self._quotient_by_state(point, j)
-        return jacobian
+            rows[:, :, SIZE + j], ends[:, :, SIZE + j] = self._quotient_by_state(point, j)
+        return Linear(rows, ends)
 
-    def _quotient(self, point: Point, index: int) -> Array:
+    def _quotient(self, point: Point, index: int) -> tuple[Array, Array]:
         step = self.unknowns.steps()[index]
         for signed in (step, -step):
             moved = point.shared.copy()
@@ -207,19 +246,30 @@ class Problem:
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
                 # residuals fall where the prediction rises
-                quotient: Array = np.nan_to_num((point.residual - other.residual) / change)
-                return quotient
-        return np.zeros_like(point.residual)
+                return np.nan_to_num((point.residual - other.residual) / change), (point.gap - other.gap) / change
+        return np.zeros_like(point.residual), np.zeros_like(point.gap)
 
-    def _quotient_by_state(self, point: Point, index: int) -> Array:
+    def _quotient_by_state(self, point: Point, index: int) -> tuple[Array, Array]:
         for signed in (_DISPLACED[index], -_DISPLACED[index]):
             moved = point.states.copy()
             moved[:, index] += signed
             other = self.evaluate(point.shared, moved)
             if other is not None:
-                quotient: Array = np.nan_to_num((point.residual - other.residual) / signed)
-                return quotient
-        return np.zeros_like(point.residual)
+                ends = point.gap - other.gap
+                ends[:, index] += signed  # the start of the next swing has moved too
+                return np.nan_to_num((point.residual - other.residual) / signed), ends / signed
+        return np.zeros_like(point.residual), np.zeros_like(point.gap)
+
+
+def link_weights(spans: Array, drift: Array) -> Array:
+    """Return the inverse covariance of what white noise of acceleration adds to pose and rate, shape (s, 6, 6)."""
+    drift = np.maximum(drift, _LEAST_DRIFT)
+    weights = np.zeros((len(spans), 6, 6))
+    place = np.arange(3)
+    weights[:, place, place] = 12.0 / np.outer(spans**3, drift)
+    weights[:, place, 3 + place] = weights[:, 3 + place, place] = -6.0 / np.outer(spans**2, drift)
+    weights[:, 3 + place, 3 + place] = 4.0 / np.outer(spans, drift)
+    return weights
 
 
 def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations: int, seed: int = 0) -> Fit | None:
@@ -231,50 +281,61 @@ def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations
     if point is None:
         return None
     damping, converged, done = 1e-3, False, 0
-    jacobian = problem.linearise(point)
-    jitter = unforeseen(problem, point, jacobian, seed)
+    linear = problem.linearise(point)
+    jitter = unforeseen(problem, point, linear.rows, seed)
     while done < iterations and problem.forward.work < MOST_WORK:
         done += 1
         noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.spread.noise)
         variance = noise**2 + JITTER_WEIGHT * jitter
         point.cost = problem.cost(point, variance)
-        normal, gradient = normal_equations(problem, point, jacobian, variance)
+        normal, gradient = normal_equations(problem, point, linear, variance)
         trial, damping = _descend(problem, point, variance, normal, gradient, damping)
         if trial is None:
             converged = True
             break
         gained = point.cost - trial.cost
         point = trial
-        jacobian = problem.linearise(point)
+        linear = problem.linearise(point)
         if gained < 0.3:
             converged = True
             break
-        jitter = unforeseen(problem, point, jacobian, seed)
+        jitter = unforeseen(problem, point, linear.rows, seed)
     noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.spread.noise)
     variance = noise**2 + JITTER_WEIGHT * jitter
     point.cost = problem.cost(point, variance)
-    normal, gradient = normal_equations(problem, point, jacobian, variance)
+    normal, gradient = normal_equations(problem, point, linear, variance)
     covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     left = covariance @ gradient
     gain_left = float(gradient @ left)
-    return Fit(point, covariance, noise, variance, jitter, jacobian, left, gain_left, done, converged)
+    return Fit(point, covariance, noise, variance, jitter, linear, left, gain_left, done, converged)
 
 
-def normal_equations(problem: Problem, point: Point, jacobian: Array, variance: Array) -> tuple[Array, Array]:
+def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
+    """Yield for each swing what its measurements and its link to the next swing add to the normal equations."""
+    z = np.abs(point.residual) / np.sqrt(variance)
+    weight = np.nan_to_num(np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / variance) * np.isfinite(point.residual)
+    residual = np.nan_to_num(point.residual)
+    shared = np.arange(SIZE)
+    for index in range(problem.window.swings):
+        inside = point.swing == index
+        rows = linear.rows[inside].reshape(-1, SIZE + 6)
+        places = np.concatenate([shared, SIZE + 6 * index + np.arange(6)])
+        found = [Piece(places, rows, rows * weight[inside].reshape(-1, 1), residual[inside].ravel())]
+        if index < len(problem.link):
+            rows = np.hstack((-linear.ends[index], np.eye(6)))
+            places = np.concatenate([shared, SIZE + 6 * index + np.arange(12)])
+            found.append(Piece(places, rows, problem.link[index] @ rows, -point.gap[index]))
+        yield found
+
+
+def normal_equations(problem: Problem, point: Point, linear: Linear, variance: Array) -> tuple[Array, Array]:
     """Return the matrix and the right-hand side of the normal equations, prior included."""
     swings = problem.window.swings
     size = SIZE + 6 * swings
     normal, gradient = np.zeros((size, size)), np.zeros(size)
-    z = np.abs(point.residual) / np.sqrt(variance)
-    weight = np.nan_to_num(np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / variance) * np.isfinite(point.residual)
-    residual = np.nan_to_num(point.residual)
-    for index in range(swings):
-        inside = point.swing == index
-        rows = jacobian[inside].reshape(-1, SIZE + 6)
-        weighted = rows * weight[inside].reshape(-1, 1)
-        places = np.concatenate([np.arange(SIZE), SIZE + 6 * index + np.arange(6)])
-        normal[np.ix_(places, places)] += weighted.T @ rows
-        gradient[places] += weighted.T @ residual[inside].ravel()
+    for piece in itertools.chain.from_iterable(pieces(problem, point, linear, variance)):
+        normal[np.ix_(piece.places, piece.places)] += piece.weighted.T @ piece.rows
+        gradient[piece.places] += piece.weighted.T @ piece.residual
     diagonal = np.diag_indices(size)
     normal[diagonal] += np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / _START_SPREAD**2, swings)])
     gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2

@@ -259,6 +259,17 @@ class Load:
                 stack += [(left, middle, least), (middle, right, least)]
         return out
 
+    def left_open(self) -> Array:
+        """Return the spectral density of the impulse that lines between the samples do not tell, in N2 s and (N m)2 s.
+
+        A load that is as rough between its samples as from one to the next leaves its lines by Brownian bridges.
+        """
+        step = np.diff(self.t)
+        slope = np.diff(self.wrench, axis=0) / step[:, None]
+        jump = np.diff(slope, axis=0) * (step[:-1] * step[1:] / (step[:-1] + step[1:]))[:, None]
+        variance: Array = 2.0 * (jump**2).mean(axis=0)
+        return variance * float(step.mean()) / 12.0
+
     def averaged(self, count: int) -> Load:
         """Return `count` knots at equal distances whose lines are nearest to this load (least squares).
 

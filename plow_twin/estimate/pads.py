@@ -84,8 +84,8 @@ def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
         inside = found.point.swing == swing
         if inside.sum() < _FEWEST_ROWS:
             continue
-        shared = np.concatenate([found.jacobian[inside][:, :, :SIZE], turns[inside]], axis=2).reshape(-1, size)
-        own = found.jacobian[inside][:, :, SIZE:].reshape(-1, 6)
+        shared = np.concatenate([found.linear.rows[inside][:, :, :SIZE], turns[inside]], axis=2).reshape(-1, size)
+        own = found.linear.rows[inside][:, :, SIZE:].reshape(-1, 6)
         weights = weight[inside].reshape(-1, 1)
         cross = (weights * shared).T @ own
         held = (weights * own).T @ own

@@ -38,9 +38,9 @@ class Stage:
 _FEWEST_ROWS = (8, 12)
 
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Shortest swing and horizon, as shares of the period, of hard and of soft contacts, and under a broad-band load: what
-#: its samples do not tell between them adds up along a swing.
-_SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.12, np.inf)
+#: Shortest swing and horizon, as shares of the period, of hard and of soft contacts, and under a broad-band load, whose
+#: swings are linked: what its samples do not tell between them adds up along a swing.
+_SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.03, np.inf)
 
 
 def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> Fit | None:
@@ -62,16 +62,17 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 
 def refine(
-    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, broad: bool,
+    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, drift: Array | None,
     turns: Array | None = None,
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
-    """Fit all poses from a good start: the beginning of each swing first; `broad`: the load is broad-band.
+    """Fit all poses from a good start: the beginning of each swing first.
 
-    `turns` (4,) are those of the walls, in m.
+    `drift` (3,), in m2/s3 and rad2/s3, is what a broad-band load leaves open, None of another load; `turns` (4,) are
+    those of the walls, in m.
     """
     hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
-    shortest, horizon = _SHORT if hard else _BROAD if broad else _LONG
+    shortest, horizon = _SHORT if hard else _LONG if drift is None else _BROAD
     shortest, horizon = max(shortest * period, rows[1]), max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
@@ -80,9 +81,9 @@ def refine(
     found = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
     if found is None:
         return None
-    whole = Problem(forward, unknowns, window, horizon=horizon, turns=turns)
+    whole = Problem(forward, unknowns, window, horizon=horizon, turns=turns, drift=None if hard else drift)
     states = better_states(whole, found.shared, found.point.states)
-    found = fit(whole, found.shared, states, found.noise, 12 if hard else 8)
+    found = fit(whole, found.shared, states, found.noise, 8 if not hard and drift is None else 12)
     return None if found is None else (whole, found)
 
 

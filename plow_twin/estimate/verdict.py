@@ -5,12 +5,14 @@ The thresholds were set on truths with seeds below 1000 and tried on others; see
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.fit import Fit, Problem
+from plow_twin.estimate.fit import Fit, Problem, pieces
 from plow_twin.estimate.measurements import FEWEST_POSES, Poses
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, GAIN, GX, GY, SIZE
@@ -33,6 +35,8 @@ STUCK_ROWS, STUCK_MOTION = 12, 6.0
 STUCK_FOR_CERTAIN = 50
 #: Gain in chi^2 from which a change within the window counts, and its least size in m.
 CHANGE_CHI2, CHANGE_M = 200.0, 5e-4
+#: Moments of a window, about, at which a change is looked for.
+MOMENTS = 60
 #: Quick noise of one part of the window over that of the rest.
 MOST_NOISE_RATIO = 2.0
 
@@ -182,32 +186,42 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
 
 def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     """Look for the moment from which on a bias, or a clearance, is another one (score test, linearised)."""
-    blocks = swing_blocks(fit)
-    if len(blocks) < 6:
+    if problem.window.swings < 6:
         return
-    precision = np.diag(1.0 / problem.deviation**2)
-    normal = sum((block.normal for block in blocks), precision)
-    best: dict[str, tuple[float, Array, int]] = {}
+    best: dict[str, tuple[float, Array]] = {}
     for name, columns in (("bias", np.arange(SIZE)[BIAS]), ("clearance", np.array([GX, GY]))):
-        for split in range(2, len(blocks) - 1):
-            later_normal = sum((block.normal for block in blocks[split:]), np.zeros((SIZE, SIZE)))
-            later_score = sum((block.score for block in blocks[split:]), np.zeros(SIZE))
-            cross = later_normal[columns]
-            information = later_normal[np.ix_(columns, columns)] - cross @ np.linalg.solve(normal, cross.T)
-            information += precision[np.ix_(columns, columns)]
-            change = np.linalg.solve(information, later_score[columns])
-            gained = float(change @ later_score[columns])
-            if name not in best or gained > best[name][0]:
-                best[name] = (gained, change, split)
-    for name, (gained, _, _) in best.items():
+        best[name] = (-np.inf, np.zeros(len(columns)))
+        for information, score in _changes(problem, fit, columns):
+            held = information + np.diag(1.0 / problem.deviation[columns] ** 2)
+            change = np.asarray(np.linalg.solve(held, score), np.float64)
+            gained = float(change @ score)
+            if gained > best[name][0]:
+                best[name] = (gained, change)
+    for name, (gained, _) in best.items():
         verdict.figures[f"change_{name}"] = gained
-    (bias, shift, _), (clearance, growth, _) = best["bias"], best["clearance"]
+    (bias, shift), (clearance, growth) = best["bias"], best["clearance"]
     if max(bias, clearance) < CHANGE_CHI2:
         return
     if bias >= clearance and (np.abs(shift) * [1.0, 1.0, 0.2]).max() > CHANGE_M:
         verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
     elif clearance > bias and np.abs(growth).max() > CHANGE_M:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
+
+
+def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
+    """Yield information and score of a change of some shared unknowns from each swing on, all else eliminated."""
+    count = len(columns)
+    cross, own, score = np.zeros((len(fit.covariance), count)), np.zeros((count, count)), np.zeros(count)
+    swings = list(pieces(problem, fit.point, fit.linear, fit.variance))
+    apart = math.ceil(len(swings) / MOMENTS)
+    for index in range(len(swings) - 1, 1, -1):
+        for piece in swings[index]:
+            changed = piece.weighted[:, columns]
+            cross[piece.places] += piece.rows.T @ changed
+            own += changed.T @ piece.rows[:, columns]
+            score += changed.T @ piece.residual
+        if index < len(swings) - 1 and index % apart == 0:
+            yield own - cross.T @ fit.covariance @ cross, score.copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,7 +243,7 @@ def swing_blocks(fit: Fit) -> list[Block]:
         inside = fit.point.swing == index
         if inside.sum() < 4:
             continue
-        rows = fit.jacobian[inside].reshape(-1, SIZE + 6)
+        rows = fit.linear.rows[inside].reshape(-1, SIZE + 6)
         weighted = rows * weight[inside].reshape(-1, 1)
         normal, score = weighted.T @ rows, weighted.T @ residual[inside].ravel()
         own = normal[SIZE:, SIZE:] + np.diag(1e-6 + 1e-9 * np.diag(normal[SIZE:, SIZE:]))
