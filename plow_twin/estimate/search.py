@@ -42,6 +42,9 @@ STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: swings are linked: what its samples do not tell between them adds up along a swing.
 _SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.03, np.inf)
 
+#: Most swings: the normal equations are dense.
+_MOST_SWINGS = 350
+
 
 def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> Fit | None:
     """Return the best fit to the beginnings of the first swings, or None where no start could be run."""
@@ -73,7 +76,8 @@ def refine(
     hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest, horizon = _SHORT if hard else _LONG if drift is None else _BROAD
-    shortest, horizon = max(shortest * period, rows[1]), max(horizon * period, rows[0])
+    shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
+    horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
     starts = [shared, *([range_of_hard(unknowns, poses, shared)] if hard else [])]
