@@ -13,7 +13,7 @@ from numba.core.registry import cpu_target
 from numba.core.typing.context import Context
 
 from plow_twin.kernel.compiler import FASTMATH
-from plow_twin.kernel.quick import UNUSED, QuickPasses, lock_untold, remembering
+from plow_twin.kernel.quick import UNUSED, QuickPasses, caching_context, without_lock_events
 
 
 def _flags(fastmath: bool) -> Flags:
@@ -39,8 +39,8 @@ def test_a_sum_of_two_numbers_is_looked_up_once(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(Context, "resolve_function_type", count)
     cpu_target.target_context.refresh()
-    context = remembering(cpu_target.typing_context, Flags())
-    context._given.clear()
+    context = caching_context(cpu_target.typing_context, Flags())
+    context._signatures.clear()
     for kind in (numba.float64, numba.float64, numba.int64):
         assert context.resolve_function_type(operator.add, (kind, kind), {}).return_type == kind
     assert looked_up == [operator.add] * 2
@@ -49,9 +49,9 @@ def test_a_sum_of_two_numbers_is_looked_up_once(monkeypatch: pytest.MonkeyPatch)
 def test_what_numba_made_for_fast_kernels_is_not_remembered_for_exact_ones() -> None:
     """Numba compiles its own `max` for the flags of the kernel that asks: its code may be reordered for one alone."""
     context = cpu_target.typing_context
-    exact, fast = (remembering(context, _flags(fastmath)) for fastmath in (False, True))
+    exact, fast = (caching_context(context, _flags(fastmath)) for fastmath in (False, True))
     assert exact is not fast
-    assert remembering(context, _flags(False)) is exact and remembering(context, _flags(True)) is fast
+    assert caching_context(context, _flags(False)) is exact and caching_context(context, _flags(True)) is fast
 
 
 def test_who_listens_to_llvms_lock_is_told_again_afterwards() -> None:
@@ -59,7 +59,7 @@ def test_who_listens_to_llvms_lock_is_told_again_afterwards() -> None:
     listener = (lambda: told.append("taken"), lambda: told.append("released"))
     llvm.ffi.register_lock_callback(*listener)
     try:
-        with pytest.raises(RuntimeError, match="parsing"), lock_untold():
+        with pytest.raises(RuntimeError, match="parsing"), without_lock_events():
             llvm.parse_assembly("no module")
         assert not told
         llvm.parse_assembly("")

@@ -129,7 +129,7 @@ def test_a_start_exactly_on_the_wall_is_solved(speed: float) -> None:
         Head(10.0, 0.1), Frame(1.0, 0.4), Clearance(0.0, 0.0), contact, loads=(Constant("f", (3.0, 1.0)),),
         initial=Initial(v=(0.0, -speed, 0.0)),
     )  # fmt: skip
-    result = simulate(scene, 0.1, energy_balance=True)
+    result = simulate(scene, 0.1)
     assert np.isfinite(result.q).all() and result.force[-1].max() > 0.0
 
 

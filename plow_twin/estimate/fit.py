@@ -183,6 +183,7 @@ class Problem:
         self.forward, self.unknowns, self.window, self.horizon = forward, unknowns, window, horizon
         self.mean, self.deviation = prior or (unknowns.nominal(), unknowns.deviations())
         self.turns = np.zeros(len(WALLS)) if turns is None else turns
+        self.drift = drift
         self.link = np.zeros((0, 6, 6)) if drift is None else link_weights(np.diff(window.starts)[:-1], drift)
 
     def evaluate(self, shared: Array, states: Array, turns: Array | None = None) -> Point | None:

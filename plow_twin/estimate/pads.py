@@ -60,8 +60,9 @@ def turned(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
         step, _ = _joint_step(problem, found)
         turn = np.clip(step[SIZE:], -_LONGEST_TURN, _LONGEST_TURN)
         problem = Problem(
-            forward, problem.unknowns, problem.window, horizon=problem.horizon, turns=problem.turns + turn
-        )
+            forward, problem.unknowns, problem.window, horizon=problem.horizon, turns=problem.turns + turn,
+            drift=problem.drift,
+        )  # fmt: skip
         again = fit(problem, found.shared, found.point.states, found.noise, _ITERATIONS)
         if again is None:
             return None

@@ -19,7 +19,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, register_pass
 from numba.core.typed_passes import IRLegalization
 
-from plow_twin.kernel.quick import QuickPasses, lock_untold, remembering
+from plow_twin.kernel.quick import QuickPasses, caching_context, without_lock_events
 
 _ENVIRONMENT = "_ZN08NumbaEnv"
 
@@ -92,7 +92,7 @@ class _Compiler(CompilerBase):
     choice: type[_ChooseLibrary]
 
     def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, local: Any) -> None:
-        super().__init__(remembering(typing, flags), target, library, args, result, flags, local)
+        super().__init__(caching_context(typing, flags), target, library, args, result, flags, local)
 
     def define_pipelines(self) -> list[Any]:
         passes = QuickPasses(DefaultPassBuilder.define_nopython_pipeline(self.state))
@@ -114,7 +114,7 @@ class EntryCompiler(_Compiler):
 
     def compile_extra(self, func: Any) -> Any:
         """Compile, as numba's own."""
-        with _garbage_kept(), lock_untold():
+        with _garbage_kept(), without_lock_events():
             return super().compile_extra(func)
 
 

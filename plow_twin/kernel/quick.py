@@ -36,7 +36,7 @@ UNUSED: Final = frozenset(
 
 
 class QuickPasses(PassManager):
-    """The passes of a pipeline of numba's that kernels need, without word of each: that writes all its types out."""
+    """A pipeline of numba's without the passes that no kernel needs and without their events, which print all types."""
 
     def __init__(self, whole: PassManager) -> None:
         super().__init__(whole.pipeline_name)
@@ -50,31 +50,31 @@ class QuickPasses(PassManager):
 
 
 @contextmanager
-def lock_untold() -> Iterator[None]:
-    """Let LLVM's lock be taken without word of it: numba times it anew for each function within a function.
+def without_lock_events() -> Iterator[None]:
+    """Take LLVM's lock without numba's events, whose timers nest as deep as functions do.
 
-    Where llvmlite keeps whom to tell elsewhere, they are told.
+    Where an llvmlite keeps its callbacks elsewhere the events stay.
     """
-    told = getattr(getattr(llvm.ffi.lib, "_lock", None), "_cblist", [])
-    kept = list(told)
-    told.clear()
+    callbacks = getattr(getattr(llvm.ffi.lib, "_lock", None), "_cblist", [])
+    kept = list(callbacks)
+    callbacks.clear()
     try:
         yield
     finally:
-        told[:] = kept
+        callbacks[:] = kept
 
 
-class RememberingContext(Context):
-    """Numba's context of types, all of it, that remembers what operators and functions of numba's give for types.
+class CachingContext(Context):
+    """Numba's typing context with a cache of the signatures of operators and of numba's own functions.
 
-    Numba tries dozens of candidates for each `+` in the text, and does so anew for the next one.
+    Numba itself tries dozens of candidates for each `+`, and does so again for the next one.
     """
 
-    __slots__ = ("_given",)
+    __slots__ = ("_signatures",)
 
     def __init__(self, shared: Context) -> None:
         self.__dict__ = shared.__dict__
-        self._given: dict[Any, Any] = {}
+        self._signatures: dict[Any, Any] = {}
 
     def resolve_function_type(self, func: Any, args: Any, kws: Any) -> Any:
         """Return the signature of a call, as numba's own does."""
@@ -83,20 +83,20 @@ class RememberingContext(Context):
         if of_others or isinstance(func, str) or kws:
             return super().resolve_function_type(func, args, kws)
         call = func, tuple(args)
-        found = self._given.get(call)
+        found = self._signatures.get(call)
         if found is None:
             found = super().resolve_function_type(func, args, kws)
             if found is not None:
-                self._given[call] = found
+                self._signatures[call] = found
         return found
 
 
-_CONTEXTS: Final[dict[Any, RememberingContext]] = {}
+_CONTEXTS: Final[dict[Any, CachingContext]] = {}
 
 
-def remembering(context: Context, flags: Any) -> RememberingContext:
-    """Return the context that remembers for one set of compiler flags, which numba's functions take over."""
+def caching_context(context: Context, flags: Any) -> CachingContext:
+    """Return the caching context for one set of compiler flags, which numba's functions inherit."""
     found = _CONTEXTS.get((context, flags))
     if found is None:
-        found = _CONTEXTS[context, flags.copy()] = RememberingContext(context)
+        found = _CONTEXTS[context, flags.copy()] = CachingContext(context)
     return found
