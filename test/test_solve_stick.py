@@ -332,6 +332,16 @@ def test_a_force_too_small_to_move_the_head_still_tells_whether_its_corner_holds
     assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
 
 
+@pytest.mark.parametrize("seed", [6, 17])
+def test_a_soft_grip_at_a_tight_tolerance_stays_finite(seed: int) -> None:
+    """The release penetration is one that the corner does not cross in less time than the series can tell."""
+    scene = held_scene("hertz", seed)
+    assert scene.friction is not None
+    scene = replace(scene, friction=replace(scene.friction, stick_stiffness_n_m=1e8, stick_damping_n_s_m=None))
+    tight, other = (simulate(scene, 1.0, output_dt=0.01, tol=tol) for tol in (1e-12, 1e-8))
+    assert pose_error(scene, other.q, tight.q) < 1e-7
+
+
 @pytest.mark.stress
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("law", ["kelvin_voigt", "exact_restitution", "hertz"])

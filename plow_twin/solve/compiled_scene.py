@@ -276,7 +276,9 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
         # a corner that is released lets go of its wall: what its spring held by must not be seen either
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
-        release = min(release, float((held / scene.contact.stiffness) ** (1.0 / exponent)))
+        # a corner that crosses it in less than 1e-11 s has series whose terms are not finite
+        depth = max(float((held / scene.contact.stiffness) ** (1.0 / exponent)), 1e-11 * speed)
+        release = min(release, depth)
     return release
 
 
