@@ -79,7 +79,7 @@ class Point:
     residual : (n, 3) measured minus predicted; NaN where nothing was measured
     rate : (n, 3) predicted rates
     contact : (s, 8) time in contact of each pair in s
-    gap : (s - 1, 6) from the end of each swing to the start of the next; (0, 6) where they are not linked
+    defect : (s - 1, 6) from the end of each swing to the start of the next; (0, 6) where they are not linked
     """
 
     shared: Array
@@ -88,7 +88,7 @@ class Point:
     residual: Array
     rate: Array
     contact: Array
-    gap: Array
+    defect: Array
     cost: float = np.inf
 
 
@@ -210,8 +210,8 @@ class Problem:
         residual, rate = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
         residual[rows] = window.poses.q[rows] - np.delete(motions.q, ends, axis=0) - shared[BIAS]
         rate[rows] = np.delete(motions.v, ends, axis=0)
-        gap = states[1 : len(ends) + 1] - np.hstack((motions.q[ends], motions.v[ends]))
-        return Point(shared, states, swing, residual, rate, motions.contact, gap)
+        defect = states[1 : len(ends) + 1] - np.hstack((motions.q[ends], motions.v[ends]))
+        return Point(shared, states, swing, residual, rate, motions.contact, defect)
 
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.
@@ -223,12 +223,12 @@ class Problem:
         lacking = np.isnan(loss) & np.isfinite(self.window.poses.q)
         shift = (point.shared - self.mean) / self.deviation
         moved = (point.states - self.window.states) / _START_SPREAD
-        linked = np.einsum("si,sij,sj->", point.gap, self.link, point.gap)
+        linked = np.einsum("si,sij,sj->", point.defect, self.link, point.defect)
         return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum() + linked)
 
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the prediction and of the ends of the swings."""
-        rows, ends = np.zeros((len(point.residual), 3, SIZE + 6)), np.zeros((len(point.gap), 6, SIZE + 6))
+        rows, ends = np.zeros((len(point.residual), 3, SIZE + 6)), np.zeros((len(point.defect), 6, SIZE + 6))
         for j in (j for j in MOVING if j != DAMPING or self.unknowns.damped):
             rows[:, :, j], ends[:, :, j] = self._quotient(point, j)
         rows[:, :, BIAS] = np.eye(3)
@@ -247,8 +247,8 @@ class Problem:
             other = self.evaluate(moved, point.states) if abs(change) > 0.5 * step else None
             if other is not None:
                 # residuals fall where the prediction rises
-                return np.nan_to_num((point.residual - other.residual) / change), (point.gap - other.gap) / change
-        return np.zeros_like(point.residual), np.zeros_like(point.gap)
+                return np.nan_to_num((point.residual - other.residual) / change), (point.defect - other.defect) / change
+        return np.zeros_like(point.residual), np.zeros_like(point.defect)
 
     def _quotient_by_state(self, point: Point, index: int) -> tuple[Array, Array]:
         for signed in (_DISPLACED[index], -_DISPLACED[index]):
@@ -256,10 +256,10 @@ class Problem:
             moved[:, index] += signed
             other = self.evaluate(point.shared, moved)
             if other is not None:
-                ends = point.gap - other.gap
+                ends = point.defect - other.defect
                 ends[:, index] += signed  # the start of the next swing has moved too
                 return np.nan_to_num((point.residual - other.residual) / signed), ends / signed
-        return np.zeros_like(point.residual), np.zeros_like(point.gap)
+        return np.zeros_like(point.residual), np.zeros_like(point.defect)
 
 
 def link_weights(spans: Array, drift: Array) -> Array:
@@ -325,7 +325,7 @@ def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> I
         if index < len(problem.link):
             rows = np.hstack((-linear.ends[index], np.eye(6)))
             places = np.concatenate([shared, SIZE + 6 * index + np.arange(12)])
-            found.append(Piece(places, rows, problem.link[index] @ rows, -point.gap[index]))
+            found.append(Piece(places, rows, problem.link[index] @ rows, -point.defect[index]))
         yield found
 
 
