@@ -17,6 +17,8 @@ from work_precision import OURS, SECTION
 #: Colour and marker of each solver that is drawn, in the order of the legend.
 STYLES: dict[str, tuple[str, str]] = {
     OURS: ("#d62728", "o"),
+    "heyoka (Taylor, events)": ("#111111", "*"),
+    "DOP853 (numba, events located)": ("#6a3d9a", "d"),
     "lean RK4 (numba)": ("#7f7f7f", "v"),
     "CVODE Adams (C)": ("#1f4e9c", "s"),
     "CVODE Adams (C, rootfinding)": ("#4a90d9", "D"),
