@@ -28,6 +28,8 @@ Guess = tuple[float, ...]
 
 #: Largest standard deviation in m with which a clearance counts as estimated.
 OBSERVED = 1e-3
+#: The same of the clearance of a group of pads: enough to see that a wall is worn askew.
+GROUP_OBSERVED = 5e-4
 #: Longest distance of poses in s: where fewer lie in a flight, its start is guessed wrong and the fit with it.
 SPARSEST = 0.125
 #: Load periods and seconds of a window, whichever is longer; of more the newest are taken, since the work is bounded.
@@ -36,8 +38,6 @@ MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
 _LONGEST_S = 600.0
 #: Scatter of the last half of the poses, in that of their quick changes, from which on the head moves.
 _MOVES = 5.0
-#: The same of a group of pads: there is no other use of it than to see that a wall is worn askew.
-GROUP_OBSERVED = 5e-4
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
 #: Knots of the load in a period that are simulated, about.
@@ -397,10 +397,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
     """
     size = len(fit.shared)
     plain = fit.covariance[:size, :size]
-    scattered = np.diag(sandwich(fit, 1.0 / problem.deviation**2))
-    swings, moving = problem.window.swings, list(MOVING)
-    freed = swings / max(swings - len(moving), swings / _MOST_FREED)
-    ratio = 1.0 if len(problem.link) else max(1.0, freed * float((scattered / np.diag(plain))[moving].mean()))
+    ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(plain)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else UNFINISHED)
     covariance: Array = plain * (widened**2 * ratio) + np.outer(fit.left[:size], fit.left[:size])
@@ -408,6 +405,14 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
         covariance[GX, GX] += HARD_SCATTER**2
         covariance[GY, GY] += HARD_SCATTER**2
     return covariance
+
+
+def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
+    """Return the variance that the swings' scatter gives over that which the noise gives, of what moves the head."""
+    scattered = np.diag(sandwich(problem, fit, 1.0 / problem.deviation**2))
+    swings, moving = problem.window.swings, list(MOVING)
+    freed = swings / max(swings - len(moving), swings / _MOST_FREED)
+    return freed * float((scattered / variance)[moving].mean())
 
 
 def _groups(problem: Problem, fit: Fit, covariance: Array, states: list[State]) -> dict[str, tuple[Interval, State]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -292,6 +293,11 @@ class Load:
                 np.bincount(left, (1.0 - share) * value, count) + np.bincount(left + 1, share * value, count)
             )
         return Load(knots, solveh_banded(bands, np.stack(columns, axis=1)))
+
+
+def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
+    """Return the deviations that poses bring, shape (n, 3), NaN for one that brings none."""
+    return np.array([one or (math.nan,) * 3 for one in brought], dtype=np.float64).reshape(-1, 3)
 
 
 def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:

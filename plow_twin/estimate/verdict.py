@@ -232,32 +232,25 @@ class Block:
     score: Array
 
 
-def swing_blocks(fit: Fit) -> list[Block]:
-    """Return information and score of each swing that has measurements."""
+def swing_blocks(problem: Problem, fit: Fit) -> list[Block]:
+    """Return information and score of each swing that has measurements, as if it were not linked."""
     out = []
-    weight = np.where(np.isfinite(fit.point.residual), 1.0 / fit.variance, 0.0)
-    z = np.abs(np.nan_to_num(fit.point.residual)) / np.sqrt(fit.variance)
-    weight *= np.minimum(1.0, 3.0 / np.maximum(z, 1e-12))
-    residual = np.nan_to_num(fit.point.residual)
-    for index in range(len(fit.point.states)):
-        inside = fit.point.swing == index
-        if inside.sum() < 4:
+    for measured, *_ in pieces(problem, fit.point, fit.linear, fit.variance):
+        if len(measured.residual) < 12:  # four poses
             continue
-        rows = fit.linear.rows[inside].reshape(-1, SIZE + 6)
-        weighted = rows * weight[inside].reshape(-1, 1)
-        normal, score = weighted.T @ rows, weighted.T @ residual[inside].ravel()
+        normal, score = measured.weighted.T @ measured.rows, measured.weighted.T @ measured.residual
         own = normal[SIZE:, SIZE:] + np.diag(1e-6 + 1e-9 * np.diag(normal[SIZE:, SIZE:]))
         gain = np.linalg.solve(own, normal[SIZE:, :SIZE]).T
         out.append(Block(normal[:SIZE, :SIZE] - gain @ normal[SIZE:, :SIZE], score[:SIZE] - gain @ score[SIZE:]))
     return out
 
 
-def sandwich(fit: Fit, precision: Array) -> Array:
+def sandwich(problem: Problem, fit: Fit, precision: Array) -> Array:
     """Return the covariance of the shared unknowns that the scatter of the swings' scores gives, shape (11, 11).
 
     Reference: White, Econometrica 50 (1982) 1: maximum likelihood of misspecified models.
     """
-    blocks = swing_blocks(fit)
+    blocks = swing_blocks(problem, fit)
     normal = sum((block.normal for block in blocks), np.diag(precision))
     scores = np.stack([block.score for block in blocks]) if blocks else np.zeros((1, SIZE))
     scores = scores - scores.mean(axis=0)

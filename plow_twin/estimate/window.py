@@ -14,7 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.gaps import Gaps
-from plow_twin.estimate.measurements import FEWEST_POSES, LONGEST_GAP_S, UNSTATED, Deviation, Load, Poses, believed
+from plow_twin.estimate.measurements import (
+    FEWEST_POSES,
+    LONGEST_GAP_S,
+    UNSTATED,
+    Deviation,
+    Load,
+    Poses,
+    believed,
+    own_deviations,
+)
 from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
@@ -23,7 +32,6 @@ Row = tuple[int, tuple[float, ...]]
 
 #: Most poses, and gaps, that are kept: more come where the load has stopped, or another clock is ahead by hours.
 MOST_KEPT = 600_000
-_NONE = (np.nan, np.nan, np.nan)
 #: Share of the window's full length from which on it is worth an estimate.
 LEAST_SHARE = 0.5
 
@@ -129,7 +137,7 @@ class Windows:
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
         load, lost_load = Load.of(*_table(rows, start_ns), self._load_deviation)
         times, q = _table([(stamp, values) for stamp, values, _ in poses], start_ns)
-        own = np.array([deviation or _NONE for _, _, deviation in poses]).reshape(-1, 3)
+        own = own_deviations(brought for _, _, brought in poses)
         q, deviation = believed(self._pose_deviation, q, own)
         pose, lost_poses = Poses.of(times, q, deviation)
         tabled, lost_gaps = self._table_of_gaps(measured, start_ns)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.estimate.measurements import UNSTATED, Deviation, believed
+from plow_twin.estimate.measurements import UNSTATED, Deviation, believed, own_deviations
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
@@ -33,7 +33,6 @@ Array = NDArray[np.float64]
 SCENE_FILE, LOAD_FILE, POSE_FILE, GAPS_FILE = "scene.yaml", "load.csv", "pose.csv", "gaps.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
-_NONE: Final = (math.nan,) * 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +141,10 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
                 gaps.clear()
             elif isinstance(entry, Pose):
                 poses.append((entry.stamp_ns, *entry.pose))
-                brought.append(entry.deviation or _NONE)
+                brought.append(entry.deviation or ())
             elif isinstance(entry, PartOfPose):
                 poses.append((entry.stamp_ns, *whole_pose(entry)))
-                brought.append(_NONE)
+                brought.append(())
             elif isinstance(entry, Gaps):
                 row = np.full(1 + PAIR_COUNT, np.nan)
                 row[0], row[1 + np.array(entry.pairs)] = entry.stamp_ns, entry.gaps
@@ -154,11 +153,7 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
                 spread = np.maximum(spread, entry.deviation)
         loads.append(rows[since:][entries.sample[since:]])
     measured = np.array(poses, dtype=np.float64).reshape(-1, 4)
-    return np.concatenate(loads), measured, np.array(gaps).reshape(-1, 1 + PAIR_COUNT), spread, _three(brought)
-
-
-def _three(rows: list[tuple[float, ...]]) -> Array:
-    return np.array(rows, dtype=np.float64).reshape(-1, 3)
+    return np.concatenate(loads), measured, np.array(gaps).reshape(-1, 1 + PAIR_COUNT), spread, own_deviations(brought)
 
 
 def _collect(
