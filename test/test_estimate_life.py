@@ -15,7 +15,7 @@ from scenes import preset
 from plow_twin import Clearance, Table, Wear, simulate
 from plow_twin.cli.app import run as cli
 from plow_twin.estimate.coefficient import History, coefficient
-from plow_twin.estimate.forecast import Plan, Scenario, forecast, with_estimate
+from plow_twin.estimate.forecast import Plan, Scenario, forecast, with_clearances, with_estimate
 from plow_twin.estimate.life import LifeError, mean_forces, period_of, wear_path
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
@@ -32,6 +32,28 @@ def test_the_jump_agrees_with_the_direct_run() -> None:
     path = wear_path(scene, (1.0, 1.0), FAST.coefficient_m2_n * FAST.travel_speed_m_s * span / FAST.pad_area_m2)
     assert path.depth[-1] == pytest.approx(direct, rel=0.03, abs=1e-5)
     assert direct.max() > 1e-3
+
+
+def test_the_jump_agrees_with_the_direct_run_with_sliding_in_the_plane_and_running_in() -> None:
+    """At a hundredth of the usual travel the sliding in the plane outweighs it; new pads wear three times as fast."""
+    slow = replace(FAST, travel_speed_m_s=0.02, coefficient_m2_n=3e-9, sliding="total")
+    scene = replace(preset("paper"), wear=replace(slow, running_in_ratio=3.0, running_in_depth_m=2e-4))
+    assert scene.wear is not None
+    span = 24.0 * period_of(scene)
+    direct = simulate(scene, span, span, 1e-6).wear_depth
+    exposure = slow.coefficient_m2_n * slow.travel_speed_m_s * span / slow.pad_area_m2
+    path = wear_path(scene, (1.0, 1.0), exposure)
+    assert path.depth[-1] == pytest.approx(direct, rel=0.03, abs=1e-5)
+    travel_only = wear_path(replace(preset("paper"), wear=replace(slow, sliding="travel")), (1.0, 1.0), exposure)
+    assert direct.max() > 1.5 * travel_only.depth[-1].max() > 1e-4
+    # one path serves every coefficient: so it does at a quarter, where running-in is under way
+    quarter = simulate(replace(scene, wear=replace(scene.wear, coefficient_m2_n=7.5e-10)), span, span, 1e-6).wear_depth
+    early = [np.interp(0.25 * exposure, path.exposure, pad) for pad in path.depth.T]
+    assert early == pytest.approx(quarter, rel=0.05, abs=1e-5)
+    # a head whose clearances have grown has run in
+    grown = with_clearances(scene, scene.clearance.horizontal_m + 2e-3, scene.clearance.vertical_m)
+    assert grown.wear is not None and grown.clearance == scene.clearance
+    assert grown.wear.initial_depth_m == pytest.approx(1e-3 * np.abs(NORMAL_X))
 
 
 def test_constant_force_wears_as_archard_says() -> None:

@@ -275,8 +275,12 @@ def scenes(draw: st.DrawFn) -> Scene:
         else:
             loads.append(draw(tables(name)))
     contact = draw(contacts())
-    wear = Wear(draw(POSITIVE), draw(POSITIVE), draw(POSITIVE), (draw(POSITIVE),) * 8)
-    rate = wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
+    ratio = draw(st.floats(1.0, 10.0))
+    wear = Wear(
+        draw(POSITIVE), draw(POSITIVE), draw(POSITIVE), (draw(POSITIVE),) * 8,
+        sliding=draw(st.sampled_from(["travel", "total"])), running_in_ratio=ratio, running_in_depth_m=draw(POSITIVE),
+    )  # fmt: skip
+    rate = ratio * wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
     # what wears faster than its damper lets the head move is refused
     bearable = not LAWS[contact.law].additive or not (contact.damping or 0.0) * rate > 1.0
     letters = draw(st.lists(NAME, max_size=len(CORNER_NAMES), unique=True))

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scenes import preset
 
-from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene, Twin, Wear, simulate
+from plow_twin import Clearance, Contact, Frame, Gravity, Head, Initial, Scene, SceneError, Twin, Wear, simulate
+from plow_twin.model.pairs import PAIR_NAMES
 
 
 def pressed(wear: Wear | None, *, clearance: float, gravity: float, stiffness: float = 1e7) -> Scene:
@@ -58,8 +59,86 @@ def test_depth_is_the_wear_law_of_the_impulse_and_widens_the_clearance() -> None
     assert worn.q == pytest.approx(same.q, abs=1e-9)
 
 
+#: Both of what may wear a pad beside its force and the travel: one kernel for the tests of either.
+RUBBED = Wear(1e-11, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5)
+
+
+def worn_by(exposure: float) -> float:
+    """Return h with dh/dE = 1 + (r - 1) exp(-h / h0): h0 ln(r exp(E / h0) - r + 1)."""
+    h0, ratio = RUBBED.running_in_depth_m, RUBBED.running_in_ratio
+    assert h0 is not None
+    return h0 * math.log(ratio * math.exp(exposure / h0) - ratio + 1.0)
+
+
+@pytest.mark.parametrize("damping", [1e3, 1e8], ids=["explicit", "implicit"])
+@pytest.mark.parametrize(("along", "t"), [(0.0, 20.0), (0.4, 1.0)])
+def test_sliding_in_the_plane_and_running_in_under_a_constant_load(damping: float, along: float, t: float) -> None:
+    """A head that slides steadily along the bottom wears its pads by the way of both motions, less as they run in."""
+    weight, stiffness = 2000.0 * 9.81, 1e7
+    scene = dataclasses.replace(
+        pressed(RUBBED, clearance=0.02, gravity=9.81, stiffness=stiffness),
+        clearance=Clearance(1.0, 0.02),
+        contact=Contact("kelvin_voigt", stiffness, damping=damping),
+        initial=Initial((0.0, -0.01 - 0.5 * weight / stiffness, 0.0), (along, 0.0, 0.0)),
+        locked=("theta",),
+    )
+    twin = Twin(scene, tol=1e-10)
+    worn = twin.advance(t).wear_depth
+    exposure = RUBBED.coefficient_m2_n / RUBBED.pad_area_m2 * 0.5 * weight * math.hypot(2.0, along) * t
+    assert worn[[0, 2]] == pytest.approx([worn_by(exposure)] * 2, rel=1e-5)
+    assert (twin._state.implicit_steps > 0) == (damping > 1e7)
+    # the running-in is seen: at its end it has made h0 ln r of the depth
+    assert worn[0] > exposure + 1.5e-5
+
+
+def test_sliding_in_the_plane_wears_by_the_way_of_the_corner() -> None:
+    """Each pad's depth is the integral of its force times its speed, made of the rows; so is that of fixed steps."""
+    wear = dataclasses.replace(RUBBED, travel_speed_m_s=0.05)
+    scene = dataclasses.replace(preset("paper"), wear=wear)
+    result, fixed = simulate(scene, 4.0, 1e-4), simulate(scene, 4.0, method="rk4", dt=2e-5)
+    (half_w, half_h), corners = 0.5 * np.array([scene.frame.width_m, scene.frame.height_m]), []
+    c, s = np.cos(result.q[:, 2]), np.sin(result.q[:, 2])
+    for pair, name in enumerate(PAIR_NAMES):
+        x = half_w if "right" in name.rsplit("_", 1)[0] else -half_w
+        y = half_h if "top" in name.rsplit("_", 1)[0] else -half_h
+        # speed of the head's wall below the corner, along the wall
+        vx = result.v[:, 0] - result.v[:, 2] * (y - result.q[:, 1])
+        vy = result.v[:, 1] + result.v[:, 2] * (x - result.q[:, 0])
+        along = c * vx + s * vy if name.endswith(("top", "bottom")) else c * vy - s * vx
+        corners.append(np.trapezoid(result.force[:, pair] * np.hypot(0.05, along), result.t))
+    expected = [worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * float(way)) for way in corners]
+    impulse = np.array([row["impulse"] for row in result.statistics.values()])
+    # far more than the travel alone
+    assert result.wear_depth.max() > 1.5 * worn_by(wear.coefficient_m2_n / wear.pad_area_m2 * 0.05 * impulse.max())
+    assert result.wear_depth == pytest.approx(expected, rel=1e-3, abs=1e-12)
+    assert fixed.wear_depth == pytest.approx(result.wear_depth, rel=0.02, abs=1e-11)
+
+
+def test_a_twin_goes_on_wearing_from_a_snapshot_and_stands_still_without_wear() -> None:
+    scene = dataclasses.replace(preset("paper"), wear=dataclasses.replace(RUBBED, coefficient_m2_n=1e-13))
+    whole, parts = Twin(scene), Twin(scene)
+    expected = whole.advance(2.0).wear_depth
+    parts.advance(0.7)
+    other = Twin(scene)
+    other.restore(parts.snapshot())
+    assert np.array_equal(other.advance(2.0).wear_depth, expected)
+    # worn pads have run in: they do not begin as new ones do, at the same motion
+    other.reset(0.0, wear_depth=np.full(8, 1e-3))
+    assert (other.advance(2.0).wear_depth - 1e-3).max() < 0.4 * expected.max()
+    other.set_travel_speed(0.0)
+    expected = other.advance(2.0).wear_depth
+    assert np.array_equal(other.advance(3.0).wear_depth, expected)
+
+
+def test_a_ratio_without_a_depth_is_named() -> None:
+    with pytest.raises(SceneError, match="running_in_depth_m"):
+        pressed(Wear(1e-14, 0.015, 2.0, running_in_ratio=3.0), clearance=0.02, gravity=9.81)
+
+
 def test_without_wear_its_code_is_not_compiled() -> None:
     without, with_wear = Twin(preset("paper")), Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
     assert without._parts.terms.wear is None and with_wear._parts.terms.wear is not None
+    assert with_wear._parts.terms.sliding is None and with_wear._parts.terms.running_in is None
     assert not without.advance(2.0).wear_depth.any()
     assert with_wear.advance(2.0).wear_depth.any()
+    assert not with_wear._work.rub.any()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.coefficient import Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, State
-from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
 from plow_twin.model.scene import Clearance, Scene, Table
 
 Array = NDArray[np.float64]
@@ -264,9 +264,20 @@ def with_load(scene: Scene, multiple: float) -> Scene:
 
 
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float) -> Scene:
-    """Return the scene with other clearances: those that were estimated, which hold all the wear there is."""
-    wear = None if scene.wear is None else replace(scene.wear, initial_depth_m=(0.0,) * PAIR_COUNT)
-    return replace(scene, clearance=Clearance(horizontal_m, vertical_m), wear=wear)
+    """Return the scene with other clearances: those that were estimated, which hold all the wear there is.
+
+    With running-in the pads are as worn as the clearances have grown, for they no longer wear as new ones.
+    """
+    wear, clearance, grown = scene.wear, Clearance(horizontal_m, vertical_m), np.zeros(PAIR_COUNT)
+    if wear is None:
+        return replace(scene, clearance=clearance)
+    if wear.running_in_ratio > 1.0:
+        new = scene.clearance
+        clearance = Clearance(min(horizontal_m, new.horizontal_m), min(vertical_m, new.vertical_m))
+        # half of the growth at either of two walls
+        grown += 0.5 * (horizontal_m - clearance.horizontal_m) * np.abs(NORMAL_X)
+        grown += 0.5 * (vertical_m - clearance.vertical_m) * np.abs(NORMAL_Y)
+    return replace(scene, clearance=clearance, wear=replace(wear, initial_depth_m=tuple(grown.tolist())))
 
 
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:

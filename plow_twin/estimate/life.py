@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import PlowTwinError, SolverError
 from plow_twin.estimate.measurements import Load
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
+from plow_twin.model.running_in import with_running_in, without_running_in
 from plow_twin.model.scene import Harmonic, Scene, Table, Wear
 from plow_twin.run.simulate import simulate
 
@@ -28,6 +29,10 @@ Array = NDArray[np.float64]
 SETTLE_PERIODS, MEAN_PERIODS = 2, 4
 #: Largest change of a pad's depth in a step, as a share of the smaller clearance, and error allowed in a step.
 LARGEST_CHANGE, ERROR = 0.02, 1e-3
+#: Wear in m by which the way of sliding pads is told, far less than moves anything.
+_TRACE_M = 1e-12
+#: Rows for one of a path with running-in.
+_FINER = 16
 #: Most steps of a path.
 _MOST_STEPS = 400
 #: Clearance in m as which smaller ones count in these shares: a path from none would have no end.
@@ -89,6 +94,8 @@ def period_of(scene: Scene) -> float:
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
     """Return the mean force of each pad in N with worn walls, shape (8,), and its standard error over the periods.
 
+    Where sliding in the plane wears too the force counts by the way per travel.
+
     Raises
     ------
     LifeError
@@ -96,7 +103,10 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
     """
     period = period_of(scene)
     wear = scene.wear or Wear(0.0, 1.0, 0.0)
-    worn = replace(scene, wear=replace(wear, coefficient_m2_n=0.0, initial_depth_m=tuple(map(float, depth))))
+    trace = _trace(scene, period) if wear.sliding == "total" else 0.0
+    worn = replace(scene, wear=replace(
+        wear, coefficient_m2_n=trace, initial_depth_m=tuple(map(float, depth)), running_in_ratio=1.0
+    ))  # fmt: skip
     impulses = []
     for count in range(SETTLE_PERIODS, SETTLE_PERIODS + MEAN_PERIODS + 1):
         try:
@@ -107,9 +117,22 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
                 f"clearances: got {widest[0]:.1f} mm and {widest[1]:.1f} mm at the end of the path, expected ones with "
                 f"which the model runs: {error}"
             ) from error
-        impulses.append([values["impulse"] for values in result.statistics.values()])
+        if trace:
+            # what the force and the way have worn, as the impulse that the travel alone would have needed
+            impulses.append((result.wear_depth - depth) * (wear.pad_area_m2 / (trace * wear.travel_speed_m_s)))
+        else:
+            impulses.append(np.array([values["impulse"] for values in result.statistics.values()]))
     forces = np.diff(np.array(impulses), axis=0) / period
     return forces.mean(axis=0), forces.std(axis=0, ddof=1) / math.sqrt(len(forces))
+
+
+def _trace(scene: Scene, period: float) -> float:
+    """Return a wear coefficient in m^2/N that leaves the walls where they are: `_TRACE_M` deep under the weight."""
+    wear = scene.wear
+    if wear is None or wear.travel_speed_m_s <= 0.0:
+        raise LifeError("wear: got none or no travel speed, expected both")
+    impulse = scene.head.mass_kg * 10.0 * (SETTLE_PERIODS + MEAN_PERIODS) * period
+    return _TRACE_M * wear.pad_area_m2 / (wear.travel_speed_m_s * impulse)
 
 
 def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) -> Path:
@@ -122,16 +145,18 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
     """
     if scene.wear is None:
         raise LifeError("wear: got none, expected its parameters")
-    depth = np.array(scene.wear.initial_depth_m, dtype=np.float64)
+    # as worn without running-in: what is left of the pads' own coefficient is the same for all of them
+    steady = without_running_in(scene.wear, np.array(scene.wear.initial_depth_m, dtype=np.float64))
+    depth = with_running_in(scene.wear, steady)
     smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
     force, deviation = mean_forces(scene, depth)
-    rows = [(0.0, depth, force, deviation)]
+    rows = [(0.0, steady, force, deviation)]
     error, exposure = 0.0, 0.0
     step = LARGEST_CHANGE * smallest / max(float(force.max()), 1.0)
-    while exposure < most_exposure and len(rows) < _MOST_STEPS and not _beyond(scene, rows[-1][1], limit):
+    while exposure < most_exposure and len(rows) < _MOST_STEPS and not _beyond(scene, depth, limit):
         step = min(step, most_exposure - exposure)
-        euler = depth + step * force
-        ahead, ahead_deviation = mean_forces(scene, euler)
+        euler = steady + step * force
+        ahead, ahead_deviation = mean_forces(scene, with_running_in(scene.wear, euler))
         change = 0.5 * step * (ahead - force)
         # noise of the means is no error of the step
         noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
@@ -139,16 +164,29 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         if off > ERROR and step * float(force.max()) > 1e-3 * smallest:
             step *= 0.5
             continue
-        exposure, depth, force, deviation = exposure + step, euler + change, ahead, ahead_deviation
+        exposure, steady, force, deviation = exposure + step, euler + change, ahead, ahead_deviation
+        depth = with_running_in(scene.wear, steady)
         error += off * off * smallest + float(noise.max()) ** 2 / smallest
-        rows.append((exposure, depth, force, deviation))
+        rows.append((exposure, steady, force, deviation))
         smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
         grow = 1.5 if off < 0.3 * ERROR else 1.0
         step = min(grow * step, LARGEST_CHANGE * smallest / max(float(force.max()), 1.0))
-    if exposure < most_exposure and not _beyond(scene, rows[-1][1], limit):
+    if exposure < most_exposure and not _beyond(scene, depth, limit):
         raise LifeError(f"path: got {len(rows)} steps and no end, expected at most {_MOST_STEPS}")
     columns = [np.array([row[i] for row in rows]) for i in range(4)]
-    return Path(columns[0], columns[1], columns[2], columns[3], error)
+    if scene.wear.running_in_ratio > 1.0:
+        columns = _finer(columns)
+    return Path(columns[0], with_running_in(scene.wear, columns[1]), columns[2], columns[3], error)
+
+
+def _finer(columns: list[Array]) -> list[Array]:
+    """Return columns with rows between each two, on straight lines: between rows running-in is none."""
+    at = np.arange(len(columns[0]), dtype=np.float64)
+    more = np.linspace(0.0, at[-1], _FINER * (len(at) - 1) + 1)
+    before = np.minimum(more.astype(int), max(len(at) - 2, 0))
+    share = more - before
+    after = np.minimum(before + 1, len(at) - 1)
+    return [(column[before].T * (1.0 - share) + column[after].T * share).T for column in columns]
 
 
 def _beyond(scene: Scene, depth: Array, limit: tuple[float, float]) -> bool:

@@ -258,9 +258,13 @@ class Initial:
 class Wear:
     """Archard wear of the eight pads by the travel along the face: dh/dt = k_s F v / A.
 
+    With `sliding: total` v is the speed of the corner over its pad, sqrt(v^2 + s'^2), s' that in the plane of the
+    section. With `running_in_ratio` r and `running_in_depth_m` h0 a pad that is worn by h has the coefficient
+    k_s (1 + (r - 1) exp(-h / h0)).
+
     References
     ----------
-    Archard, J. Appl. Phys. 24 (1953) 981.
+    Archard, J. Appl. Phys. 24 (1953) 981. Running-in: Queener, Smith and Mitchell, Wear 8 (1965) 391.
     """
 
     coefficient_m2_n: float = _quantity("m^2/N", "k_s = k/H", ge=0.0)
@@ -271,6 +275,9 @@ class Wear:
         "m^2/N", "5 % and 95 % points of what k_s may be", (1e-15, 1e-13), gt=0.0
     )
     pad_length_m: float | None = _quantity("m", "length of a pad along the face: what the slide wears by", None, gt=0.0)
+    sliding: str = _choice("what wears: the travel, or the sliding in the plane too", ("travel", "total"), "travel")
+    running_in_ratio: float = _quantity("1", "coefficient of a new pad over k_s", 1.0, ge=1.0)
+    running_in_depth_m: float | None = _quantity("m", "wear depth over which that falls by e", None, gt=0.0)
 
 
 @dataclass(frozen=True)
@@ -452,8 +459,10 @@ MOST_DAMPING_FACTOR: Final = 1e9
 def _check_wear(wear: Wear, contact: Contact) -> Iterator[Problem]:
     if wear.prior_m2_n[0] > wear.prior_m2_n[1]:
         yield Problem("wear.prior_m2_n", wear.prior_m2_n, "the 5 % point first, then the 95 % point")
+    if wear.running_in_ratio > 1.0 and wear.running_in_depth_m is None:
+        yield Problem("wear.running_in_depth_m", None, "a depth, with this wear.running_in_ratio")
     if wear.travel_speed_m_s > fastest_travel(wear, contact):
-        rate = wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
+        rate = wear.running_in_ratio * wear.coefficient_m2_n * wear.travel_speed_m_s / wear.pad_area_m2
         yield Problem(
             "contact.damping", contact.damping, f"at most {1.0 / rate:.3g} N s/m, A / (k_s v), with this wear"
         )
@@ -466,7 +475,7 @@ def fastest_travel(wear: Wear | None, contact: Contact) -> float:
     """
     if wear is None or not LAWS[contact.law].additive:
         return math.inf
-    worn = (contact.damping or 0.0) * wear.coefficient_m2_n
+    worn = (contact.damping or 0.0) * wear.coefficient_m2_n * wear.running_in_ratio
     return wear.pad_area_m2 / worn if worn > 0.0 else math.inf
 
 

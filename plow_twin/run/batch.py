@@ -26,7 +26,7 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 #: Terms without which a scene computes the same as with them, where their numbers are zero.
-_OPTIONAL = ("hysteretic", "wear", "offset", "free", "slip")
+_OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
 class TwinBatch:

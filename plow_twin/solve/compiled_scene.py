@@ -143,7 +143,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
-    for name, value in (values | _slip(scene) | _frame(scene)).items():
+    for name, value in (values | _rubbing(scene.wear) | _slip(scene) | _frame(scene)).items():
         params[name] = value
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
@@ -158,7 +158,7 @@ def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments
         harmonics=harmonics is not None,
         second=harmonics is not None and bool(harmonics["second"].any()),
         segments=segments is not None,
-        wear=scene.wear is not None and scene.wear.coefficient_m2_n != 0.0,
+        **_wear_terms(scene.wear),
         offset=any(scene.head.com_offset_m),
         free=bool(scene.locked),
     )
@@ -170,6 +170,12 @@ def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
     present["rest"] = not (present["harmonics"] or creeps or present["support"])
     return law._replace(**_flags(present))
+
+
+def _wear_terms(wear: Wear | None) -> dict[str, bool]:
+    if wear is None or wear.coefficient_m2_n == 0.0:
+        return {"wear": False}
+    return {"wear": True, "sliding": wear.sliding == "total", "running_in": wear.running_in_ratio > 1.0}
 
 
 def order_for(admissible: float) -> int:
@@ -306,13 +312,22 @@ def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     return new_implicit(scene.support is not None) if overdamped else None
 
 
+def _rubbing(wear: Wear | None) -> dict[str, Any]:
+    """Return what wear depends on beside force and travel (`solve.rubbing`); for what is off nothing but zeros."""
+    there, found = _wear_terms(wear), dict[str, Any]()
+    if wear is not None and there.get("sliding"):
+        found["speed_per_wear"] = wear.pad_area_m2 / wear.coefficient_m2_n
+    if wear is not None and there.get("running_in") and wear.running_in_depth_m is not None:
+        found |= {"running_in": wear.running_in_ratio - 1.0, "running_in_rate": 1.0 / wear.running_in_depth_m}
+    return found
+
+
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return what friction needs; without it nothing but a speed to divide by, for scenes that run together."""
-    friction = scene.friction
+    """Return what friction needs; without it places along the walls, and a speed to divide by."""
+    friction, along = scene.friction, {"slip_rows": geometry.slip_rows(scene), "slip_speed": 1.0}
     if friction is None:
-        return {"slip_speed": 1.0}
-    return dict(
-        slip_rows=geometry.slip_rows(scene),
+        return along
+    return along | dict(
         slip_arm_rows=geometry.slip_arm_rows(scene),
         friction=friction.coefficient,
         slip_speed=friction.regularisation_speed_m_s,

@@ -16,6 +16,7 @@ from plow_twin.solve.energy_balance import balance_fixed_step, start_balance
 from plow_twin.solve.grip import settle_grips
 from plow_twin.solve.kinematics import pose_of, to_body, to_world
 from plow_twin.solve.modes import mode_inside, touch, within_range
+from plow_twin.solve.rubbing import rubbing
 from plow_twin.solve.state import OFF, ON, Status
 from plow_twin.solve.support import to_body_both, to_world_both
 from plow_twin.solve.totals import add_set_times, log_event
@@ -76,7 +77,8 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     the velocity counted over the time left; and where a pair has touched or parted within a step the impulse in doubt,
     F dt / 2, over the time in which the largest load crosses the clearance.
     """
-    acts, y, size = acting(parts), state.y, 6 if parts.terms.support is None else 12
+    terms = parts.terms
+    acts, y, size = acting(parts), state.y, 6 if terms.support is None else 12
     z, trial, k = bound.z[0, :size], bound.z[1, :size], bound.z[2:, :size]
     pen, rate, now, before = bound.pairs[0], bound.pairs[1], bound.pairs[2], bound.pairs[3]
     start = state.step_start
@@ -99,7 +101,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
             return _NON_FINITE
         state.steps += 1
         _to_body(parts.terms.support, state, z)
-        _wear(p, parts.terms.wear, state, now, dt)
+        _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
         for pair in range(PAIR_COUNT):
             before[pair] = now[pair]
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
@@ -134,7 +136,8 @@ def integrate_fixed(
     trial, k = np.empty(z.size), np.empty((4, z.size))
     load, y, acts = np.empty(3), state.y, acting(parts)
     pen, rate, now, before = np.empty(8), np.empty(8), np.empty(8), np.empty(8)
-    support, half = parts.terms.support, z.size // 2
+    terms = parts.terms
+    support, half = terms.support, z.size // 2
     if done[0] == 0:
         _to_world(support, state, z)
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
@@ -169,7 +172,7 @@ def integrate_fixed(
             return _NON_FINITE
         state.steps += 1
         _to_body(support, state, z)
-        _wear(p, parts.terms.wear, state, now, dt)
+        _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
         before[:] = now
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
         _switch(p, state, pen, rate, t + dt, totals, log)
@@ -204,7 +207,8 @@ def _settle_grips(p, stick, state, force) -> None:
 
 
 @kernel()
-def _wear(p, wear, state, force, dt) -> None:
+def _wear(p, wear, sliding, running_in, state, force, dt) -> None:
     if wear is not None:
         for pair in range(PAIR_COUNT):
-            state.wear_depth[pair] += p.wear_per_impulse[pair] * force[pair] * dt
+            faster = rubbing(p, pair, state.y, state.wear_depth[pair], sliding, running_in)
+            state.wear_depth[pair] += p.wear_per_impulse[pair] * faster * force[pair] * dt

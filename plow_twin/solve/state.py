@@ -118,6 +118,9 @@ PARAMS: Final = _in_lines(
         ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
         ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # its arm about G
         ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
+        ("speed_per_wear", "f8"),  # A / k_s, which makes v of that; 0 where sliding in the plane does not wear
+        ("running_in", "f8"),  # share by which a new pad wears faster
+        ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which that falls with the depth
         ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
         ("inverse_mass", "f8"),
         ("inverse_inertia", "f8"),
@@ -218,6 +221,11 @@ WORK: Final = np.dtype(
         ("damped", "f8", _WIDE),  # ramped damping: the ramp times the rate; other laws: not written
         ("force", "f8", _WIDE),
         ("wear", "f8", _WIDE),  # growth of the wear depth
+        (
+            "rub",
+            "f8",
+            (6, *_WIDE),
+        ),  # wear: sliding s' / v, way per travel, force times it; running-in, what it is made of
         ("guard", "f8", _WIDE),
         ("bernstein", "f8", _WIDE),
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
@@ -310,6 +318,8 @@ class Terms(NamedTuple):
     fraction: int | None  #: an exponent that is not an integer
     ramp: int | None  #: the viscous part grows with the penetration
     wear: int | None
+    sliding: int | None  #: sliding in the plane wears too
+    running_in: int | None  #: new pads wear faster
     offset: int | None  #: the centre of mass is not the cavity's
     free: int | None  #: some degree of freedom is locked
     slip: int | None  #: regularised friction

@@ -71,6 +71,7 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
         parts.implicit,
         terms.ramp,
         terms.wear,
+        (terms.sliding, terms.running_in),
         terms.slip,
         terms.stick,
         terms.support,

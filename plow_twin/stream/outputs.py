@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.running_in import with_running_in, without_running_in
 from plow_twin.model.scene import Scene
 
 if TYPE_CHECKING:
@@ -140,13 +141,17 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
     """Return the 5 % and 95 % points of the pad depths under the prior of the wear coefficient, shape (8,) each [m].
 
-    Growth is proportional to k_s as long as it is small against the clearance. Without wear, or with k_s = 0, both
-    points equal the wear depth.
+    Growth is proportional to k_s as long as it is small against the clearance, or what it would be without running-in
+    is. Without wear, or with k_s = 0, both points equal the wear depth.
     """
     if scene.wear is None or scene.wear.coefficient_m2_n == 0.0:
         return wear_depth, wear_depth
     initial = np.asarray(scene.wear.initial_depth_m)
     low, high = (point / scene.wear.coefficient_m2_n for point in scene.wear.prior_m2_n)
+    if scene.wear.running_in_ratio > 1.0:
+        begin, steady = without_running_in(scene.wear, initial), without_running_in(scene.wear, wear_depth)
+        points = [with_running_in(scene.wear, begin + (steady - begin) * share) for share in (low, high)]
+        return points[0], points[1]
     return initial + (wear_depth - initial) * low, initial + (wear_depth - initial) * high
 
 

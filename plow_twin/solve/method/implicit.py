@@ -22,6 +22,7 @@ from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.grip import grip_guard, grip_terms
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value, row_values, to_body, to_world
+from plow_twin.solve.rubbing import rubbing
 from plow_twin.solve.state import CLIPPED, COS, OMEGA, ON, SIN, THETA, VX, VY, Implicit, X, Y, new_record
 from plow_twin.solve.support import (
     FRAME_THETA,
@@ -108,6 +109,7 @@ def _implicit_type(size: int) -> np.dtype[np.void]:
             ("seen", "f8", shape),  # the same as seen from a frame that gives way
             ("frame", "f8", shape),  # and that frame, in the lanes of `w.frame`
             ("pairs", "f8", (3, STAGES, PAIR_COUNT)),  # force, law's force (of clipped pairs too), rate, at the nodes
+            ("wearing", "f8", (STAGES, PAIR_COUNT)),  # rate of wear at the nodes
             ("wear_depth", "f8", shape),  # at the start and at the nodes
             ("load", "f8", (3,)),
         ]
@@ -307,22 +309,27 @@ def _measure(p, support, state, implicit) -> None:
 
 
 @kernel()
-def _wear_at_nodes(p, support, state, h, implicit) -> float:
-    """Write each pad's wear depth at the nodes from the forces there; return the largest change in m."""
-    worn, a, s, change = implicit.wear_depth, implicit.weights, implicit.nodes.size, 0.0
+def _wear_at_nodes(p, support, state, h, implicit, sliding, running_in) -> float:
+    """Write rate and depth of each pad's wear at the nodes from the forces there; return the largest change in m."""
+    worn, rates, a, s, change = implicit.wear_depth, implicit.wearing, implicit.weights, implicit.nodes.size, 0.0
+    seen = _seen(support, implicit)
     _measure(p, support, state, implicit)
+    for i in range(s):
+        for pair in range(PAIR_COUNT):
+            faster = rubbing(p, pair, seen[i + 1], worn[i + 1, pair], sliding, running_in)
+            rates[i, pair] = p.wear_per_impulse[pair] * faster * max(implicit.pairs[0, i, pair], 0.0)
     for i in range(s):
         for pair in range(PAIR_COUNT):
             value = worn[0, pair]
             for j in range(s):
-                value += h * a[i, j] * p.wear_per_impulse[pair] * max(implicit.pairs[0, j, pair], 0.0)
+                value += h * a[i, j] * rates[j, pair]
             change = max(change, abs(value - worn[i + 1, pair]))
             worn[i + 1, pair] = value
     return change
 
 
 @kernel()
-def _solve(p, acts, support, state, t, h, implicit, wear) -> bool:
+def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -> bool:
     """Find the velocities at the nodes by Newton's method; return whether it converged.
 
     The derivatives are taken at every node: as the head turns, so does the direction that is damped. Down to rounding:
@@ -362,7 +369,11 @@ def _solve(p, acts, support, state, t, h, implicit, wear) -> bool:
         state.evaluations += (2 * n + 1) * s
         if wear is not None:
             _places(implicit, h)
-            change += _wear_at_nodes(p, support, state, h, implicit) * p.velocity_tolerance / p.position_tolerance
+            change += (
+                _wear_at_nodes(p, support, state, h, implicit, sliding, running_in)
+                * p.velocity_tolerance
+                / p.position_tolerance
+            )
         # quadratic: one that rounding keeps from falling further is the last
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
@@ -436,6 +447,8 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
         w.series[s, i] = 0.0
     seen = _series_seen(support, h, w, implicit)
     _interpolate(pairs[0], implicit.from_stages, h, w.force)
+    if wear is not None:
+        _interpolate(implicit.wearing, implicit.from_stages, h, scratch)
     _interpolate(pairs[2], implicit.from_stages, h, w.rate)
     for k in range(s + 1):
         y = seen[k]
@@ -443,7 +456,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
         if k == 0:
             penetration = penetration + row(p.penetration_rows, 4) - row(state.wear_depth, 0)
         elif wear is not None:
-            worn = row(w.force, k - 1) * row(p.wear_per_impulse, 0) * (1.0 / k)
+            worn = row(scratch, k - 1) * (1.0 / k)
             set_row(w.wear, k, worn)
             penetration = penetration - worn
         set_row(w.penetration, k, penetration)
@@ -523,7 +536,7 @@ def _write_ramp(p, h, w, implicit) -> float:
 
 
 @kernel()
-def lay_out(p, parts, implicit, ramp, wear, slip, stick, support, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, implicit, ramp, wear, rub_terms, slip, stick, support, state, w, span, penetrating) -> bool:
     """Lay out an implicit step, where damping is what bounds explicit ones; `w.decay[0]` keeps its rate of decay."""
     if implicit is None:
         return False
@@ -534,7 +547,7 @@ def lay_out(p, parts, implicit, ramp, wear, slip, stick, support, state, w, span
     w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
         return False
-    size = _collocate(p, parts, support, state, w, span, w.decay[0], implicit, ramp, wear, stick)
+    size = _collocate(p, parts, support, state, w, span, w.decay[0], implicit, ramp, wear, *rub_terms, stick)
     state.sigma_end, state.order = size, STAGES
     state.ends_at_stop = 1 if size == span else 0
     return size > 0.0
@@ -568,7 +581,7 @@ def _start(support, state, implicit) -> None:
 
 
 @kernel()
-def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, stick) -> float:
+def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, sliding, running_in, stick) -> float:
     """Lay out an implicit step as series of order `STAGES`; return its size, or 0 when explicit ones are better.
 
     `decay` is the `decay_rate`.
@@ -582,7 +595,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
     while h >= least:
         for i in range(implicit.nodes.size + 1):
             set_row(implicit.wear_depth, i, row(state.wear_depth, 0))
-        if _solve(p, acting(parts), support, state, state.step_start, h, implicit, wear):
+        if _solve(p, acting(parts), support, state, state.step_start, h, implicit, wear, sliding, running_in):
             size = _write_series(p, support, state, h, w, implicit, ramp, wear, stick)
             better = 0.9 * (admissible / max(size, 1e-6 * admissible)) ** (1.0 / (STAGES - 1))
             if size <= admissible:

@@ -22,6 +22,7 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.grip import grip_terms
 from plow_twin.solve.kinematics import row_values
+from plow_twin.solve.rubbing import time_per_way
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
 from plow_twin.solve.support import (
     FRAME_THETA,
@@ -279,19 +280,89 @@ def _hold_on(p, state, w, k, c, s, x, y, dc, ds, dx, dy):
 
 
 @kernel(fast=True)
-def _wear(p, w, k, alpha, beta) -> None:
-    """Write order k + 1 of the growth of each pad's penetration:  dh/dt = k_s F v / A (Archard)."""
-    growth = row(w.force, k) * alpha
+def _slide(p, w, k, dc, ds, dx, dy) -> None:
+    """Write order k of the force times the way that a corner slides per travel to `w.rub[2]`.
+
+    The way is sqrt(q) with q = 1 + (s' / v)^2:  2 root_0 root_k = q_k - sum of root_j root_{k-j} without its ends.
+    """
+    sliding, way = w.rub[0], w.rub[1]
+    rate = row_values(p.slip_rows, dc, ds, dx, dy)
+    for pair in range(PAIR_COUNT):
+        sliding[k, pair] = lane(rate, pair) * time_per_way(p, pair)
+    square = _multiply(sliding, sliding, k)
+    if k == 0:
+        for pair in range(PAIR_COUNT):
+            way[0, pair] = math.sqrt(1.0 + lane(square, pair))
+    else:
+        twice = square - _multiply_older(way, way, k)
+        for pair in range(PAIR_COUNT):
+            way[k, pair] = 0.5 * lane(twice, pair) / way[0, pair]
+    set_row(w.rub[2], k, _multiply(w.force, way, k))
+
+
+@kernel(fast=True)
+def _run_in(p, state, w, rubbed, k) -> None:
+    """Write order k of `rubbed` times what running-in makes of the coefficient, 1 + a e, to `w.rub[5]`.
+
+    With e = exp(-h / h0):  k e_k = -(1 / h0) sum_j j h_j e_{k-j}.
+    """
+    growth, left = w.rub[3], w.rub[4]
+    if k == 0:
+        set_row(growth, 0, splat(0.0))
+        for pair in range(PAIR_COUNT):
+            left[0, pair] = p.running_in * math.exp(-state.wear_depth[pair] * p.running_in_rate)
+    else:
+        set_row(growth, k, row(w.wear, k) * (-p.running_in_rate * k))
+        set_row(left, k, (_multiply_older(growth, left, k) + row(growth, k) * row(left, 0)) * w.inverse[k])
+    set_row(w.rub[5], k, row(rubbed, k) + _multiply(rubbed, left, k))
+
+
+@kernel(fast=True)
+def _grow(p, w, rubbed, k, alpha, beta) -> None:
+    """Write order k + 1 of the growth of each pad's penetration:  dh/dt = k_s F v / A (Archard).
+
+    `rubbed` is the series of F, or of F times what makes the pad wear faster.
+    """
+    growth = row(rubbed, k) * alpha
     if k > 0:
-        growth = growth + row(w.force, k - 1) * beta
+        growth = growth + row(rubbed, k - 1) * beta
     set_row(w.wear, k + 1, growth * row(p.wear_per_impulse, 0) * w.inverse[k + 1])
+
+
+@kernel(fast=True, inline="code")
+def _wear(p, state, w, k, alpha, beta, dc, ds, dx, dy, sliding, running_in) -> None:
+    """Write order k + 1 of the growth of the pads' penetrations from the force and what makes them wear faster."""
+    if sliding is not None:
+        _slide(p, w, k, dc, ds, dx, dy)
+        if running_in is not None:
+            _run_in(p, state, w, w.rub[2], k)
+            _grow(p, w, w.rub[5], k, alpha, beta)
+        else:
+            _grow(p, w, w.rub[2], k, alpha, beta)
+    elif running_in is not None:
+        _run_in(p, state, w, w.force, k)
+        _grow(p, w, w.rub[5], k, alpha, beta)
+    else:
+        _grow(p, w, w.force, k, alpha, beta)
+
+
+@kernel(fast=True, inline="code")
+def _slide_size(p, w, k, sliding, running_in):
+    """Return the size of order k - 1 of the speed at which the pads that carry slide: order k is not known yet."""
+    size = 0.0
+    if sliding is not None:
+        for pair in range(PAIR_COUNT):
+            if w.per_pair[ACTS, pair] != 0.0 and p.speed_per_wear != 0.0:
+                size += abs(w.rub[1, k - 1, pair]) / time_per_way(p, pair)
+    return size
 
 
 @kernel(inline="source")
 def one_by_one(terms):
     """Return the terms as plain tuples, to be passed on with a star: of the load, of the law, and the others."""
     load = terms.harmonics, terms.second, terms.segments
-    return load, law_terms(terms), terms.wear, terms.offset, terms.free, terms.slip, terms.stick, terms.support
+    rub = terms.sliding, terms.running_in
+    return load, law_terms(terms), terms.wear, rub, terms.offset, terms.free, terms.slip, terms.stick, terms.support
 
 
 @kernel(fast=True)
@@ -354,7 +425,21 @@ def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
 
 @kernel(fast=True)
 def expand(
-    p, state, w, limit, penetrating, sigma_limit, load_terms, law_terms, wear, offset, free, slip, stick, support
+    p,
+    state,
+    w,
+    limit,
+    penetrating,
+    sigma_limit,
+    load_terms,
+    law_terms,
+    wear,
+    rub_terms,
+    offset,
+    free,
+    slip,
+    stick,
+    support,
 ):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
@@ -397,6 +482,7 @@ def expand(
             if wear is not None and penetrating:
                 penetration = penetration - row(w.wear, k)
                 size += p.weight / p.radius * total(magnitude(row(w.wear, k)))
+                size += _slide_size(p, w, k, *rub_terms) / sigma_limit
             w.term_size[k] = size
             reach *= sigma_limit
             quiet = quiet + 1 if size * reach < small else 0
@@ -443,7 +529,7 @@ def expand(
                 dragged = _hold_on(p, state, w, k, seen_c, seen_s, seen_x, seen_y, dc, ds, dx, dy)
                 applied, pushed = applied + dragged, pushed + dragged
             if wear is not None:
-                _wear(p, w, k, alpha, beta)
+                _wear(p, state, w, k, alpha, beta, dc, ds, dx, dy, *rub_terms)
             # the penetration of the next order needs this order's rates alone: no forces to wait for
             penetration = rate * steady + closing * bent
             closing = rate

@@ -85,13 +85,15 @@ class LoadTotals:
     slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
     _first_ns: int | None = None
     _last: tuple[int, Array, Array, Array] | None = None
+    #: depth of the pads after the last advance [m]
+    _worn: Array | None = None
     _place_m: float = 0.0
     _direction: float = 0.0
     _reversals: list[Series] = field(default_factory=lambda: [Series() for _ in range(PAIR_COUNT)])
 
     def restart(self) -> None:
         """Go on after a reset: what happened between two stamps across it counts for nothing."""
-        self._last = None
+        self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
         """Take in some advances."""
@@ -159,17 +161,18 @@ class LoadTotals:
             for piece in np.unique(pieces).tolist():
                 key = (len(self.passes) - 1, piece)
                 self.face[key] = max(self.face.get(key, 0.0), float(largest[pieces == piece].max()))
-            self._wear(walked.rows.impulse, speed, pieces)
+            self._wear(walked.rows.wear_depth, speed, pieces)
+        self._worn = walked.rows.wear_depth[-1].copy()
 
-    def _wear(self, impulse: Array, speed: float, pieces: NDArray[np.int64]) -> None:
-        """Book Archard's wear by direction: the pads', and that of the places of the slide that they pass.
+    def _wear(self, depth: Array, speed: float, pieces: NDArray[np.int64]) -> None:
+        """Book the wear by direction: the pads', and that of the places of the slide that they pass.
 
         A pad is engaged all the way, a place of the slide only while the pad passes it: for its length.
         """
         wear = self.scene.wear
         if wear is None or wear.coefficient_m2_n == 0.0:
             return
-        gained = wear.coefficient_m2_n / wear.pad_area_m2 * abs(speed) * impulse
+        gained = np.diff(depth, axis=0, prepend=depth[:1] if self._worn is None else self._worn[None])
         backward = int(speed < 0.0)
         self.pad_wear[backward] += gained.sum(axis=0)
         if wear.pad_length_m is None:

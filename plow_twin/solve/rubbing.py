@@ -1,0 +1,39 @@
+"""What wears a pad beside its force and the travel along the face: sliding in the plane, and running-in.
+
+    dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
+
+s' is the rate at which the corner slides along its wall, across the travel; a plough that stands wears nothing. For its
+own speed the way has a kink at s' = 0 that no series could follow, so v in the root is not below `SLOWEST_TRAVEL`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.kinematics import row_rate
+from plow_twin.solve.state import COS, OMEGA, SIN, VX, VY, X, Y
+
+#: Speed along the face in m/s below which the sliding in the plane counts as at this one, by the speed's share.
+SLOWEST_TRAVEL: Final = 0.01
+
+
+@kernel(inline="code")
+def time_per_way(p, pair) -> float:
+    """Return 1 / v in s/m of a pad; 0 where sliding in the plane does not wear it."""
+    if p.speed_per_wear == 0.0:
+        return 0.0
+    return 1.0 / max(p.speed_per_wear * p.wear_per_impulse[pair], SLOWEST_TRAVEL)
+
+
+@kernel()
+def rubbing(p, pair, y, depth, sliding, running_in) -> float:
+    """Return by how much a pad at a wear depth wears faster than by travel alone, with the head at y, shape (8,)."""
+    factor = 1.0
+    if sliding is not None:
+        rate = row_rate(p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+        factor = math.sqrt(1.0 + (rate * time_per_way(p, pair)) ** 2)
+    if running_in is not None:
+        factor *= 1.0 + p.running_in * math.exp(-depth * p.running_in_rate)
+    return factor
