@@ -72,3 +72,15 @@ def kernel(
         return compiled
 
     return decorate
+
+
+def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
+    """Return an entry compiled for the types of some arguments; a call of it looks at no types.
+
+    For calls whose types never change: to look at those of nested tuples and records takes longer than a sample's work.
+    """
+    compile_for = getattr(function, "compile", None)
+    if compile_for is None:
+        return function  # numba is told not to compile
+    found: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
+    return found

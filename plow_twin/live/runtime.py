@@ -256,10 +256,13 @@ class Runtime:
             lost.append(f"recording incomplete: lost {dict(report.lost)}, closed {report.closed}, error {report.error}")
         return lost
 
-    def periodic(self) -> list[tuple[float, Callable[[], None]]]:
-        """Return what the front is to call while the twin is active, each with its rate [Hz] on a steady clock."""
+    def periodic(self) -> list[tuple[float, Callable[[], float | None]]]:
+        """Return what the front is to call while the twin is active, each with its rate [Hz] on a steady clock.
+
+        What is returned is as of `Timer`.
+        """
         settings = self.settings
-        periodic: list[tuple[float, Callable[[], None]]] = []
+        periodic: list[tuple[float, Callable[[], float | None]]] = []
         if settings.excitation_source == "scene":
             periodic.append((settings.step_rate, self.clock_tick))
         elif not self._front.follows_samples:
@@ -323,15 +326,16 @@ class Runtime:
             self.publishing.publish(publication)
         self._advanced()
 
-    def silence(self) -> None:
-        """Go on without samples when they have been missing for too long."""
-        holds = self.driver.holds
-        publication = self.driver.silence(time.monotonic_ns())
+    def silence(self) -> float:
+        """Go on without samples when they have been missing for too long; return how long that cannot be so [s]."""
+        holds, now_ns = self.driver.holds, time.monotonic_ns()
+        publication = self.driver.silence(now_ns)
         if publication is not None or self.driver.holds != holds:
             # what is published next answers no message
             self.publishing.received_ns = 0
             self.publishing.publish(publication)
             self._advanced()
+        return self.driver.quiet_ns(now_ns) * 1e-9
 
     def clock_tick(self) -> None:
         """Go on under the scene's own loads."""

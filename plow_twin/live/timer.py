@@ -7,9 +7,12 @@ from collections.abc import Callable
 
 
 class Timer:
-    """Call `do` each `period_s`; what is missed is left out, and the phase is kept."""
+    """Call `do` each `period_s`; what is missed is left out, and the phase is kept.
 
-    def __init__(self, period_s: float, do: Callable[[], None]) -> None:
+    `do` may return for how long there is nothing to do [s]: it is not called before.
+    """
+
+    def __init__(self, period_s: float, do: Callable[[], float | None]) -> None:
         self._period_s, self._do = period_s, do
         self.restart()
 
@@ -22,4 +25,6 @@ class Timer:
         now = time.monotonic()
         if now >= self.due:
             self.due += self._period_s * (1 + (now - self.due) // self._period_s)
-            self._do()
+            idle_s = self._do()
+            if idle_s:
+                self.due += self._period_s * (idle_s // self._period_s)

@@ -58,10 +58,11 @@ class InputLoop:
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
         self._queues: dict[int, InputQueue] = {}
-        self._timers: list[Timer] = []
-        self._look = Timer(_LOOK_S, self._look_at_all)
+        #: the first one always runs
+        self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._signs = [self._wake]
         self._thread = threading.Thread(target=self._run, name="plow_twin_inputs", daemon=True)
         #: what ended the thread; None: it runs, or has been stopped
         self.error: Exception | None = None
@@ -70,10 +71,11 @@ class InputLoop:
         """Empty a queue from now on, and close it at the end."""
         with self._turns:
             self._queues[queue.fd] = queue
+            self._signs.append(queue.fd)
         self._look_again()
 
-    def every(self, period_s: float, do: Callable[[], None]) -> None:
-        """Do something each `period_s` while the timers run; before the start."""
+    def every(self, period_s: float, do: Callable[[], float | None]) -> None:
+        """Do something, as `Timer`, each `period_s` while the timers run; before the start."""
         self._timers.append(Timer(period_s, do))
 
     def start(self) -> None:
@@ -103,7 +105,7 @@ class InputLoop:
         """Hand over what waits in the queues now."""
         with self._turns:
             for queue in self._queues.values():
-                while queue.take(_MOST):
+                while queue.take(_MOST, all_there_are=True):
                     pass
 
     def _look_again(self) -> None:
@@ -119,12 +121,14 @@ class InputLoop:
             self._on_error(error)
 
     def _pause_s(self) -> float:
-        dues = [timer.due for timer in self._timers] if self._active else []
-        return max(0.0, min(self._look.due, *dues) - time.monotonic()) if dues else _LOOK_S
+        return max(0.0, min([timer.due for timer in self._running()]) - time.monotonic())
+
+    def _running(self) -> list[Timer]:
+        return self._timers if self._active else self._timers[:1]
 
     def _ready(self, pause_s: float) -> list[int]:
         """Wait until something has come, a timer is due, or somebody wakes the loop; return the queues that have."""
-        ready = select.select([self._wake, *self._queues], (), (), pause_s)[0]
+        ready = select.select(self._signs, (), (), pause_s)[0]
         if self._wake in ready:
             os.eventfd_read(self._wake)
             ready.remove(self._wake)
@@ -134,10 +138,12 @@ class InputLoop:
         """Empty queues and do what is due, in a turn; return the queues that may not be empty."""
         with self._turns:
             left = {fd for fd in ready if self._queues[fd].take(_MOST)}
-            for timer in (self._look, *(self._timers if self._active else ())):
-                timer.look()
+            now = time.monotonic()
+            for timer in self._running():
+                if now >= timer.due:
+                    timer.look()
         return left
 
     def _look_at_all(self) -> None:
         for queue in self._queues.values():
-            queue.take(_MOST)
+            queue.take(_MOST, all_there_are=True)

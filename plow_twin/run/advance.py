@@ -71,7 +71,7 @@ class _Rows:
     error_estimate_m: NDArray[np.float64]
 
     @classmethod
-    def of(cls, times: NDArray[np.float64], rows: NDArray[np.void]) -> Self:
+    def of(cls, times: NDArray[np.float64], rows: NDArray[np.void], *, own: bool = False) -> Self:
         """Return the fields of the rows that the kernels fill; they share memory.
 
         Parameters
@@ -80,9 +80,11 @@ class _Rows:
             Model times in s.
         rows : ndarray of `ROW`, shape (n,), of a batch (m, n)
             What the kernels filled.
+        own : bool
+            Whether nobody else writes to the rows: a copy of one, field by field, takes as long as two advances.
         """
         made = cls.__new__(cls)
-        made.__dict__.update(t=times, _rows=rows)
+        made.__dict__.update(t=times, _rows=rows, _own=own)
         return made
 
     def __getattr__(self, name: str) -> NDArray[Any]:
@@ -103,8 +105,11 @@ class AdvanceSeries(_Rows):
 
     def __getitem__(self, index: int) -> Advance:
         rows = self.__dict__.get("_rows")
-        # a copy: it does not keep all the rows, nor change with their memory
-        row = tuple(getattr(self, name)[index] for name in _ROW_NAMES) if rows is None else rows[index].copy().item()
+        if rows is None:
+            row = tuple(getattr(self, name)[index] for name in _ROW_NAMES)
+        else:
+            # a copy: it does not keep all the rows, nor change with their memory
+            row = (rows[index] if self.__dict__["_own"] else rows[index].copy()).item()
         made = Advance.__new__(Advance)  # all at once: a frozen class sets its fields one by one
         made.__dict__.update(zip(_ROW_NAMES, row, strict=True), t=float(self.t[index]))
         made.__dict__.update(steps=int(made.steps), status=_STATUS[made.status])

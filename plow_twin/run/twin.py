@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time as _time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
+from plow_twin.kernel.compiler import for_arguments
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
@@ -114,6 +115,8 @@ class Twin:
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
         self._stock, self._rows_left = np.zeros(0, ROW), 0
+        #: what advances to one sample, once its types are known
+        self._advance_one: Callable[..., bool] | None = None
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
@@ -183,7 +186,49 @@ class Twin:
                 raise ArgumentError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
             return self._advance_scene(np.array([t], dtype=np.float64))[0]
         sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
-        return self.advance_samples(np.array([t], dtype=np.float64), sample.reshape(1, -1))[0]
+        if sample.shape != (3,):
+            raise ArgumentError(f"wrench: got {sample!r}, expected 3 finite numbers")
+        return self.advance_sample(float(t), sample.tolist())[0]
+
+    def advance_sample(self, t: float, wrench: Sequence[float]) -> AdvanceSeries:
+        """Advance through one sample, as `advance_samples` does through many, in a third of its time.
+
+        Parameters
+        ----------
+        t : float
+            Model time in s, not before the present one.
+        wrench : sequence of float, length 3
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t`.
+
+        Returns
+        -------
+        AdvanceSeries
+            One row.
+
+        Raises
+        ------
+        ArgumentError
+            As `advance`; nothing has changed then.
+        """
+        if self.excitation != "sampled":
+            raise ArgumentError("advance_sample: got excitation='scene', expected excitation='sampled'")
+        times = np.array([t])
+        check_times(self.time, times)
+        if len(wrench) != 3 or not all(map(math.isfinite, wrench)):
+            raise ArgumentError(f"wrench: got {wrench!r}, expected 3 finite numbers")
+        rows = self._new_row()
+        ends = np.empty((1, 2, 3))
+        ends[0, 0], ends[0, 1] = self._wrench, wrench
+        arguments = (
+            self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, times,
+            ends / self._inertias, self._budget, rows[None], self._bound, self._pace.record,
+        )  # fmt: skip
+        if self._advance_one is None:
+            self._advance_one = for_arguments(loop.advance_batch, arguments)
+        work = self._advance_one
+        self._in_slices(lambda: work(*arguments), times, ends[0, 1:], rows)
+        self._wrench = ends[0, 1]
+        return AdvanceSeries.of(times, rows, own=True)
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
         """Advance through many samples; the same bits as one `advance` each.
@@ -209,9 +254,9 @@ class Twin:
             raise ArgumentError("advance_samples: got excitation='scene', expected excitation='sampled'")
         times, samples = np.asarray(t, dtype=np.float64), np.ascontiguousarray(wrench, dtype=np.float64)
         check_times(self.time, times)
-        if samples.shape != (len(times), 3) or not _finite(samples):
+        if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
             raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
-        rows = self._new_rows(len(times))
+        rows = np.zeros(len(times), ROW)
         ends = np.empty((1, len(times) + 1, 3))
         ends[0, 0], ends[0, 1:] = self._wrench, samples
         wrenches, members = ends / self._inertias, rows[None]
@@ -445,10 +490,8 @@ class Twin:
         for name in ("peak", "impulse", "makes"):
             self._all_totals[name] = 0
 
-    def _new_rows(self, count: int) -> NDArray[np.void]:
-        """Return rows of zeros. One by one they are cut from a stock: numpy takes as long for one as for hundreds."""
-        if count != 1:
-            return np.zeros(count, ROW)
+    def _new_row(self) -> NDArray[np.void]:
+        """Return a row of zeros, (1,), cut from a stock: numpy takes as long for one as for hundreds."""
         if self._rows_left == 0:
             self._stock, self._rows_left = np.zeros(_STOCK, ROW), _STOCK
         self._rows_left -= 1
@@ -476,13 +519,6 @@ class MarkedAdvance:
     status: NDArray[np.int64]
     digests: list[str]
     wear_depth: NDArray[np.float64]
-
-
-def _finite(samples: NDArray[np.float64]) -> bool:
-    """Tell whether all numbers of samples (n, 3) are finite."""
-    if len(samples) == 1:
-        return all(map(math.isfinite, samples[0].tolist()))
-    return bool(np.isfinite(samples).all())
 
 
 def read_snapshot(data: bytes, dtype: np.dtype[np.void]) -> tuple[np.void, NDArray[np.float64], float]:

@@ -40,6 +40,8 @@ Arrival = tuple[int, tuple[float, float, float]]
 
 #: Most model time that one call may catch up when the excitation is silent [ns]: the work of a call stays bounded.
 _LARGEST_HOLD_NS: Final = NS_PER_S
+#: Silence is looked for at least this often [ns]: the policy may change.
+_LONGEST_QUIET_NS: Final = NS_PER_S // 10
 #: At most so many resets by jumps and failures in that time [ns]: clocks out of step must not reset the model for ever.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
@@ -187,6 +189,12 @@ class Driver:
             self._zeroed = True
             return self._advance(Unload(stamp_ns), now_ns, StreamState.STALE)
         return self._advance(Hold(stamp_ns), now_ns, StreamState.STALE)
+
+    def quiet_ns(self, now_ns: int) -> int:
+        """Return for how long `silence` has nothing to do, whatever comes [ns]."""
+        timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
+        left_ns = timeout_ns if self._newest_ns is None else self._received_ns + timeout_ns - now_ns
+        return max(0, min(left_ns, _LONGEST_QUIET_NS))
 
     def clock_tick(self, stamp_ns: int, now_ns: int) -> Publication | None:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.

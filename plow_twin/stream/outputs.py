@@ -262,20 +262,22 @@ class Outputs:
             return None
         corrected = self._corrected_ns is not None
         mark = self._held or corrected
-        publication = Publication(
-            self._stamp_ns,
-            advance.penetration,
-            advance.rate,
-            advance.force,
-            self._makes.copy(),
-            self._impulse.copy(),
-            self._peak.copy(),
-            advance.q,
-            advance.v,
-            self._slow_part(advance.wear_depth),
-            self._held,
-            corrected,
-            mark or self._marked,
+        publication = Publication.__new__(Publication)
+        # all at once: a frozen class sets its fields one by one
+        publication.__dict__.update(
+            stamp_ns=self._stamp_ns,
+            penetration=advance.penetration,
+            rate=advance.rate,
+            force=advance.force,
+            makes=self._makes.copy(),
+            impulse=self._impulse.copy(),
+            peak=self._peak.copy(),
+            q=advance.q,
+            v=advance.v,
+            slow=self._slow_part(advance.wear_depth),
+            held=self._held,
+            corrected=corrected,
+            marked=mark or self._marked,
         )
         self._corrected_ns, self._marked = None, mark
         self._impulse[:] = 0.0

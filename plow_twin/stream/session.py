@@ -329,9 +329,12 @@ class Session:
         if self.origin_ns is None:
             self.origin_ns = self._begin(stamps_ns[0])
         origin_ns = self.origin_ns
-        series = self.twin.advance_samples(
-            [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
-        )
+        if len(samples) == 1:
+            series = self.twin.advance_sample((stamps_ns[0] - origin_ns) * 1e-9, samples[0].wrench)
+        else:
+            series = self.twin.advance_samples(
+                [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
+            )
         self.stamp_ns, self.wear_depth = stamps_ns[-1], series.wear_depth[-1].copy()
         if self.twin.max_evaluations is not None:
             self._largest_error_m = max(self._largest_error_m, float(series.error_estimate_m.max()))
