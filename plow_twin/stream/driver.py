@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+import numpy as np
+
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.run.twin import Status
 from plow_twin.stream.health import RealTimeFactor
@@ -345,13 +347,13 @@ class Driver:
 
     def _use(self, samples: list[Sample], now_ns: int) -> Iterator[Publication]:
         """Advance to samples: one by one where each is published, else in one go, as late ones are in any case."""
-        late = sum(self._is_late(sample) for sample in samples)
+        late = sum(map(self._is_late, samples))
         self.rolled_back += late
         if self.every_sample and not late:
             for sample in samples:
                 series = self.session.apply_sample(sample)
                 self._advanced(now_ns)
-                self._judge_advance(Status(int(series.status[-1])), StreamState.RUNNING)
+                self._judge_advance(series.status[-1], StreamState.RUNNING)
                 self._give_up_after_failures(now_ns)
                 publication = self.due()
                 if publication is not None:
@@ -362,7 +364,7 @@ class Driver:
             self._advanced(now_ns)
             # failures count in a row: where the last advance went well none counts
             for status in series.status[-1:] if not series.status.any() else series.status:
-                self._judge_advance(Status(int(status)), StreamState.RUNNING)
+                self._judge_advance(status, StreamState.RUNNING)
             self._give_up_after_failures(now_ns)
         self._find_newest()
         publication = self.due() if self.every_sample else None
@@ -390,7 +392,7 @@ class Driver:
             self.real_time.advanced((reached_ns - self._counted_ns) * 1e-9, now_ns)
         self._counted_ns = reached_ns
 
-    def _judge_advance(self, status: Status, state: StreamState) -> None:
+    def _judge_advance(self, status: int | np.int64, state: StreamState) -> None:
         if not status:
             self._failures_in_row = 0
             self.state = state
@@ -398,7 +400,7 @@ class Driver:
         self.failures += 1
         self._failures_in_row += 1
         self.state = StreamState.FAILED
-        self.failure = status.text
+        self.failure = Status(int(status)).text
 
     def _give_up_after_failures(self, now_ns: int) -> None:
         if 0 < self.policy.failure_limit <= self._failures_in_row and self._may_reset(now_ns):

@@ -205,10 +205,6 @@ class Outputs:
 
     def add_series(self, stamps_ns: Sequence[int], series: AdvanceSeries, held: bool = False) -> None:
         """Take in many advances that ended at `stamps_ns`; those that failed count for nothing."""
-        if len(stamps_ns) == 1:
-            if not series.status[0]:
-                self.add(stamps_ns[0], series[0], held)
-            return
         good = np.flatnonzero(series.status == 0)
         if good.size == 0:
             return

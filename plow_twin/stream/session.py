@@ -331,14 +331,19 @@ class Session:
         origin_ns = self.origin_ns
         if len(samples) == 1:
             series = self.twin.advance_sample((stamps_ns[0] - origin_ns) * 1e-9, samples[0].wrench)
+            advance = series[0]
+            self.wear_depth = advance.wear_depth.copy()
+            if not advance.status:
+                self.outputs.add(stamps_ns[0], advance, self.held)
         else:
             series = self.twin.advance_samples(
                 [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
             )
-        self.stamp_ns, self.wear_depth = stamps_ns[-1], series.wear_depth[-1].copy()
+            self.wear_depth = series.wear_depth[-1].copy()
+            self.outputs.add_series(stamps_ns, series, self.held)
+        self.stamp_ns = stamps_ns[-1]
         if self.twin.max_evaluations is not None:
             self._largest_error_m = max(self._largest_error_m, float(series.error_estimate_m.max()))
-        self.outputs.add_series(stamps_ns, series, self.held)
         return series
 
     def _travel_on_the_way(self, travel: Travel, sample: Sample) -> None:
