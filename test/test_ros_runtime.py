@@ -44,7 +44,7 @@ class _Flood:
         self.fd = os.eventfd(1)
         self.taken = 0
 
-    def take(self, most: int) -> bool:
+    def take(self, most: int, *, all_there_are: bool = False) -> bool:
         self.taken += most
         return True
 
