@@ -48,6 +48,8 @@ LARGEST_STEP_ERROR = 1e-6
 STEP_SHARE_FRACTION = 1e-6
 #: Mode changes at one instant before the solver goes on past it.
 MAX_EVENTS_AT_ONCE = 64
+#: Harmonics up to this share of what presses the head against its walls may let it rest (`method.hum`).
+_HUM = 1e-2
 
 _NO_TERMS = Terms(*[None] * len(Terms._fields))
 
@@ -148,11 +150,13 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
         segments = np.zeros(1, SEGMENT)
-    terms = _scene_terms(scene, terms, harmonics, segments)
+    terms = _scene_terms(scene, terms, loads, harmonics, segments)
     return CompiledScene(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
 
 
-def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments: Segments | None) -> Terms:
+def _scene_terms(
+    scene: Scene, law: Terms, loads: LoadSet, harmonics: Harmonics | None, segments: Segments | None
+) -> Terms:
     """Return the terms of the law together with those of the rest of the scene."""
     present = dict(
         harmonics=harmonics is not None,
@@ -168,7 +172,11 @@ def _scene_terms(scene: Scene, law: Terms, harmonics: Harmonics | None, segments
     # with the loads' moment about another point than the centre of mass the flight has no elementary integral
     present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
-    present["rest"] = not (present["harmonics"] or creeps or present["support"])
+    present["rest"] = not (creeps or present["support"])
+    if present["harmonics"]:
+        # nothing but damping keeps a harmonic from swinging the head up
+        damped = law.viscous is not None or law.hysteretic is not None
+        present["rest"] &= damped and present["flight"] and _only_hums(scene, loads)
     return law._replace(**_flags(present))
 
 
@@ -176,6 +184,24 @@ def _wear_terms(wear: Wear | None) -> dict[str, bool]:
     if wear is None or wear.coefficient_m2_n == 0.0:
         return {"wear": False}
     return {"wear": True, "sliding": wear.sliding == "total", "running_in": wear.running_in_ratio > 1.0}
+
+
+def _only_hums(scene: Scene, loads: LoadSet) -> bool:
+    """Tell whether the harmonics are small beside what may press the head against its walls: steady loads, preload."""
+    mass, contact = scene.head.mass_kg, scene.contact
+    arms = np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
+    pressing = np.abs(loads.constant) @ arms + mass * abs(scene.gravity.acceleration_m_s2)
+    if loads.pieces is not None:
+        pressing += float(np.abs(loads.pieces.start).max(axis=0) @ arms)
+    pressing += contact.stiffness * _initial_depth(scene) ** contact.exponent
+    return bool(np.hypot(loads.sine, loads.cosine).sum(axis=0) @ arms <= _HUM * pressing)
+
+
+def _initial_depth(scene: Scene) -> float:
+    """Return the penetration in m of the pair that is deepest at the start, at least 0."""
+    y = geometry.body_state(scene.initial.q, scene.initial.v, scene.head.com_offset_m)
+    rows = geometry.penetration_rows(scene)
+    return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)
 
 
 def order_for(admissible: float) -> int:
@@ -294,9 +320,7 @@ def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
     mobility += float(params.frame_mobility[0] + params.radius**2 * params.frame_mobility[2])
     largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
-    y = geometry.body_state(scene.initial.q, scene.initial.v, scene.head.com_offset_m)
-    inside = float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ params.penetration_rows).max())
-    depth = max((largest_force / contact.stiffness) ** (1.0 / contact.exponent), inside)
+    depth = max((largest_force / contact.stiffness) ** (1.0 / contact.exponent), _initial_depth(scene))
     largest_force = contact.stiffness * depth**contact.exponent
     spring = contact.exponent * largest_force / depth
     damping = params.stick_damping

@@ -25,7 +25,7 @@ from plow_twin.solve.support import to_ground
 
 #: Nodes of the quadrature: exact to degree 47, above that of any product of two series in use.
 _NODES = 24
-#: Radians of the fastest harmonic in one panel of a flight.
+#: Radians of the fastest harmonic in one panel of a flight, or of rest.
 _PANEL_PHASE = 8.0
 # indices into the powers and impulses at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
@@ -186,7 +186,7 @@ def balance_step(p, parts, wear, flight, state, w, balance) -> None:
     y, wear_depth, end, support = balance.body, balance.wear_depth, state.sigma_end, parts.terms.support
     set_row(wear_depth, 0, row(state.wear_depth, 0))
     panels = 1
-    if flight is not None and state.in_flight == 1:
+    if flight is not None and (state.in_flight == 1 or state.at_rest == 1):
         panels += int(end * p.fastest / _PANEL_PHASE)
     width = end / panels
     for panel in range(panels):

@@ -15,7 +15,7 @@ def load_at(p, harmonics, segments, t, out) -> None:
     for j in range(3):
         out[j] = p.constant[j]
     if harmonics is not None:
-        _add_harmonics(p, harmonics, t, out)
+        add_harmonics(p, harmonics, t, out)
     if segments is not None:
         piece = max(np.searchsorted(segments.knot, t, side="right") - 1, 0)
         ahead = max(t - segments[piece].knot, 0.0)
@@ -24,7 +24,8 @@ def load_at(p, harmonics, segments, t, out) -> None:
 
 
 @kernel()
-def _add_harmonics(p, harmonics, t, out) -> None:
+def add_harmonics(p, harmonics, t, out) -> None:
+    """Add what the harmonics give at t, in the same units."""
     for i in range(harmonics.size):
         one = harmonics[i]
         sine, cosine = math.sin(one.omega * t), math.cos(one.omega * t)

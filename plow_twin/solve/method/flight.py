@@ -22,7 +22,7 @@ _SAFE = 0.9
 
 
 @kernel(inline="code")
-def _amplitudes(p, one, j):
+def amplitudes(p, one, j):
     """Return sine and cosine amplitude of a harmonic's acceleration along x, y or theta."""
     if j == 2:
         return one.moment[0], one.moment[1]
@@ -51,7 +51,7 @@ def _bounds(p, harmonics, t, z, w) -> None:
         drift, push, swing = z[3 + j], 0.0, 0.0
         for i in range(harmonics.size):
             one = harmonics[i]
-            sine, cosine = _amplitudes(p, one, j)
+            sine, cosine = amplitudes(p, one, j)
             phase, size = one.omega * t, p.free[j] * math.hypot(sine, cosine)
             drift += p.free[j] * (sine * math.cos(phase) - cosine * math.sin(phase)) / one.omega
             push += size
@@ -124,7 +124,7 @@ def _swing(p, harmonics, j, t, time):
     rate = way = 0.0
     for i in range(harmonics.size):
         one = harmonics[i]
-        sine, cosine = _amplitudes(p, one, j)
+        sine, cosine = amplitudes(p, one, j)
         before, after = one.omega * t, one.omega * (t + time)
         rise, fall = math.sin(after) - math.sin(before), math.cos(after) - math.cos(before)
         rate += (cosine * rise - sine * fall) / one.omega

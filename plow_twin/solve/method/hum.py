@@ -1,0 +1,153 @@
+"""Rest under harmonics: whether what they do to a head that its contacts hold stays below the tolerance for good.
+
+About its equilibrium such a head obeys  e'' + C e' + K e = r,  with e its distance from the linear answer to the
+harmonics (the angle counts as a place, times the radius of gyration) and r what the linear equations leave out. The
+answer is known in closed form, resonance included. With eps <= c / 2, s / (10 S), sqrt(s) / 10, where s and c are the
+least eigenvalues of K and C, and S is the largest one of C,
+
+    V = (e'e' + e K e) / 2 + eps (e e' + e C e / 2),  V' <= -eps W + r (1 + eps / sqrt(s)) sqrt(W),  W = e'e' + e K e
+
+is between 0.45 W and 0.55 W. So sqrt(W) stays below the larger of 1.2 times what it is now and 1.4 r / eps for all
+time, and e below sqrt(W / s). Without damping nothing keeps r from swinging the head up.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.contact_force import law_force
+from plow_twin.solve.dynamics import accelerate
+from plow_twin.solve.kinematics import penetration_of
+from plow_twin.solve.loads import add_harmonics
+from plow_twin.solve.method.equilibrium import stiffer_than
+from plow_twin.solve.method.flight import amplitudes
+from plow_twin.solve.state import ON, X, Y
+
+#: Halvings after which an eigenvalue counts as zero.
+_HALVINGS = 40
+#: Evaluations of the equations of motion that it takes to tell.
+HUM = 4
+
+
+@kernel()
+def without_harmonics(p, harmonics, t, rate, spare) -> None:
+    """Take what the harmonics give at t from the accelerations rate[3:]; `spare`, shape (3,), is written over."""
+    if harmonics is not None:
+        spare[0] = spare[1] = spare[2] = 0.0
+        add_harmonics(p, harmonics, t, spare)
+        for j in range(3):
+            rate[3 + j] -= p.free[j] * spare[j]
+
+
+@kernel()
+def _damping_at(p, acts, state, w, gyration) -> None:
+    """Write minus the derivatives of the accelerations at `w.rest[0]`, by rate to `w.damping`."""
+    z, rate, moved = w.rest[0], w.rest[1], w.rest[2]
+    accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
+    for j in range(3):
+        # the laws are linear in the rate
+        unit = gyration if j == 2 else 1.0
+        z[3 + j] = 1.0 / unit
+        accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], moved)
+        z[3 + j] = 0.0
+        for i in range(3):
+            w.damping[i, j] = (rate[3 + i] - moved[3 + i]) * (gyration if i == 2 else 1.0)
+            if p.free[i] == 0.0 or p.free[j] == 0.0:
+                w.damping[i, j] = np.inf if i == j else 0.0
+    state.evaluations += 4
+
+
+@kernel()
+def _least_eigenvalue(h) -> float:
+    """Return a bound from below of the least eigenvalue, not far below half of it; 0 where it is not positive."""
+    least = 0.99 * min(h[0, 0], h[1, 1], h[2, 2])
+    for _ in range(_HALVINGS):
+        if stiffer_than(h, least):
+            return least
+        least *= 0.5
+    return 0.0
+
+
+@kernel()
+def _trace(p, h) -> float:
+    """Return a bound from above of the largest eigenvalue."""
+    trace = 0.0
+    for j in range(3):
+        trace += h[j, j] if p.free[j] != 0.0 else 0.0
+    return trace
+
+
+@kernel(inline="code")
+def _dynamic_stiffness(p, w, omega, i, j):
+    """Return an entry of K - omega^2 + i omega C; a locked place has an equation of its own."""
+    if p.free[i] == 0.0 or p.free[j] == 0.0:
+        return complex(1.0 if i == j else 0.0, 0.0)
+    return complex(w.hessian[i, j] - (omega * omega if i == j else 0.0), omega * w.damping[i, j])
+
+
+@kernel()
+def _answer(p, one, w, gyration):
+    """Return the amplitude in m of the linear answer to a harmonic, all three places together, and of sqrt(x K x)."""
+    om = one.omega
+    a, b, c = _dynamic_stiffness(p, w, om, 0, 0), _dynamic_stiffness(p, w, om, 0, 1), _dynamic_stiffness(p, w, om, 0, 2)
+    d, e, f = _dynamic_stiffness(p, w, om, 1, 0), _dynamic_stiffness(p, w, om, 1, 1), _dynamic_stiffness(p, w, om, 1, 2)
+    g, h, k = _dynamic_stiffness(p, w, om, 2, 0), _dynamic_stiffness(p, w, om, 2, 1), _dynamic_stiffness(p, w, om, 2, 2)
+    sx, cx = amplitudes(p, one, 0)
+    sy, cy = amplitudes(p, one, 1)
+    st, ct = amplitudes(p, one, 2)
+    x, y, t = p.free[0] * complex(cx, -sx), p.free[1] * complex(cy, -sy), p.free[2] * gyration * complex(ct, -st)
+    # by the adjugate
+    first, second, third = e * k - f * h, f * g - d * k, d * h - e * g
+    along_x = first * x + (c * h - b * k) * y + (b * f - c * e) * t
+    along_y = second * x + (a * k - c * g) * y + (c * d - a * f) * t
+    along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
+    size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
+    size /= abs(a * first + b * second + c * third)
+    # x K x is at most what the harmonic and the inertia do on the way
+    load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
+    return size, math.sqrt(load * size) + om * size
+
+
+@kernel()
+def _left_out(p, state, w, reach, rate, gyration) -> float:
+    """Return a bound of r within distances `reach` and rates `rate`: how the pairs' forces bend, and how they turn."""
+    y, left_out = state.y, 0.0
+    arm = (p.leverage + math.hypot(y[X], y[Y])) / gyration
+    way = math.sqrt(1.0 + arm * arm)
+    for pair in range(PAIR_COUNT):
+        if p.enabled[pair] == 1 and state.mode[pair] == ON:
+            d = penetration_of(p, state, pair, y)
+            force = law_force(p, state, pair, d, 0.0)
+            damper = law_force(p, state, pair, d, 1.0) - force
+            bent = p.exponent * abs(p.exponent - 1.0) * force / d * reach
+            if p.ramp > 0.0 or p.viscous == 0.0:
+                bent += (p.exponent + 2.0) * damper * rate
+            left_out += p.inverse_mass * way**3 * bent * reach / d
+    return left_out + 4.0 * (_trace(p, w.hessian) * reach + _trace(p, w.damping) * rate) * reach / gyration
+
+
+@kernel()
+def hums_on(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
+    """Tell whether the head stays within `way` of its equilibrium, and slower than `fast`, for all time.
+
+    `distance` is sqrt(W) of the head now, were there no harmonics; `w.hessian` has its stiffness.
+    """
+    least = _least_eigenvalue(w.hessian)
+    _damping_at(p, acts, state, w, gyration)
+    eps = min(
+        0.5 * _least_eigenvalue(w.damping), 0.1 * least / max(_trace(p, w.damping), 1e-300), 0.1 * math.sqrt(least)
+    )
+    swing = swing_rate = 0.0
+    for i in range(harmonics.size):
+        size, energy = _answer(p, harmonics[i], w, gyration)
+        swing += size
+        swing_rate += harmonics[i].omega * size
+        distance += harmonics[i].omega * size + energy
+    reach = min(way, 2.0 * (swing + 1.2 * distance / math.sqrt(least)))
+    rate = min(fast, 2.0 * (swing_rate + 1.2 * distance))
+    distance = max(1.2 * distance, 1.4 * _left_out(p, state, w, reach, rate, gyration) / eps)
+    return swing + distance / math.sqrt(least) <= reach and swing_rate + distance <= rate
