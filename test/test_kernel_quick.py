@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import operator
+from copy import copy
 from typing import Any
 
 import llvmlite.binding as llvm
+import llvmlite.ir
 import numba
 import pytest
 from numba.core.compiler import DefaultPassBuilder, Flags
@@ -13,7 +15,7 @@ from numba.core.registry import cpu_target
 from numba.core.typing.context import Context
 
 from plow_twin.kernel.compiler import FASTMATH
-from plow_twin.kernel.quick import UNUSED, QuickPasses, caching_context, without_lock_events
+from plow_twin.kernel.quick import UNUSED, QuickPasses, ask_llvm_once, caching_context, without_lock_events
 
 
 def _flags(fastmath: bool) -> Flags:
@@ -66,3 +68,16 @@ def test_who_listens_to_llvms_lock_is_told_again_afterwards() -> None:
         assert set(told) == {"taken", "released"}
     finally:
         llvm.ffi.unregister_lock_callback(*listener)
+
+
+def test_llvm_is_asked_once_for_the_size_of_a_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It parses a module for the answer, for each access to an array."""
+    target = copy(cpu_target.target_context)
+    target.__dict__.pop("get_abi_sizeof", None)
+    asked: list[Any] = []
+    parse = llvm.parse_assembly
+    monkeypatch.setattr(llvm, "parse_assembly", lambda *text: asked.append(text) or parse(*text))
+    ask_llvm_once(target)
+    pair = llvmlite.ir.LiteralStructType([llvmlite.ir.DoubleType()] * 2)
+    assert [target.get_abi_sizeof(pair) for _ in range(3)] == [16] * 3
+    assert len(asked) == 1

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numba
 
-from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, keep_from_python
+from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, keep_from_python, save_later
 
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
@@ -68,6 +68,7 @@ def kernel(
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
             if inline != "source" and not entry:
                 keep_from_python(dispatcher)
+                save_later(dispatcher)
         compiled: Callable[..., Any] = dispatcher
         return compiled
 

@@ -14,40 +14,77 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import llvmlite.ir
+from numba.core.cgutils import normalize_ir_text
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import AnalysisPass, register_pass
-from numba.core.typed_passes import IRLegalization
+from numba.core.compiler_machinery import register_pass
+from numba.core.typed_passes import NativeLowering
 
-from plow_twin.kernel.quick import QuickPasses, caching_context, without_lock_events
+from plow_twin.kernel.background import Background
+from plow_twin.kernel.quick import QuickPasses, ask_llvm_once, caching_context, without_lock_events
 
 _ENVIRONMENT = "_ZN08NumbaEnv"
+
+#: What LLVM does to linked code, beside the typing and lowering of what calls it.
+background = Background()
 
 
 class LinkedLibrary(JITCodeLibrary):
     """The code of a kernel, as its callers link it; its machine code holds nothing but the variables numba sets."""
 
-    def _optimize_final_module(self) -> None:
-        pass
+    def __init__(self, codegen: Any, name: str) -> None:
+        super().__init__(codegen, name)
+        self._texts: list[tuple[str, str]] = []
+        self._exported: list[str] = []
 
-    def _finalize_final_module(self) -> None:
+    def add_ir_module(self, ir_module: llvmlite.ir.Module) -> None:
+        """Take functions as text."""
+        self._texts.append((ir_module.name, normalize_ir_text(str(ir_module))))
+        defined = (function for function in ir_module.functions if not function.is_declaration)
+        self._exported += [function.name for function in defined if not function.linkage]
+
+    def finalize(self) -> None:
+        """Have LLVM make of the text what callers link, in the background."""
+        self._finalized = True
+        self._wait = background.do(self._link, list(dict.fromkeys(self._linking_libraries)))
+
+    def _link(self, libraries: list[JITCodeLibrary]) -> None:
+        for name, text in self._texts:
+            functions = llvm.parse_assembly(text)
+            functions.name = name
+            functions.verify()
+            self.add_llvm_module(functions)
+        self._texts.clear()
+        whole = self._final_module
         self._finalize_dynamic_globals()
-        self._verify_declare_only_symbols()
-        whole, self._finalized = self._final_module, True
-        self._get_module_for_linking()
-        variables = self._codegen._create_empty_module(self.name)
-        for variable in whole.global_variables:
-            if variable.name.startswith(_ENVIRONMENT):
-                _declare(variables, variable.name)
-        self._final_module = llvm.parse_assembly(str(variables))
-        self._final_module.name = self.name
-        super()._finalize_final_module()
+        environments = _environments(whole)
+        for library in libraries:
+            whole.link_in(library._get_module_for_linking(), preserve=True)
+            self._dynamic_globals += library._dynamic_globals
+            environments |= _environments(library._final_module)
+        for name in self._exported:
+            # as in numba: a caller holds it, or leaves it out
+            whole.get_function(name).linkage = "linkonce_odr"
+        self._shared_module = whole
+        self._final_module = _variables(self._codegen._create_empty_module(self.name), environments)
+        self._set_compiled_object(self._codegen._tm.emit_object(self._final_module))
+
+    def _get_module_for_linking(self) -> llvm.ModuleRef:
+        self._ensure_finalized()
+        self._wait()
+        return self._shared_module
 
 
-def _declare(module: llvmlite.ir.Module, name: str) -> None:
+def _environments(module: llvm.ModuleRef) -> set[str]:
+    return {variable.name for variable in module.global_variables if variable.name.startswith(_ENVIRONMENT)}
+
+
+def _variables(module: llvmlite.ir.Module, names: set[str]) -> llvm.ModuleRef:
     pointer = llvmlite.ir.IntType(8).as_pointer()
-    variable = llvmlite.ir.GlobalVariable(module, pointer, name)
-    variable.linkage, variable.initializer = "common", llvmlite.ir.Constant(pointer, None)
+    for name in sorted(names):
+        variable = llvmlite.ir.GlobalVariable(module, pointer, name)
+        variable.linkage, variable.initializer = "common", llvmlite.ir.Constant(pointer, None)
+    return llvm.parse_assembly(str(module))
 
 
 class EntryLibrary(JITCodeLibrary):
@@ -64,39 +101,49 @@ class EntryLibrary(JITCodeLibrary):
                 function.linkage = llvm.Linkage.internal
 
 
-class _ChooseLibrary(AnalysisPass):
-    library: type[JITCodeLibrary]
+def _new_library(state: Any, kind: type[JITCodeLibrary]) -> JITCodeLibrary:
+    library = kind(state.targetctx.codegen(), state.func_id.func_qualname)
+    library.enable_object_caching()
+    return library
 
-    def __init__(self) -> None:
-        AnalysisPass.__init__(self)
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerForLinking(NativeLowering):
+    """Numba's pass, but that nothing is made ready to be called."""
+
+    _name = "lower_for_linking"
 
     def run_pass(self, state: Any) -> bool:
-        state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
-        state.library.enable_object_caching()
-        return False
+        state.library = _new_library(state, LinkedLibrary)
+        state.flags.no_compile = True
+        super().run_pass(state)
+        state.library.finalize()
+        # stands for the function wherever a caller is lowered
+        entry_point = object()
+        state.targetctx.insert_user_function(entry_point, state.cr.fndesc, [state.library])
+        state["cr"] = state.cr._replace(cfunc=entry_point)
+        return True
 
 
-@register_pass(mutates_CFG=False, analysis_only=True)
-class _LowerForLinking(_ChooseLibrary):
-    _name = "lower_for_linking"
-    library = LinkedLibrary
-
-
-@register_pass(mutates_CFG=False, analysis_only=True)
-class _LowerForPython(_ChooseLibrary):
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LowerForPython(NativeLowering):
     _name = "lower_for_python"
-    library = EntryLibrary
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _new_library(state, EntryLibrary)
+        return bool(super().run_pass(state))
 
 
 class _Compiler(CompilerBase):
-    choice: type[_ChooseLibrary]
+    lowering: type[NativeLowering]
 
     def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, local: Any) -> None:
+        ask_llvm_once(target)
         super().__init__(caching_context(typing, flags), target, library, args, result, flags, local)
 
     def define_pipelines(self) -> list[Any]:
         passes = QuickPasses(DefaultPassBuilder.define_nopython_pipeline(self.state))
-        passes.add_pass_after(self.choice, IRLegalization)
+        passes.passes = [(self.lowering if one is NativeLowering else one, said) for one, said in passes.passes]
         passes.finalize()
         return [passes]
 
@@ -104,17 +151,17 @@ class _Compiler(CompilerBase):
 class LinkedCompiler(_Compiler):
     """numba's compiler, but for the library that it lowers into: for what kernels call."""
 
-    choice = _LowerForLinking
+    lowering = _LowerForLinking
 
 
 class EntryCompiler(_Compiler):
     """numba's compiler, but for the library that it lowers into: for what Python calls, with all that it calls."""
 
-    choice = _LowerForPython
+    lowering = _LowerForPython
 
     def compile_extra(self, func: Any) -> Any:
         """Compile, as numba's own."""
-        with _garbage_kept(), without_lock_events():
+        with _garbage_kept(), without_lock_events(), background.running():
             return super().compile_extra(func)
 
 
@@ -137,3 +184,10 @@ def keep_from_python(dispatcher: Any) -> None:
         raise TypeError(f"{dispatcher.py_func.__qualname__} is for kernels to call: it would have to be an entry")
 
     dispatcher._insert, dispatcher._compile_for_args = lambda *overload, **options: None, refuse
+
+
+def save_later(dispatcher: Any) -> None:
+    """Write the cache when LLVM is done with what goes into it."""
+    cache = dispatcher._cache
+    save = cache.save_overload
+    cache.save_overload = lambda signature, result: background.do(save, signature, result)

@@ -1,12 +1,13 @@
 """Compile with less of numba's own work in Python, which is most of the time of compiling.
 
-Four means, none of which changes what numba makes of a kernel: the same types, the same code.
+Five means, none of which changes what numba makes of a kernel: the same types, the same code.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, Final
 
 import llvmlite.binding as llvm
@@ -100,3 +101,10 @@ def caching_context(context: Context, flags: Any) -> CachingContext:
     if found is None:
         found = _CONTEXTS[context, flags.copy()] = CachingContext(context)
     return found
+
+
+def ask_llvm_once(target: Any) -> None:
+    """Let numba's target remember what it compiles for and how large types are: for each LLVM has to parse a module."""
+    codegen = target.codegen()
+    target.__dict__.setdefault("get_abi_sizeof", cache(target.get_abi_sizeof))
+    codegen.__dict__.setdefault("magic_tuple", cache(codegen.magic_tuple))
