@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import operator
+import subprocess
+import sys
 from copy import copy
 from typing import Any
 
@@ -81,3 +83,16 @@ def test_llvm_is_asked_once_for_the_size_of_a_type(monkeypatch: pytest.MonkeyPat
     pair = llvmlite.ir.LiteralStructType([llvmlite.ir.DoubleType()] * 2)
     assert [target.get_abi_sizeof(pair) for _ in range(3)] == [16] * 3
     assert len(asked) == 1
+
+
+BLAS = (
+    "import sys, numpy as np, numba; from plow_twin.kernel import compiler; "
+    "print('scipy.linalg' in sys.modules, end=' '); "
+    "print(numba.njit(lambda a: np.dot(a, a))(np.arange(4.0)), 'scipy.linalg.cython_blas' in sys.modules)"
+)
+
+
+def test_blas_is_loaded_where_it_is_used() -> None:
+    """Numba loads it to see whether it is there: that took a fifth of a start."""
+    done = subprocess.run([sys.executable, "-c", BLAS], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "14.0", "True"], done.stderr

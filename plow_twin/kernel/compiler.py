@@ -14,10 +14,12 @@ from typing import Any, Final, Literal
 import numba
 
 from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, keep_from_python, save_later
+from plow_twin.kernel.quick import load_numba
 
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
+load_numba()
 
 #: Rooms that hold compiled functions, with all their folders.
 KERNEL_FOLDERS: Final = ("kernel", "model", "solve")

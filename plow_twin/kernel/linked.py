@@ -7,9 +7,6 @@ vain. It takes a quarter of the time of compiling, which is left out here by num
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -21,7 +18,7 @@ from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 
 from plow_twin.kernel.background import Background
-from plow_twin.kernel.quick import QuickPasses, ask_llvm_once, caching_context, without_lock_events
+from plow_twin.kernel.quick import QuickPasses, ask_llvm_once, caching_context, garbage_kept, without_lock_events
 
 _ENVIRONMENT = "_ZN08NumbaEnv"
 
@@ -161,20 +158,8 @@ class EntryCompiler(_Compiler):
 
     def compile_extra(self, func: Any) -> Any:
         """Compile, as numba's own."""
-        with _garbage_kept(), without_lock_events(), background.running():
+        with garbage_kept(), without_lock_events(), background.running():
             return super().compile_extra(func)
-
-
-@contextmanager
-def _garbage_kept() -> Iterator[None]:
-    """Pause the collection of garbage: compiling makes millions of objects that stay, looked at again and again."""
-    paused = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if paused:
-            gc.enable()
 
 
 def keep_from_python(dispatcher: Any) -> None:

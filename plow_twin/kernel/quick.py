@@ -1,10 +1,11 @@
 """Compile with less of numba's own work in Python, which is most of the time of compiling.
 
-Five means, none of which changes what numba makes of a kernel: the same types, the same code.
+Six means, none of which changes what numba makes of a kernel: the same types, the same code.
 """
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
@@ -13,7 +14,9 @@ from typing import Any, Final
 import llvmlite.binding as llvm
 from numba.core import types
 from numba.core.compiler_machinery import PassManager
+from numba.core.registry import cpu_target
 from numba.core.typing.context import Context
+from numba.np import linalg
 
 #: Numba's passes for what no kernel has: closures, `with`, loops over literals, array expressions, parallel loops,
 #: overloads that are inlined; and those that only tell or check. One of a name that numba does not have is no matter;
@@ -48,6 +51,32 @@ class QuickPasses(PassManager):
         pss.run_initialization(internal_state)
         pss.run_pass(internal_state)
         pss.run_finalizer(internal_state)
+
+
+@contextmanager
+def garbage_kept() -> Iterator[None]:
+    """Pause the collection of garbage: numba makes millions of objects that stay, looked at again and again."""
+    paused = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if paused:
+            gc.enable()
+
+
+def load_numba() -> None:
+    """Load what numba compiles with, but for scipy's BLAS: numba only looks whether it is there, and loads it for that.
+
+    Compiled functions that use it load it themselves.
+    """
+    found = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        with garbage_kept():
+            cpu_target.target_context.refresh()
+    finally:
+        linalg.ensure_blas = found
 
 
 @contextmanager
