@@ -3,7 +3,8 @@
 `python benchmark/live_load.py [--seconds N] [--repeats N]` prints a line of JSON for each case, medians of the repeats,
 in each of which every case runs once, and then the targets with what was reached. `--minutes N` runs the node with its
 recorder at 1 kHz (or `--rate`) for so long instead, prints a line each ten seconds, what has grown, and
-whether each message sent was used or counted.
+whether each message sent was used or counted. `--beside` runs the echo, the node and a recording node at once under
+the same samples: what else the machine does meets all of them, so that their ratios hold on a busy one too.
 The machine is shared by publisher, node and subscriber: what is compared is the node and the echo in the same run.
 """
 
@@ -44,7 +45,7 @@ FIXED, FIXED_RECORDED = Case("fixed_rate", 1000), Case("fixed_rate", 1000, True)
 CASES = (ECHO, RAW_ECHO, ON_SAMPLE, RECORDED, FIXED, FIXED_RECORDED, Case("fixed_rate", 10000))
 
 
-def echo(raw: bool = False) -> None:
+def echo(raw: bool = False, namespace: str = "live_load") -> None:
     """Answer each sample with three messages of the sizes that the node sends, and nothing else.
 
     `raw`: with bytes that were serialised before, but for the stamp, that of the sample: the least that
@@ -62,9 +63,9 @@ def echo(raw: bool = False) -> None:
     node = rclpy.create_node("echo", namespace=f"/echo_{os.getpid()}")
     joints = [JointState(name=[f"pair_{i:016d}" for i in range(8)], position=[0.0] * 8, velocity=[0.0] * 8,
                          effort=[0.0] * 8) for _ in range(2)]  # fmt: skip
-    names = ("/live_load/contact_forces", "/live_load/contact_peaks")
+    names = (f"/{namespace}/contact_forces", f"/{namespace}/contact_peaks")
     sent = [(node.create_publisher(JointState, name, 1000), joint) for name, joint in zip(names, joints, strict=True)]
-    sent.append((node.create_publisher(Odometry, "/live_load/head_state", 1000), Odometry()))
+    sent.append((node.create_publisher(Odometry, f"/{namespace}/head_state", 1000), Odometry()))
 
     def answer(message: Any) -> None:
         for publisher, reply in sent:
@@ -130,8 +131,7 @@ class Probe:
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 10)
 
     def _heard(self, data: bytes) -> None:
-        sec, nanosec = struct.unpack_from("<iI", data, 4)
-        self.ages.append((time.time_ns() - sec * NS_PER_S - nanosec) * 1e-6)
+        _append_age(self.ages, data)
 
     def _report(self, message: Any) -> None:
         for status in message.status:
@@ -207,10 +207,11 @@ def _cpu_s(process_id: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _twin(mode: str, folder: str) -> list[str]:
+def _twin(mode: str, folder: str, namespace: str = "/live_load") -> list[str]:
     given = {"publish_mode": mode, "excitation_timeout": 60.0, "record_path": folder}
     settings = [word for name, value in given.items() if value != "" for word in ("-p", f"{name}:={value}")]
-    return [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-r", "__ns:=/live_load", *settings]
+    return [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-r", f"__ns:={namespace}", "-r",
+            "excitation:=/live_load/excitation", *settings]  # fmt: skip
 
 
 def compare(seconds: float, repeats: int) -> None:
@@ -246,6 +247,63 @@ def _targets(rows: dict[Case, dict[str, float]]) -> Iterator[tuple[str, float, f
         yield f"p99 of the age above the echo [ms], 1 kHz out{how}", row["age_p99_ms"] - bare["age_p99_ms"], 1.0
     for case, how in ((FIXED, ""), (FIXED_RECORDED, ", recording")):
         yield f"share of a core, 100 Hz out{how}", rows[case]["core"], 1.0 / 3.0
+
+
+def beside(seconds: float) -> None:
+    """Print CPU and age of the echo, the node and a recording node that hear the same samples, and their ratios."""
+    from sensor_msgs.msg import JointState
+
+    probe, cases = Probe(), {"echo": ECHO, "on_sample": ON_SAMPLE, "recording": RECORDED}
+    heard: dict[str, list[float]] = {name: [] for name in cases}
+    shares: dict[str, list[float]] = {name: [] for name in cases}
+    running: dict[str, subprocess.Popen[bytes]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            for name, case in cases.items():
+                command = [sys.executable, __file__, "--role", f"echo:{name}"]
+                if case is not ECHO:
+                    command = _twin(case.mode, f"{folder}/run" if case.recorded else "", f"/{name}")
+                running[name] = subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL)
+                hear = partial(_append_age, heard[name])
+                probe.node.create_subscription(JointState, f"/{name}/contact_forces", hear, 5000, raw=True)
+            probe.spin(lambda: probe.node.count_subscribers("/live_load/excitation") >= len(cases), 120.0)
+            probe.spin(lambda: False, 3.0)
+            sender = source(1000.0, seconds)
+            probe.spin(lambda: all(len(ages) > 500 for ages in heard.values()), 60.0)
+            for ages in heard.values():
+                ages.clear()
+            while sender.poll() is None:
+                before, begin = {name: _exact_cpu_s(process.pid) for name, process in running.items()}, time.monotonic()
+                probe.spin(lambda: sender.poll() is not None, 2.0)
+                passed_s = time.monotonic() - begin
+                if passed_s > 1.9:
+                    for name, process in running.items():
+                        shares[name].append((_exact_cpu_s(process.pid) - before[name]) / passed_s)
+        finally:
+            for process in running.values():
+                process.terminate()
+            for process in running.values():
+                process.wait(20.0)
+            probe.close()
+    for name, ages in heard.items():
+        ages.sort()
+        ratios = [one / echo_s for one, echo_s in zip(shares[name], shares["echo"], strict=True)]
+        print(json.dumps({
+            "case": name, "messages": len(ages),
+            "core": round(median(shares[name]), 3), "x_echo": round(median(ratios), 3),
+            "age_p50_ms": round(ages[len(ages) // 2], 3), "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+        }))  # fmt: skip
+
+
+def _append_age(ages: list[float], data: bytes) -> None:
+    sec, nanosec = struct.unpack_from("<iI", data, 4)
+    ages.append((time.time_ns() - sec * NS_PER_S - nanosec) * 1e-6)
+
+
+def _exact_cpu_s(process_id: int) -> float:
+    """Return the time on a processor of all threads, as the scheduler has it: `stat` counts ticks of 10 ms."""
+    tasks = Path(f"/proc/{process_id}/task").iterdir()
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) * 1e-9
 
 
 def soak(minutes: float, rate_hz: float) -> bool:
@@ -309,15 +367,20 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--minutes", type=float, default=0.0)
     parser.add_argument("--rate", type=float, default=1000.0, help="samples a second of --minutes")
+    parser.add_argument("--beside", action="store_true", help="all at once, for --seconds")
     parser.add_argument("--role", nargs="+", default=[])
     options = parser.parse_args()
     if options.role:
         role, *numbers = options.role
-        roles: dict[str, Callable[..., None]] = {"echo": echo, "raw_echo": partial(echo, True), "send": send}
+        roles: dict[str, Callable[..., None]] = {"echo": echo, "raw_echo": partial(echo, True), "send": send,
+                                                 "echo:echo": partial(echo, False, "echo")}  # fmt: skip
         roles[role](*map(float, numbers))
         return
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     os.environ.setdefault("ROS_DOMAIN_ID", "91")
+    if options.beside:
+        beside(options.seconds)
+        return
     if options.minutes:
         sys.exit(0 if soak(options.minutes, options.rate) else 1)
     compare(options.seconds, options.repeats)

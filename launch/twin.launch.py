@@ -5,6 +5,8 @@ With `view:=true` a process of its own shows the recording in a browser while it
 stand in another Python environment (`view:=/opt/viewer/bin/plow-twin`): rerun needs numpy 2, ROS 2 Jazzy has 1.26.
 """
 
+import shutil
+
 from launch.actions import DeclareLaunchArgument, ExecuteProcess
 from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, PythonExpression
@@ -23,6 +25,9 @@ ARGUMENTS = {
     "autostart": ("true", "configure and activate at start"),
     "view": ("", "true, or the program plow-twin of the environment that has rerun; empty: not shown"),
 }
+
+#: Asks a process to stop when `launch` has gone: at SIGTERM that ends without a word to those it has started.
+STOP_WITH_LAUNCH = "setpriv --pdeathsig TERM" if shutil.which("setpriv") else ""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -43,6 +48,8 @@ def generate_launch_description() -> LaunchDescription:
         # the node closes its recording first, within 5 s
         sigterm_timeout="6",
         sigkill_timeout="6",
+        prefix=STOP_WITH_LAUNCH,
+        exec_name="twin",
         output="screen",
     )
     # without what a sourced ROS 2 adds: the viewer's environment is its own

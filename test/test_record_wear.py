@@ -45,6 +45,7 @@ def test_another_head_or_scene_and_damage_are_refused(tmp_path: Path) -> None:
     broken = [
         path.read_text()[:40],
         "[]",
+        "[" * 100_000,
         json.dumps(record | {"version": 2}),
         json.dumps(record | {"depth_m": {**record["depth_m"], "top_left_top": -1e-3}}),
         json.dumps(record | {"depth_m": {**record["depth_m"], "top_left_top": "nan"}}),

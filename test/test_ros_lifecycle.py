@@ -113,6 +113,17 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
     assert "Traceback" not in said
 
 
+@pytest.mark.parametrize("program", ["main", "excitation_publisher"])
+def test_arguments_that_ros_cannot_read_are_said_without_a_traceback(tmp_path: Path, program: str) -> None:
+    path = tmp_path / "missing.yaml"
+    process = Process(f"plow_twin.ros.{program}", ["--ros-args", "--params-file", str(path)], tmp_path / "log")
+    assert process.wait() == 2
+    said = process.output()
+    process.close()
+    assert str(path) in said and "Error opening YAML file" in said
+    assert "Traceback" not in said and "/src/" not in said
+
+
 def test_a_parameter_file_with_integers_for_doubles_and_a_typing_error(tmp_path: Path) -> None:
     path = tmp_path / "twin.yaml"
     path.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"excitation_timeout": 2, "hold_polcy": "zero"}}}))

@@ -5,12 +5,18 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import runpy
+import shlex
 import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
+import psutil
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped
@@ -481,6 +487,34 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
     assert used > 500 and not reader.lost
     report = replay(tmp_path / "run")
     assert report.first_divergence is None
+
+
+def test_a_twin_ends_cleanly_when_its_launch_has_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # `launch` at SIGTERM ends at once and hands nothing on; it is no part of the tests: what the file asks it for is
+    asked = {name: MagicMock() for name in ("launch", "launch_ros")}
+    for package, names in (("launch", "actions conditions substitutions"), ("launch_ros", "actions substitutions")):
+        for name in ("", *names.split(), *(("parameter_descriptions",) if package == "launch_ros" else ())):
+            monkeypatch.setitem(
+                sys.modules, f"{package}.{name}".rstrip("."), getattr(asked[package], name) if name else asked[package]
+            )
+    runpy.run_path(str(ROOT / "launch" / "twin.launch.py"))["generate_launch_description"]()
+    prefix = shlex.split(asked["launch_ros"].actions.Node.call_args.kwargs["prefix"])
+    twin = [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-p", f"record_path:={tmp_path / 'run'}"]
+    launch = subprocess.Popen(
+        [sys.executable, "-c", "import subprocess, sys; subprocess.run(sys.argv[1:])", *prefix, *twin],
+        stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert launch.stderr is not None
+    assert any("solver ready" in line for line in launch.stderr)
+    children = psutil.Process(launch.pid).children(recursive=True)
+    launch.kill()
+    gone, left = psutil.wait_procs(children, 10.0)
+    for process in left:
+        process.kill()
+    launch.communicate()
+    assert gone and not left
+    reader = RunReader(tmp_path / "run")
+    assert list(reader) and reader.status is FileStatus.COMPLETE
 
 
 def test_a_stop_while_the_solver_is_compiled_is_clean(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,7 @@ from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
 
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
@@ -29,8 +30,9 @@ from plow_twin.record.measured import read_recording
 from plow_twin.record.reader import EntryRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.input_loop import InputLoop, Turns
-from plow_twin.ros.input_queue import Taken
+from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.node import TwinNode
+from plow_twin.ros.qos import OUTPUT, sensor_input
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Verdict
@@ -139,6 +141,10 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
             taken = [Taken(b"", number, 0, serialize_message(message))]
             front.subscriptions._measured_poses(PoseWithCovarianceStamped, taken)
         assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
+        # a quaternion that nobody has filled in is no angle of 0
+        message.pose.pose.orientation.w = 0.0
+        front.subscriptions._measured_poses(PoseWithCovarianceStamped, [Taken(b"", 6, 0, serialize_message(message))])
+        assert front.runtime.inputs.head_pose.counts[Verdict.MALFORMED] == 1
         front.runtime.samples([(stamp * 1_000_000_000, (0.0, 0.0, 0.0)) for stamp in (1, 2, 3)])
         assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
         assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
@@ -185,6 +191,42 @@ def test_under_a_flood_of_samples_what_is_due_is_done_and_others_have_their_turn
             assert flood.taken == inside
     loop.close()
     assert not errors and len(set(at)) == len(at) and at[-1] > 20
+
+
+def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
+    # as many are asked for as have been signalled: those that a turn leaves over must not be forgotten for newer ones
+    with _node() as node:
+        heard: list[int] = []
+        subscription = node.create_subscription(TwistStamped, "burst", lambda _: None, sensor_input(1000), raw=True)
+        queue = InputQueue(node, subscription, lambda batch: heard.extend(taken.number for taken in batch))
+        publisher = node.create_publisher(TwistStamped, "burst", OUTPUT)
+        give_up = time.monotonic() + 30.0
+
+        def send(count: int) -> None:
+            for _ in range(count):
+                publisher.publish(TwistStamped())
+            # has the middleware told of all of them, every turn takes what it is asked for
+            time.sleep(0.2)
+
+        while publisher.get_subscription_count() == 0 and time.monotonic() < give_up:
+            time.sleep(0.01)
+        send(50)
+        assert queue.take(20)
+        send(3)
+        while queue.take(20):
+            pass
+        queue.close()
+    assert heard == list(range(1, 54))
+
+
+def test_another_node_under_the_same_name_is_said() -> None:
+    with _node() as node:
+        assert node.start()
+        node._publish_diagnostics()
+        assert "second twin" not in node._published_status[1]
+        node.create_publisher(JointState, "contact_forces", 1)
+        node._publish_diagnostics()
+        assert node._published_status[0] == 1 and "second twin" in node._published_status[1]
 
 
 def test_loss_is_counted_by_the_publishers_numbers() -> None:

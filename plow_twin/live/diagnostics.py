@@ -187,6 +187,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
         (OK, runtime.clock == "paused", "/clock is paused"),
         (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
         (WARN, bool(others), f"another publisher of {', '.join(others)} sends too and is not followed"),
+        (WARN, runtime.others_publish, "another node publishes contact_forces under this name too: a second twin?"),
         (WARN, bool(runtime.inputs.silent()), f"silent: {', '.join(runtime.inputs.silent())}"),
     ]
     for trouble_level, there, text in troubles:

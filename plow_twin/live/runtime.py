@@ -80,6 +80,8 @@ class Runtime:
         self.periods = _periods(settings)
         #: why time stands still, where it does: `waiting` for the first `/clock`, or `paused`
         self.clock = "running"
+        #: whether somebody else publishes under the names of this twin's outputs
+        self.others_publish = False
         self._clock_before_ns = 0
         self._start_due = True
         self._early: list[Arrival] = []

@@ -149,7 +149,7 @@ def _parse(text: str, path: Path) -> WearState:
             raise WearStateError(f"{path}: version: got {version!r}, expected {VERSION}")
         depth = tuple(float(record["depth_m"][name]) for name in PAIR_NAMES)
         head, scene = str(record["head"]), str(record["scene"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         if isinstance(error, WearStateError):
             raise
         raise WearStateError(f"{path}: damaged, expected the wear of {len(PAIR_NAMES)} pads ({error!r})") from error

@@ -40,6 +40,7 @@ from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import set_stamp
 from plow_twin.ros.qos import LATCHED, sensor_input
+from plow_twin.ros.start import RosArgumentsError, start_ros, without_ros
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import NS_PER_S
@@ -268,20 +269,19 @@ def _cutting(options: argparse.Namespace) -> CuttingLoad | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Send a scene's load; return 0 when all was sent, 1 without a twin, 2 on wrong usage, 3 when answers failed."""
     import rclpy.utilities
-    from rclpy.signals import SignalHandlerOptions
 
     given = list(sys.argv if arguments is None else ["excitation_publisher", *arguments])
     stop = StopSignals()
     try:
-        options = _parse(rclpy.utilities.remove_ros_args(given)[1:])
+        options = _parse(without_ros(given)[1:])
         samples = plan(options.scene, options.rate, options.seconds, _cutting(options), options.sensor)
         stop.interrupt = False
+        start_ros(given)
     except StopRequested:
         return 0
-    except (SceneError, ArgumentError, OSError) as error:
+    except (SceneError, ArgumentError, OSError, RosArgumentsError) as error:
         print(f"excitation_publisher: {error}", file=sys.stderr)
         return 2
-    rclpy.init(args=given, signal_handler_options=SignalHandlerOptions.NO)
     node = ExcitationPublisher(samples, stop, fast=options.speed == "fast")
     try:
         return _publish(node, options)

@@ -138,6 +138,10 @@ class RosFront:
         """What ended the thread of the inputs, None while it runs."""
         return self._loop.error
 
+    def look_for_others(self) -> None:
+        """Find out whether somebody else publishes what this twin does."""
+        self.runtime.others_publish = self._node.count_publishers(self.topics["contact_forces"]) > 1
+
     def activate(self) -> None:
         """Start taking samples."""
         with self.turns:

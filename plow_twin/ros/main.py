@@ -27,7 +27,7 @@ def make_executor() -> Executor:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until it is asked to stop; return 0, or 2 when its parameters cannot be used."""
+    """Run the node until it is asked to stop; return 0, or 2 when its arguments or parameters cannot be used."""
     stop = StopSignals()
     try:
         return _run(arguments, stop)
@@ -38,15 +38,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
     # after the handlers: a stop during these imports must not end in a traceback
     import rclpy.utilities
-    from rclpy.signals import SignalHandlerOptions
 
     from plow_twin.live.parameters import ParameterError
     from plow_twin.live.solver_start import leave
     from plow_twin.ros.node import TwinNode
+    from plow_twin.ros.start import RosArgumentsError, start_ros
 
-    rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
+        start_ros(arguments)
         node = TwinNode(stop_asked=lambda: stop.stopped)
         stop.interrupt = False
         executor = make_executor()
@@ -61,7 +61,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
                     node.start()
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)
-    except ParameterError as error:
+    except (ParameterError, RosArgumentsError) as error:
         print(f"twin: {error}", file=sys.stderr)
         return 2
     finally:

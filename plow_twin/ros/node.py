@@ -230,6 +230,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
             if self._front.error is not None:
                 raise self._front.error  # as from any callback: the program ends, and says why
             self._connections.look_for_subscribers(self.publishers)
+            self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:
             # a manager that configures later, perhaps another scene, need not wait for the compiler then
             self.prepare()

@@ -214,9 +214,13 @@ class Subscriptions:
         for message in self._messages("head_pose", kind, self._inputs.head_pose, batch):
             with_covariance = kind is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
-            theta = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
+            turn, stamp = pose.orientation, stamp_ns(message.header)
+            if turn.z == turn.w == 0.0:  # no turn about z: never filled in, or upside down
+                self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
+                continue
+            theta = 2.0 * math.atan2(turn.z, turn.w)
             deviation = deviations(message.pose.covariance) if with_covariance else ()
-            self._inputs.take_pose(stamp_ns(message.header), (pose.position.x, pose.position.y, theta), deviation)
+            self._inputs.take_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
         """Yield the messages of an input besides the load; what cannot be read is counted."""

@@ -1,0 +1,57 @@
+"""The start of the programs on ROS 2."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from plow_twin.errors import PlowTwinError
+
+
+class RosArgumentsError(PlowTwinError):
+    """What stands behind `--ros-args` cannot be used, or names a file that cannot."""
+
+
+def start_ros(arguments: Sequence[str] | None) -> None:
+    """Make the default context; signals are left to the program.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        Those of the command line; None: those of the process.
+
+    Raises
+    ------
+    RosArgumentsError
+        They cannot be used.
+    """
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    with _said_plainly():
+        rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+
+
+def without_ros(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments of a command line that are the program's own.
+
+    Raises
+    ------
+    RosArgumentsError
+        Those for ROS cannot be used.
+    """
+    from rclpy.utilities import remove_ros_args
+
+    with _said_plainly():
+        own: list[str] = remove_ros_args(list(arguments))
+    return own
+
+
+@contextmanager
+def _said_plainly() -> Iterator[None]:
+    """Turn what rclpy raises for arguments into an error without the places in rcl's sources."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise RosArgumentsError(f"--ros-args: {re.sub(r', at [^ ,]+:[0-9]+', '', str(error))}") from error
