@@ -18,7 +18,7 @@ from test_study_analysis import BIAS, LAG_S, motion, write_bag
 from plow_twin import Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate import estimate as estimating
 from plow_twin.estimate.answer import followed
-from plow_twin.estimate.bouncing import Bounced, _regress, bias_of_hard
+from plow_twin.estimate.bouncing import Bounced, _off_path, _regress, bias_of_hard
 from plow_twin.estimate.estimate import _with_gaps, estimate, summarise_bounced
 from plow_twin.estimate.fit import link_weights
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
@@ -165,6 +165,33 @@ def test_a_hard_contact_is_told_by_what_its_bounces_are_like() -> None:
     for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
         assert abs(value.mean - true) < 1.5 * (value.p95 - value.p05)
     assert result.stiffness.p05 < truth.scene.contact.stiffness < result.stiffness.p95
+
+
+def test_how_far_off_a_path_is_is_told_by_the_drawn_ones() -> None:
+    """Paths scatter together, far along a few directions: there a right one is as far off as any of the drawn ones.
+
+    A wrong one that is off across these is found, though it is nearer by the mean square over the phases.
+    """
+    rng = np.random.default_rng(5)
+    modes, slopes = rng.standard_normal((3, 60)), rng.standard_normal((14, 60))
+    across = rng.standard_normal(60)
+    across -= modes.T @ np.linalg.lstsq(modes.T, across, rcond=None)[0]
+
+    def run(count: int, about: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        features = about * rng.standard_normal((count, 14))
+        common = rng.standard_t(5, (count, 3)) @ modes
+        return features, features @ slopes + common + 0.1 * rng.standard_normal((count, 60))
+
+    right, wrong = [], []
+    for _ in range(16):
+        features, paths = run(90)
+        drawn = [np.tile(path, (11, 1)) for path in paths]
+        (measured,), (path,) = run(1, 0.5)
+        right.append(_off_path(np.tile(path, (11, 1)), features, drawn, measured))
+        wrong.append(_off_path(np.tile(path + across, (11, 1)), features, drawn, measured))
+    assert np.mean(np.array(right) > estimating.MOST_PATH) < 0.06
+    assert abs(np.mean(right)) < 0.8 and np.std(right) < 1.6
+    assert np.mean(np.array(wrong) > estimating.MOST_PATH) > 0.9
 
 
 @pytest.mark.parametrize("turn", [0.0, -0.1])

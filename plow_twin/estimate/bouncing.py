@@ -45,10 +45,14 @@ _MOST_ROWS = 2000
 _WINDOWS: Final = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
 #: Parts of a period in which the scatter is told.
 _PHASES = 20
-#: Parts of a period in which the mean path is told, and fewest measurements in one.
+#: Parts of a period in which the path is told, and fewest measurements in one.
 _PATH_PHASES, _FEWEST_OF_PHASE = 40, 9
+#: Draws near the measured motion that are compared with the others as it is; share of the variance common to all
+#: parts of a path in what its parts scatter together by, which no eighty draws tell of 120 parts.
+_COMPARED, _COMMON = 50, 0.2
 #: Delays for which it is compared, in s.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 11)
+_NO_LAG = 5
 #: Draws of each round.
 _DRAWS: Final = (40, 40, 40)
 #: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
@@ -84,8 +88,8 @@ class Bounced:
     ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
     noise : (3,) standard deviation of the measurements
     distance : of the measured motion from the drawn ones near it, over that of drawn ones among themselves
-    path : mean square of how far the mean pose at each phase of the load is from what the drawn ones foretell, in
-        standard deviations: some 0.5 where the model is right
+    path : how far mean and scatter of the pose over the load's period are from what the drawn motions foretell, as a
+        normal deviate of how far the drawn ones are from what the others foretell
     """
 
     clearance: Array
@@ -197,19 +201,52 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
         (float(found.value[5]), float(found.deviation[5])),
         eye.noise,
         found.distance,
-        _off_path(eye, np.array(features)[:, 4:], np.array(paths), measured[4:]),
+        _off_path(eye.paths(eye.q), np.array(features)[:, 4:], paths, measured[4:]),
     )
 
 
-def _off_path(eye: _Eye, features: Array, paths: Array, measured: Array) -> float:
-    """Return how far the measured mean path is from the one that the drawn motions foretell; 0 without enough of it."""
-    there = np.isfinite(paths).all(axis=0) & np.isfinite(eye.path(eye.q))
+def _off_path(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
+    """Return how far off the measured path is among the drawn motions, a normal deviate; 0 without enough of it.
+
+    Each of the drawn motions near the measured one is compared with all others as that is: how far right models are off
+    is known then, whatever the contact, the noise and the length of the window.
+    """
+    # (n, lags, parts); stamps may be late or early: a delay is no other path
+    paths = np.array(drawn)
+    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
     if there.sum() < _PATH_PHASES:
         return 0.0
-    found = _regress(features, paths[:, there], measured, local=False)
-    # stamps may be late or early: a delay is no other path
-    off = [(eye.path(eye.q, lag_s)[there] - found.value) / found.deviation for lag_s in _LAGS_S]
-    return float(min(np.nanmean(one**2) for one in off))
+    paths, off = paths[:, :, there], _distance_of_paths(features, paths[:, :, there], measured, seen[:, there])
+    distance = (((features - measured) / (features.std(axis=0) + 1e-12)) ** 2).mean(axis=1)
+    others = []
+    for index in np.argsort(distance, kind="stable")[:_COMPARED]:
+        rest = np.arange(len(features)) != index
+        others.append(_distance_of_paths(features[rest], paths[rest], features[index], paths[index]))
+    ln_others = np.log(others)
+    return float((math.log(off) - ln_others.mean()) / ln_others.std(ddof=1))
+
+
+def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
+    """Return the mean square distance of a seen path (lags, k) from what the drawn ones (n, lags, k) foretell.
+
+    Weighed by the covariance of what the drawn ones leave over, for what the phases of a path have in common is no
+    more than one deviation (Mahalanobis); of its directions the variances are drawn to their mean (Ledoit and Wolf, J.
+    Multivar. Anal. 88 (2004) 365).
+    """
+    near = _Near.to(features, measured)
+    value, left = near.left_over(paths[:, _NO_LAG])
+    variance = (near.weight[:, None] * left**2).sum(axis=0) / near.weight.sum()
+    deviation = np.sqrt(variance * (1.0 + near.inverse[0, 0]))
+    left *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
+    common = left.T @ left
+    covariance = (1.0 - _COMMON) * common + _COMMON * np.trace(common) / len(common) * np.eye(len(common))
+    off = (seen - value) / deviation
+    product = off @ np.linalg.solve(covariance, off.T)
+    # between two lags the path is taken as a straight line
+    one, other, both = np.diag(product)[:-1], np.diag(product)[1:], np.diag(product, 1)
+    share = np.clip((one - both) / np.maximum(one + other - 2.0 * both, 1e-12), 0.0, 1.0)
+    square = (1.0 - share) ** 2 * one + 2.0 * share * (1.0 - share) * both + share**2 * other
+    return float(square.min() / seen.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,29 +256,59 @@ class _Regressed:
     distance: float
 
 
-def _regress(features: Array, targets: Array, measured: Array, local: bool = True) -> _Regressed:
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """What a regression on features among the nearest of n draws needs.
+
+    distance, weight : (n,) from what was measured, and how much a draw counts
+    scale : (m,) scatter of the features
+    basis, inverse : (n, m + 1), (m + 1, m + 1) of the normal equations
+    leverage : (n,)
+    """
+
+    distance: Array
+    weight: Array
+    scale: Array
+    basis: Array
+    inverse: Array
+    leverage: Array
+
+    @staticmethod
+    def to(features: Array, measured: Array) -> _Near:
+        scale = features.std(axis=0) + 1e-12
+        z = (features - measured) / scale
+        distance = (z * z).mean(axis=1)
+        weight = np.maximum(1.0 - distance / np.sort(distance)[int(_NEAR * len(distance))], 0.0)
+        basis = np.concatenate([np.ones((len(z), 1)), z], axis=1)
+        ridge = np.diag([0.0] + [_RIDGE] * z.shape[1])
+        inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
+        leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
+        return _Near(distance, weight, scale, basis, inverse, leverage)
+
+    def regress(self, targets: Array) -> tuple[Array, Array]:
+        """Return the targets (n, k) at what was measured, shape (k,), and what is left over of them."""
+        beta = self.inverse @ (self.basis.T @ (self.weight[:, None] * targets))
+        return beta[0], targets - self.basis @ beta
+
+    def left_over(self, targets: Array) -> tuple[Array, Array]:
+        """Return the same, of each draw as it would be foretold without it."""
+        value, error = self.regress(targets)
+        left: Array = error / (1.0 - np.minimum(self.leverage, 0.9))[:, None]
+        return value, left
+
+
+def _regress(features: Array, targets: Array, measured: Array) -> _Regressed:
     """Regress targets (n, k) on features (n, m), the nearest to what was measured most.
 
-    The deviations are those of a prediction at `measured`, which may lie at the edge of what was drawn; `local`: of
-    what scatters as it does there, else as it does among all that are near.
+    The deviations are those of a prediction at `measured`, which may lie at the edge of what was drawn.
     """
-    scale = features.std(axis=0) + 1e-12
-    z = (features - measured) / scale
-    distance = (z * z).mean(axis=1)
-    weight = np.maximum(1.0 - distance / np.sort(distance)[int(_NEAR * len(distance))], 0.0)
-    basis = np.concatenate([np.ones((len(z), 1)), z], axis=1)
-    ridge = np.diag([0.0] + [_RIDGE] * z.shape[1])
-    inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
-    beta = inverse @ (basis.T @ (weight[:, None] * targets))
-    leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
-    error = targets - basis @ beta
-    variance = (weight[:, None] * error**2).sum(axis=0) / (weight * (1.0 - np.minimum(leverage, 0.9))).sum()
-    if local:
-        variance = _scatter_at(basis, weight, error, leverage)
-    deviation = np.sqrt(variance * (1.0 + inverse[0, 0]))
-    between = ((features[:, None] - features[None]) ** 2 / scale**2).mean(axis=2)
+    near = _Near.to(features, measured)
+    value, error = near.regress(targets)
+    variance = _scatter_at(near.basis, near.weight, error, near.leverage)
+    deviation = np.sqrt(variance * (1.0 + near.inverse[0, 0]))
+    between = ((features[:, None] - features[None]) ** 2 / near.scale**2).mean(axis=2)
     nearest = np.sort(between, axis=1)[:, 1:6].mean(axis=1)
-    return _Regressed(beta[0], deviation, float(np.sort(distance)[:5].mean() / np.quantile(nearest, 0.95)))
+    return _Regressed(value, deviation, float(np.sort(near.distance)[:5].mean() / np.quantile(nearest, 0.95)))
 
 
 def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
@@ -291,19 +358,30 @@ class _Eye:
         if run is None:
             return None
         seen = self._seen(run.q, white)
-        return self.features(seen), self.path(seen)
+        return self.features(seen), self.paths(seen)
 
-    def path(self, q: Array, lag_s: float = 0.0) -> Array:
-        """Return the mean pose at each phase of the load, its mean taken away, shape (120,); NaN where unknown."""
+    def paths(self, q: Array) -> Array:
+        """Return the path for each of the lags, shape (11, 240)."""
+        return np.array([self._path(q, lag_s) for lag_s in _LAGS_S])
+
+    def _path(self, q: Array, lag_s: float) -> Array:
+        """Return mean pose, its mean taken away, and logarithm of the scatter at each phase of the load, shape (240,).
+
+        NaN where too few were measured. The scatter tells how fast bounces die out, which the mean does not.
+        """
         phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * _PATH_PHASES).astype(int) % _PATH_PHASES
-        out = np.full((_PATH_PHASES, 3), np.nan)
+        out = np.full((2, _PATH_PHASES, 3), np.nan)
         for i in range(3):
             there = self._there[:, i]
-            count = np.bincount(phase[there], minlength=_PATH_PHASES)
-            total = np.bincount(phase[there], q[there, i], minlength=_PATH_PHASES)
+            inside, value = phase[there], q[there, i] - q[there, i].mean()
+            count = np.bincount(inside, minlength=_PATH_PHASES)
             known = count >= _FEWEST_OF_PHASE
-            out[known, i] = total[known] / count[known]
-            out[:, i] -= out[known, i].mean() if known.any() else 0.0
+            if not known.any():
+                continue
+            mean = np.bincount(inside, value, _PATH_PHASES) / np.maximum(count, 1)
+            square = np.bincount(inside, (value - mean[inside]) ** 2, _PATH_PHASES) / np.maximum(count, 1)
+            out[0, known, i] = mean[known] - mean[known].mean()
+            out[1, known, i] = 0.5 * np.log(square[known] + _NO_SCATTER)
         return out.ravel()
 
     def _seen(self, q: Array, white: Array) -> Array:
