@@ -12,11 +12,12 @@ import llvmlite.binding as llvm
 import llvmlite.ir
 import numba
 import pytest
+from numba.core import postproc
 from numba.core.compiler import DefaultPassBuilder, Flags
 from numba.core.registry import cpu_target
 from numba.core.typing.context import Context
 
-from plow_twin.kernel.compiler import FASTMATH
+from plow_twin.kernel.compiler import FASTMATH, kernel
 from plow_twin.kernel.quick import UNUSED, QuickPasses, ask_llvm_once, caching_context, without_lock_events
 
 
@@ -83,6 +84,23 @@ def test_llvm_is_asked_once_for_the_size_of_a_type(monkeypatch: pytest.MonkeyPat
     pair = llvmlite.ir.LiteralStructType([llvmlite.ir.DoubleType()] * 2)
     assert [target.get_abi_sizeof(pair) for _ in range(3)] == [16] * 3
     assert len(asked) == 1
+
+
+def test_lifetimes_of_variables_are_found_once_a_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba finds them after each of six passes, and deletes variables after the last."""
+    found, lifetime = [], postproc.VariableLifetime
+    monkeypatch.setattr(postproc, "VariableLifetime", lambda blocks: found.append(len(blocks)) or lifetime(blocks))
+    monkeypatch.setattr(sum_to._cache, "load_overload", lambda signature, target: None)
+    assert sum_to(4) == 10
+    assert len(found) == 1
+
+
+@kernel(entry=True)
+def sum_to(n: int) -> int:
+    total = 0
+    for k in range(n + 1):
+        total += k
+    return total
 
 
 BLAS = (

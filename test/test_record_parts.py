@@ -162,6 +162,7 @@ def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Pa
     run.file.write_bytes(whole[:end] + whole[begin:end] + whole[end:])
     after, found = replay(run.folder), examine(run.folder)
     assert after.divergences == 0 and after.samples == before.samples and after.repeated == found.repeated > 0
+    assert after.inputs == before.inputs and before.inputs
     assert found.gaps == 0 and any("more than once" in problem for problem in found.problems)
 
 

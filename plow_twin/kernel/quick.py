@@ -1,20 +1,22 @@
 """Compile with less of numba's own work in Python, which is most of the time of compiling.
 
-Six means, none of which changes what numba makes of a kernel: the same types, the same code.
+Seven means, none of which changes what numba makes of a kernel: the same types, the same code.
 """
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any, Final
 
 import llvmlite.binding as llvm
 from numba.core import types
 from numba.core.compiler_machinery import PassManager
+from numba.core.postproc import PostProcessor
 from numba.core.registry import cpu_target
+from numba.core.transforms import canonicalize_cfg
 from numba.core.typing.context import Context
 from numba.np import linalg
 
@@ -39,6 +41,32 @@ UNUSED: Final = frozenset(
 )
 
 
+#: Passes after which numba finds the lifetime of each variable anew; only that of the last one is used.
+_WITHOUT_LIFETIMES: Final = frozenset(
+    {"DeadBranchPrune", "GenericRewrites", "InlineInlinables", "IRProcessing", "PreLowerStripPhis", "ReconstructSSA"}
+)
+
+
+@contextmanager
+def without_lifetimes() -> Iterator[None]:
+    """Leave out lifetimes where numba deletes no variable after it has found them."""
+    processor: Any = PostProcessor
+    find = processor.run
+
+    def run(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+        if emit_dels or self.func_ir.is_generator:
+            find(self, emit_dels, extend_lifetimes)
+            return
+        self.func_ir.blocks = canonicalize_cfg(self.func_ir.blocks)
+        self.func_ir.generator_info = None
+
+    processor.run = run
+    try:
+        yield
+    finally:
+        processor.run = find
+
+
 class QuickPasses(PassManager):
     """A pipeline of numba's without the passes that no kernel needs and without their events, which print all types."""
 
@@ -49,7 +77,8 @@ class QuickPasses(PassManager):
     def _runPass(self, index: int, pss: Any, internal_state: Any) -> None:
         pss.analysis = self._analysis
         pss.run_initialization(internal_state)
-        pss.run_pass(internal_state)
+        with without_lifetimes() if type(pss).__name__ in _WITHOUT_LIFETIMES else nullcontext():
+            pss.run_pass(internal_state)
         pss.run_finalizer(internal_state)
 
 

@@ -177,7 +177,6 @@ class _Replay:
         if batch.damaged:
             self.alarms.give_up()
         entries = batch.entries
-        self.inputs.add(entries)
         sent = SentMessages.of(batch.outputs, self.topics)
         count = len(entries)
         breaks = np.ones(count, bool)  # entries that no run goes on into
@@ -253,6 +252,7 @@ class _Replay:
             # a failed advance is no part of a publication
             self.session.restore(*before)
             return False
+        self.inputs.add(entries)
         self.report.entries += len(entries)
         self.report.samples += len(stamps)
         self.report.steps += len(stamps)
@@ -387,6 +387,7 @@ class _Replay:
         if 0 < (-missing & _SEQUENCE_MASK) <= self.in_a_row:  # it stands there once more
             self.report.repeated += 1
             return
+        self.inputs.add_entry(record.entry)
         if missing:
             self.in_a_row = 0
             self.gaps += missing
