@@ -94,6 +94,7 @@ class Probe:
         self.node = rclpy.create_node("probe", namespace=namespace, context=self.context)
         self._executor = EventsExecutor(context=self.context)
         self._executor.add_node(self.node)
+        self._clients: dict[str, Any] = {}
         self.status: list[DiagnosticStatus] = []
         self.reports: list[dict[str, DiagnosticStatus]] = []
         # deeper than the twin's own: what changes quickly is still seen
@@ -174,11 +175,13 @@ class Probe:
             self._executor.spin_once(timeout_sec=0.02)
 
     def call(self, kind: type, service: str, request: Any) -> Any:
-        client = self.node.create_client(kind, service)
+        # one client for all calls: an answer to one that the server has not discovered yet is lost
+        if service not in self._clients:
+            self._clients[service] = self.node.create_client(kind, service)
+        client = self._clients[service]
         self.until(client.service_is_ready, service)
         future = client.call_async(request)
         self.until(future.done, f"an answer of {service}", START_S)
-        self.node.destroy_client(client)
         return future.result()
 
     def close(self) -> None:
