@@ -80,17 +80,22 @@ def _second_guard(p, state, w, order, pair, viscous, hysteretic, integer, fracti
     return True
 
 
+@kernel(inline="code")
+def elastic_term(p, w, k, pair, integer, fraction):
+    """Return order k of d^n of a pair."""
+    if integer is not None:
+        return w.power[int(p.exponent) - 2, k, pair]
+    if fraction is not None:
+        return w.power[0, k, pair]
+    return w.penetration[k, pair]
+
+
 @kernel()
 def _pull(p, w, order, pair, mode, integer, fraction) -> None:
     """Write the force of a ramped law, negative for a clipped pair, to `w.column[0]`."""
     g, sign = w.column[0], 1.0 if mode == ON else -1.0
     for k in range(order):
-        if integer is not None:
-            elastic = w.power[int(p.exponent) - 2, k, pair]
-        elif fraction is not None:
-            elastic = w.power[0, k, pair]
-        else:
-            elastic = w.penetration[k, pair]
+        elastic = elastic_term(p, w, k, pair, integer, fraction)
         g[k] = sign * (p.stiffness * elastic + p.viscous * w.damped[k, pair])
 
 

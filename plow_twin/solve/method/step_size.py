@@ -8,6 +8,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.events import elastic_term
 from plow_twin.solve.grip import grip_guard
 from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
@@ -70,18 +71,19 @@ def before_sticking(p, state, w, order, sigma) -> float:
 
 
 @kernel()
-def before_pushing_again(p, state, w, order, sigma) -> float:
+def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
     """Return the part of `sigma` over which the ramped force of clipped pairs is accurate: it moves nothing yet.
 
     Only its guard looks at it, so nothing else shortens a step for it. The same root test as for what moves, of the
-    velocity that it would give; the force d^n has its branch point where the pair parts.
+    velocity that it would give; the share of C that acts is a cubic, whose series ends long after the penetration's,
+    and a force d^n has its branch point where the pair parts.
     """
     least = np.inf
     for pair in range(PAIR_COUNT):
         if state.mode[pair] != CLIPPED:
             continue
         for k in range(order - 1, order - 1 - p.lacuna, -1):
-            force = p.stiffness * w.power[0, k, pair] + p.viscous * w.damped[k, pair]
+            force = p.stiffness * elastic_term(p, w, k, pair, integer, fraction) + p.viscous * w.damped[k, pair]
             size = abs(force) * p.inverse_mass * (state.alpha + abs(state.beta)) / (k + 1)
             if size > 0.0:
                 least = min(least, math.log(p.threshold[k + 1] / size) / (k + 1))

@@ -32,8 +32,8 @@ def lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, pen
         return False
     if slip is not None:
         sigma = before_sticking(p, state, w, order, sigma)
-    if ramp is not None and fraction is not None and penetrating:
-        sigma = before_pushing_again(p, state, w, order, sigma)
+    if ramp is not None and penetrating:
+        sigma = before_pushing_again(p, state, w, order, sigma, terms.integer, fraction)
     if stick is not None and penetrating:
         state.sigma_end = sigma
         sigma = before_gripping(p, state, w, order, sigma)
