@@ -9,7 +9,21 @@ from dataclasses import replace
 import pytest
 from scenes import pose_error, preset, wall_and_point
 
-from plow_twin import ArgumentError, Contact, ContactLaw, SceneError, add_law, simulate
+from plow_twin import (
+    ArgumentError,
+    Clearance,
+    Contact,
+    ContactLaw,
+    Frame,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Scene,
+    SceneError,
+    add_law,
+    simulate,
+)
 from plow_twin.model import contact_laws
 from plow_twin.model.contact_laws import exact_damping_number
 
@@ -83,6 +97,24 @@ def test_a_clipped_pair_pushes_again_before_it_parts_at_every_tolerance() -> Non
     assert len(tight.events) == len(loose.events)
     clipped = tight.events["mode_from"] == 2
     assert clipped.sum() > 20 and (tight.events["mode_to"][clipped] == 1).all()
+
+
+def test_a_clipped_pair_does_not_push_before_its_time() -> None:
+    """Its force is a cubic of a penetration that leaves the ramp far behind, whose series ends late.
+
+    In steps as long as the motion allows it pushed, and pulled, too early: 28 tolerances off.
+    """
+    scene = Scene(
+        Head(9678.65468622175, 6223.158278044431), Frame(0.5358668741978295, 0.8164604022979493),
+        Clearance(0.0010744492074319203, 0.0013309842731401734),
+        Contact("ramped_damping", 39789124432.568474, damping=41315573.98844641, ramp_m=1.859904061158338e-06),
+        Gravity(9.81),
+        (Harmonic("swing", (136407.79207032567, 78091.2651934814), 2.13280634928262, 6.183084803690521, -11577.53909),),
+        Initial((0.0, 0.0, 0.0), (0.08018584619312634, 0.08016477931228669, -0.04463423756155122)),
+    )  # fmt: skip
+    exact = simulate(scene, 1.0, output_dt=0.005, tol=1e-12)
+    for tol in (1e-4, 1e-6, 1e-8, 1e-10):
+        assert pose_error(scene, simulate(scene, 1.0, output_dt=0.005, tol=tol).q, exact.q) < 0.1 * tol
 
 
 @pytest.mark.parametrize(

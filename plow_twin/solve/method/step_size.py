@@ -76,9 +76,10 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
 
     Only its guard looks at it, so nothing else shortens a step for it. The same root test as for what moves, of the
     velocity that it would give; the share of C that acts is a cubic, whose series ends long after the penetration's,
-    and a force d^n has its branch point where the pair parts.
+    and a force d^n has its branch point where the pair parts. The motion's own terms may have ended early: the test is
+    of as many orders as there are.
     """
-    least = np.inf
+    least, share = np.inf, math.log(p.threshold[p.order] / p.threshold[0]) / order
     for pair in range(PAIR_COUNT):
         if state.mode[pair] != CLIPPED:
             continue
@@ -86,7 +87,7 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
             force = p.stiffness * elastic_term(p, w, k, pair, integer, fraction) + p.viscous * w.damped[k, pair]
             size = abs(force) * p.inverse_mass * (state.alpha + abs(state.beta)) / (k + 1)
             if size > 0.0:
-                least = min(least, math.log(p.threshold[k + 1] / size) / (k + 1))
+                least = min(least, share + math.log(p.threshold[0] / size) / (k + 1))
     return min(sigma, math.exp(least))
 
 
