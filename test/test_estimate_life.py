@@ -168,6 +168,14 @@ def test_a_history_of_clearances_tells_the_coefficient(tmp_path: Path, capsys: p
     found = known.interval()
     assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
     assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
+    # the forecast goes on along the path, whose pads are not worn alike
+    assert known.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)
+    ahead = with_clearances(scene, *map(float, known.clearance), known.depth)
+    assert ahead.wear is not None and ahead.wear.initial_depth_m == pytest.approx(known.depth)
+    total = np.array([ahead.clearance.horizontal_m, ahead.clearance.vertical_m]) + 0.5 * np.array(
+        [known.depth @ np.abs(NORMAL_X), known.depth @ np.abs(NORMAL_Y)]
+    )
+    assert total == pytest.approx(known.clearance)
     # what is known narrows the forecast
     plan = Plan(0.030, 0.035, 1.0, load_deviation=0.0)
     prior, posterior = (forecast(scene, plan, known=knowledge) for knowledge in (None, known))

@@ -121,7 +121,7 @@ for day in np.linspace(0.0, DAYS, VISITS, endpoint=False):
     days, means, deviations = (np.array(column) for column in zip(*history, strict=True))
     known = coefficient(believed, History(days * DAY_M, means, deviations))
     interval = known.interval()
-    now = with_clearances(believed, *map(float, known.clearance))
+    now = with_clearances(believed, *map(float, known.clearance), known.depth)
     plan = Plan(*limits, horizon_h=4.0 * DAYS * DAY_M / SPEED_M_S / 3600.0)
     ahead = forecast(now, plan, (float(known.deviation[0]), float(known.deviation[1])), known)
     at = [

@@ -90,7 +90,7 @@ def forecast(
         else:
             known = coefficient(model, _history(history))
             low, high = (float(value) for value in known.deviation)
-            model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]))
+            model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]), known.depth)
             found = run(model, plan, (low, high), known)
             facts = found.as_dict()
             facts["coefficient_m2_n"] = asdict(known.interval())

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, Interval
+from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
@@ -59,12 +60,14 @@ class Coefficient:
 
     value, weight : (m,) k_s in m^2/N on a grid, and its probabilities
     clearance, deviation : (2,) in m
+    depth : (8,) of the pads in m, as the path of the history has it: they are not worn alike
     """
 
     value: Array
     weight: Array
     clearance: Array
     deviation: Array
+    depth: Array
 
     def interval(self) -> Interval:
         """Return median and 5 % and 95 % points in m^2/N."""
@@ -104,13 +107,15 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     most = math.exp(float(grid[-1])) * float(history.travel[-1]) / wear.pad_area_m2
     limit = first + _FURTHER * growth + _FURTHER_M
     path = wear_path(begin, (float(limit[0]), float(limit[1])), most)
-    likely, means = np.empty(len(grid)), np.empty((len(grid), 2))
+    likely, means, depths = np.empty(len(grid)), np.empty((len(grid), 2)), np.empty((len(grid), PAIR_COUNT))
     for index, ln_k in enumerate(grid):
         grown = _growth(path, math.exp(float(ln_k)) * history.travel / wear.pad_area_m2)
         start = (weight * (history.clearance - grown)).sum(axis=0) / weight.sum(axis=0)
         misfit = history.clearance - grown - start
         likely[index] = -0.5 * float((weight * misfit**2).sum() + ((ln_k - middle) / spread) ** 2)
         means[index] = start + grown[-1]
+        now = math.exp(float(ln_k)) * float(history.travel[-1]) / wear.pad_area_m2
+        depths[index] = [np.interp(now, path.exposure, pad) for pad in path.depth.T]
     share = np.exp(likely - likely.max())
     share /= share.sum()
     ends = np.exp(grid[[0, -1]])
@@ -119,9 +124,9 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
             f"history: got a growth that the prior of the coefficient does not allow, from {ends[0]:.2g} to "
             f"{ends[1]:.2g} m^2/N, expected a wider wear.prior_m2_n"
         )
-    now = share @ means
-    variance = share @ (means - now) ** 2 + 1.0 / weight.sum(axis=0)
-    return Coefficient(np.exp(grid), share, now, np.sqrt(variance))
+    clearance = share @ means
+    variance = share @ (means - clearance) ** 2 + 1.0 / weight.sum(axis=0)
+    return Coefficient(np.exp(grid), share, clearance, np.sqrt(variance), share @ depths)
 
 
 def _growth(path: Path, exposure: Array) -> Array:

@@ -263,21 +263,24 @@ def with_load(scene: Scene, multiple: float) -> Scene:
     )
 
 
-def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float) -> Scene:
+def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth: Array | None = None) -> Scene:
     """Return the scene with other clearances: those that were estimated, which hold all the wear there is.
 
-    With running-in the pads are as worn as the clearances have grown, for they no longer wear as new ones.
+    `depth`, shape (8,) in m, is by how much the pads are worn, where that is known: the clearances before it follow.
+    With running-in they are as worn as the clearances have grown, for they no longer wear as new ones.
     """
-    wear, clearance, grown = scene.wear, Clearance(horizontal_m, vertical_m), np.zeros(PAIR_COUNT)
+    wear, new = scene.wear, scene.clearance
     if wear is None:
-        return replace(scene, clearance=clearance)
-    if wear.running_in_ratio > 1.0:
-        new = scene.clearance
-        clearance = Clearance(min(horizontal_m, new.horizontal_m), min(vertical_m, new.vertical_m))
-        # half of the growth at either of two walls
-        grown += 0.5 * (horizontal_m - clearance.horizontal_m) * np.abs(NORMAL_X)
-        grown += 0.5 * (vertical_m - clearance.vertical_m) * np.abs(NORMAL_Y)
-    return replace(scene, clearance=clearance, wear=replace(wear, initial_depth_m=tuple(grown.tolist())))
+        return replace(scene, clearance=Clearance(horizontal_m, vertical_m))
+    if depth is None:
+        depth = np.zeros(PAIR_COUNT)
+        if wear.running_in_ratio > 1.0:
+            # half of the growth at either of two walls
+            depth += 0.5 * max(horizontal_m - new.horizontal_m, 0.0) * np.abs(NORMAL_X)
+            depth += 0.5 * max(vertical_m - new.vertical_m, 0.0) * np.abs(NORMAL_Y)
+    grown = 0.5 * depth @ np.abs(NORMAL_X), 0.5 * depth @ np.abs(NORMAL_Y)
+    clearance = Clearance(horizontal_m - float(grown[0]), vertical_m - float(grown[1]))
+    return replace(scene, clearance=clearance, wear=replace(wear, initial_depth_m=tuple(depth.tolist())))
 
 
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
