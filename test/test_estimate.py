@@ -185,7 +185,7 @@ def test_how_far_off_a_path_is_is_told_by_the_drawn_ones() -> None:
     right, wrong = [], []
     for _ in range(16):
         features, paths = run(90)
-        drawn = [np.tile(path, (11, 1)) for path in paths]
+        drawn = [np.tile(path, (9, 1)) for path in paths]
         (measured,), (path,) = run(1, 0.5)
         right.append(_off_path(np.tile(path, (11, 1)), features, drawn, measured))
         wrong.append(_off_path(np.tile(path + across, (11, 1)), features, drawn, measured))

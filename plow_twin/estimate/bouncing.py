@@ -50,9 +50,11 @@ _PATH_PHASES, _FEWEST_OF_PHASE = 40, 9
 #: Draws near the measured motion that are compared with the others as it is; share of the variance common to all
 #: parts of a path in what its parts scatter together by, which no eighty draws tell of 120 parts.
 _COMPARED, _COMMON = 50, 0.2
-#: Delays for which it is compared, in s.
-_LAGS_S: Final = np.linspace(-0.1, 0.1, 11)
-_NO_LAG = 5
+#: Delays for which the measured path is compared, and drawn ones, in s; the scatter where a bounce begins is another
+#: one some milliseconds on.
+_LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
+_OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
+_NO_LAG = 4
 #: Draws of each round.
 _DRAWS: Final = (40, 40, 40)
 #: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
@@ -201,7 +203,7 @@ def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, s
         (float(found.value[5]), float(found.deviation[5])),
         eye.noise,
         found.distance,
-        _off_path(eye.paths(eye.q), np.array(features)[:, 4:], paths, measured[4:]),
+        _off_path(eye.paths(eye.q, _LAGS_S), np.array(features)[:, 4:], paths, measured[4:]),
     )
 
 
@@ -241,11 +243,7 @@ def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Arr
     common = left.T @ left
     covariance = (1.0 - _COMMON) * common + _COMMON * np.trace(common) / len(common) * np.eye(len(common))
     off = (seen - value) / deviation
-    product = off @ np.linalg.solve(covariance, off.T)
-    # between two lags the path is taken as a straight line
-    one, other, both = np.diag(product)[:-1], np.diag(product)[1:], np.diag(product, 1)
-    share = np.clip((one - both) / np.maximum(one + other - 2.0 * both, 1e-12), 0.0, 1.0)
-    square = (1.0 - share) ** 2 * one + 2.0 * share * (1.0 - share) * both + share**2 * other
+    square = np.einsum("ki,ik->k", off, np.linalg.solve(covariance, off.T))
     return float(square.min() / seen.shape[1])
 
 
@@ -337,6 +335,8 @@ class _Eye:
         self.q = filled(poses)
         self.noise = noise_level(self.q)
         self._period = period
+        #: until then a motion forgets where it began, which a delay makes another place
+        self._settled = poses.t - poses.t[0] >= period
         self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * _PHASES).astype(int), _PHASES - 1)
 
     def look(
@@ -358,11 +358,11 @@ class _Eye:
         if run is None:
             return None
         seen = self._seen(run.q, white)
-        return self.features(seen), self.paths(seen)
+        return self.features(seen), self.paths(seen, _OF_DRAWN_S)
 
-    def paths(self, q: Array) -> Array:
-        """Return the path for each of the lags, shape (11, 240)."""
-        return np.array([self._path(q, lag_s) for lag_s in _LAGS_S])
+    def paths(self, q: Array, lags_s: Array) -> Array:
+        """Return the path for each of some lags, shape (lags, 240)."""
+        return np.array([self._path(q, lag_s) for lag_s in lags_s])
 
     def _path(self, q: Array, lag_s: float) -> Array:
         """Return mean pose, its mean taken away, and logarithm of the scatter at each phase of the load, shape (240,).
@@ -372,12 +372,13 @@ class _Eye:
         phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * _PATH_PHASES).astype(int) % _PATH_PHASES
         out = np.full((2, _PATH_PHASES, 3), np.nan)
         for i in range(3):
-            there = self._there[:, i]
-            inside, value = phase[there], q[there, i] - q[there, i].mean()
+            there = self._there[:, i] & self._settled
+            inside = phase[there]
             count = np.bincount(inside, minlength=_PATH_PHASES)
             known = count >= _FEWEST_OF_PHASE
             if not known.any():
                 continue
+            value = q[there, i] - q[there, i].mean()
             mean = np.bincount(inside, value, _PATH_PHASES) / np.maximum(count, 1)
             square = np.bincount(inside, (value - mean[inside]) ** 2, _PATH_PHASES) / np.maximum(count, 1)
             out[0, known, i] = mean[known] - mean[known].mean()
