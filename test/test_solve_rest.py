@@ -27,9 +27,9 @@ def fallen(law: str = "kelvin_voigt") -> Scene:
     return scene
 
 
-def humming(force: float, omega: float) -> Scene:
+def fallen_under_a_harmonic(force: float, omega: float) -> Scene:
     """The same under a harmonic besides its weight; at 23.2 rad/s the head on its three pairs resonates."""
-    return dataclasses.replace(fallen(), loads=(Harmonic("hum", (force, 0.3 * force), omega, 0.3, 0.1 * force),))
+    return dataclasses.replace(fallen(), loads=(Harmonic("small", (force, 0.3 * force), omega, 0.3, 0.1 * force),))
 
 
 def static_pose(scene: Scene, guess: np.ndarray) -> np.ndarray:
@@ -122,9 +122,10 @@ def test_a_twin_at_rest_is_asked_saved_and_restored_without_a_trace() -> None:
 def test_rest_is_compiled_only_where_it_can_be() -> None:
     scene = fallen()
     driven = dataclasses.replace(scene, loads=(Harmonic("shake", (1e3, 0.0), 5.0),))
-    undamped = dataclasses.replace(humming(1e-6, 5.0), contact=dataclasses.replace(scene.contact, damping=0.0))
+    shaken = fallen_under_a_harmonic(1e-6, 5.0)
+    undamped = dataclasses.replace(shaken, contact=dataclasses.replace(scene.contact, damping=0.0))
     worn = dataclasses.replace(scene, wear=Wear(1e-12, 0.015, 2.0))
-    cases = scene, humming(1e-6, 5.0), driven, undamped, worn
+    cases = scene, shaken, driven, undamped, worn
     assert [compile_scene(one, 1e-9).parts.terms.rest for one in cases] == [1, 1, None, None, None]
 
 
@@ -141,11 +142,11 @@ def test_a_harmonic_that_cannot_be_seen_lets_the_head_rest(
     force: float, omega: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The way it moves the head is below a thousandth of the tolerance: proved beforehand, seen with rest left out."""
-    tol, scene = 1e-6, humming(force, omega)
+    tol, scene = 1e-6, fallen_under_a_harmonic(force, omega)
     rested = simulate(scene, 400.0, 0.317, tol=tol)
     assert rested.solver["steps"] == simulate(scene, 200.0, tol=tol).solver["steps"] + 2
-    larger = simulate(humming(1e3 * force, omega), 60.0, 0.317, tol=tol)
-    monkeypatch.setattr(compiled_scene, "_only_hums", lambda *arguments: False)
+    larger = simulate(fallen_under_a_harmonic(1e3 * force, omega), 60.0, 0.317, tol=tol)
+    monkeypatch.setattr(compiled_scene, "_harmonics_are_small", lambda *arguments: False)
     followed = simulate(scene, 400.0, 0.317, tol=tol)
     assert followed.solver["steps"] > 4 * rested.solver["steps"]
     way = tol * geometry.length_scale(scene)
@@ -163,5 +164,5 @@ def test_loose_tolerances_find_the_same_rest() -> None:
 
 def test_a_load_that_is_nothing_does_not_keep_a_head_awake() -> None:
     still = fallen()
-    hum = dataclasses.replace(still, loads=(*still.loads, Harmonic("nothing", (0.0, 0.0), 2.0)))
-    assert simulate(hum, 1000.0).solver == simulate(still, 1000.0).solver
+    silent = dataclasses.replace(still, loads=(*still.loads, Harmonic("nothing", (0.0, 0.0), 2.0)))
+    assert simulate(silent, 1000.0).solver == simulate(still, 1000.0).solver

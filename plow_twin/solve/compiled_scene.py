@@ -48,8 +48,8 @@ LARGEST_STEP_ERROR = 1e-6
 STEP_SHARE_FRACTION = 1e-6
 #: Mode changes at one instant before the solver goes on past it.
 MAX_EVENTS_AT_ONCE = 64
-#: Harmonics up to this share of what presses the head against its walls may let it rest (`method.hum`).
-_HUM = 1e-2
+#: Harmonics up to this share of what presses the head against its walls may let it rest (`method.small_harmonics`).
+_SMALL_HARMONICS = 1e-2
 
 _NO_TERMS = Terms(*[None] * len(Terms._fields))
 
@@ -176,7 +176,7 @@ def _scene_terms(
     if present["harmonics"]:
         # nothing but damping keeps a harmonic from swinging the head up
         damped = law.viscous is not None or law.hysteretic is not None
-        present["rest"] &= damped and present["flight"] and _only_hums(scene, loads)
+        present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads)
     return law._replace(**_flags(present))
 
 
@@ -186,7 +186,7 @@ def _wear_terms(wear: Wear | None) -> dict[str, bool]:
     return {"wear": True, "sliding": wear.sliding == "total", "running_in": wear.running_in_ratio > 1.0}
 
 
-def _only_hums(scene: Scene, loads: LoadSet) -> bool:
+def _harmonics_are_small(scene: Scene, loads: LoadSet) -> bool:
     """Tell whether the harmonics are small beside what may press the head against its walls: steady loads, preload."""
     mass, contact = scene.head.mass_kg, scene.contact
     arms = np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
@@ -194,7 +194,7 @@ def _only_hums(scene: Scene, loads: LoadSet) -> bool:
     if loads.pieces is not None:
         pressing += float(np.abs(loads.pieces.start).max(axis=0) @ arms)
     pressing += contact.stiffness * _initial_depth(scene) ** contact.exponent
-    return bool(np.hypot(loads.sine, loads.cosine).sum(axis=0) @ arms <= _HUM * pressing)
+    return bool(np.hypot(loads.sine, loads.cosine).sum(axis=0) @ arms <= _SMALL_HARMONICS * pressing)
 
 
 def _initial_depth(scene: Scene) -> float:

@@ -3,7 +3,7 @@
 With constant loads and nothing else that drives it, the sum of kinetic and potential energy cannot grow. Where the
 stiffness is positive definite it bounds for all time how far the head can get from its equilibrium. Once that is far
 below the tolerance the head is put there, and steps are as long as they may be. Harmonics may act that move the head no
-farther than that (`hum`).
+farther than that (`small_harmonics`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.dynamics import accelerate, acting
 from plow_twin.solve.kinematics import penetration_of, to_body, to_world
 from plow_twin.solve.method.equilibrium import held, stiffer_than, stiffness_at, to_equilibrium
-from plow_twin.solve.method.hum import HUM, hums_on, without_harmonics
+from plow_twin.solve.method.small_harmonics import EVALUATIONS, stays_at_rest, without_harmonics
 from plow_twin.solve.state import OMEGA, ON, VX, VY
 
 #: Share of the tolerances that the motion left out may reach.
@@ -27,7 +27,7 @@ _MARGIN = 10.0
 #: And at least so deep in m, for the differences that give the stiffness.
 _DEEP = 1e-7
 #: Evaluations of the equations of motion that it takes to tell, at most.
-AT_REST = 5 + HUM
+AT_REST = 5 + EVALUATIONS
 
 
 @kernel()
@@ -50,7 +50,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
     if not (2.0 * energy < fast * fast and stiffer_than(w.hessian, 2.0 * energy / (way * way))):
         return False
     if harmonics is not None:
-        return hums_on(p, acts, harmonics, state, w, math.sqrt(energy), way, fast, gyration)
+        return stays_at_rest(p, acts, harmonics, state, w, math.sqrt(energy), way, fast, gyration)
     return True
 
 

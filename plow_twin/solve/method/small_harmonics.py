@@ -30,7 +30,7 @@ from plow_twin.solve.state import ON, X, Y
 #: Halvings after which an eigenvalue counts as zero.
 _HALVINGS = 40
 #: Evaluations of the equations of motion that it takes to tell.
-HUM = 4
+EVALUATIONS = 4
 
 
 @kernel()
@@ -131,7 +131,7 @@ def _left_out(p, state, w, reach, rate, gyration) -> float:
 
 
 @kernel()
-def hums_on(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
+def stays_at_rest(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
     """Tell whether the head stays within `way` of its equilibrium, and slower than `fast`, for all time.
 
     `distance` is sqrt(W) of the head now, were there no harmonics; `w.hessian` has its stiffness.
