@@ -84,7 +84,7 @@ def one_life(seed: int) -> list[dict[str, Any]]:
             np.full(true.shape, NOISE),
         )
         known = coefficient(scene, history)
-        now = with_clearances(scene, *map(float, known.clearance), known.depth)
+        now = with_clearances(scene, float(known.clearance[0]), float(known.clearance[1]), known.depth)
         plan = Plan(*limits(scene), horizon_h=50.0 * hours, draws=2000, seed=seed)
         found = np.sort(forecast(now, plan, (float(known.deviation[0]), float(known.deviation[1])), known).hours)
         left = (1.0 - share) * hours
