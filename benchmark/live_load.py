@@ -175,12 +175,16 @@ def measure(answerer: list[str], rate_hz: float, seconds: float) -> dict[str, fl
     """Run one answerer under one rate; return what was sent, used and lost, its CPU, and the age at a subscriber."""
     with running(answerer) as (probe, process_id):
         sender, ages, figures = source(rate_hz, seconds), probe.ages, probe.figures
-        probe.spin(lambda: bool(ages) or figures.get("samples_used", "0") != "0", 30.0)
-        busy, begin = _cpu_s(process_id), time.monotonic()
-        probe.spin(lambda: False, 1.0)
-        first_s = max(ages, default=0.0)
-        probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
-        share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
+        try:
+            probe.spin(lambda: bool(ages) or figures.get("samples_used", "0") != "0", 30.0)
+            busy, begin = _cpu_s(process_id), time.monotonic()
+            probe.spin(lambda: False, 1.0)
+            first_s = max(ages, default=0.0)
+            probe.spin(lambda: sender.poll() is not None, seconds + 30.0)
+            share = (_cpu_s(process_id) - busy) / (time.monotonic() - begin)
+        finally:
+            sender.kill()  # one that has found nobody to send to would send to the next
+            sender.wait()
         figures.pop("samples_used", None)
         if "published" in figures:
             probe.spin(lambda: "samples_used" in figures, 5.0)
