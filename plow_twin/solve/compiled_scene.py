@@ -199,6 +199,8 @@ def _harmonics_are_small(scene: Scene, loads: LoadSet) -> bool:
 
 def _initial_depth(scene: Scene) -> float:
     """Return the penetration in m of the pair that is deepest at the start, at least 0."""
+    if not any(scene.initial.q):
+        return 0.0  # centred: no wall is reached
     y = geometry.body_state(scene.initial.q, scene.initial.v, scene.head.com_offset_m)
     rows = geometry.penetration_rows(scene)
     return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)

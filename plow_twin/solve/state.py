@@ -221,11 +221,6 @@ WORK: Final = np.dtype(
         ("damped", "f8", _WIDE),  # ramped damping: the ramp times the rate; other laws: not written
         ("force", "f8", _WIDE),
         ("wear", "f8", _WIDE),  # growth of the wear depth
-        (
-            "rub",
-            "f8",
-            (6, *_WIDE),
-        ),  # wear: sliding s' / v, way per travel, force times it; running-in, what it is made of
         ("guard", "f8", _WIDE),
         ("bernstein", "f8", _WIDE),
         ("power", "f8", (4, *_WIDE)),  # powers of the penetration
@@ -251,11 +246,12 @@ WORK: Final = np.dtype(
         ("flight", "f8", (6, 6)),  # start of a flight, what bounds it, scratch (`solve.method.flight`)
         ("rest", "f8", (4, 6)),  # place, rates and load at rest (`solve.method.rest`)
         ("hessian", "f8", (3, 3)),
-        ("damping", "f8", (3, 3)),
         ("term_size", "f8", (_ROWS,)),  # size of each order as a velocity
         ("decay", "f8", (1,)),  # rate in 1/s at which damping decays, 0 where it does not bound steps
         ("switch", "i8", (PAIR_COUNT,)),  # modes that pairs take at the step's end, -1 for no change
         ("inverse", "f8", (_ROWS + 2,)),  # 1/k
+        ("damping", "f8", (3, 3)),  # by rate, at rest under harmonics
+        ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, way per travel, force times it; running-in and its factors
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
     ]
 )
