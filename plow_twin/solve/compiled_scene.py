@@ -145,7 +145,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
-    for name, value in (values | _rubbing(scene.wear) | _slip(scene) | _frame(scene)).items():
+    for name, value in (values | _rubbing(scene) | _slip(scene) | _frame(scene)).items():
         params[name] = value
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
@@ -338,10 +338,11 @@ def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
     return new_implicit(scene.support is not None) if overdamped else None
 
 
-def _rubbing(wear: Wear | None) -> dict[str, Any]:
+def _rubbing(scene: Scene) -> dict[str, Any]:
     """Return what wear depends on beside force and travel (`solve.rubbing`); for what is off nothing but zeros."""
-    there, found = _wear_terms(wear), dict[str, Any]()
+    wear, there, found = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
     if wear is not None and there.get("sliding"):
+        found["slip_rows"] = geometry.slip_rows(scene)
         found["speed_per_wear"] = wear.pad_area_m2 / wear.coefficient_m2_n
     if wear is not None and there.get("running_in") and wear.running_in_depth_m is not None:
         found |= {"running_in": wear.running_in_ratio - 1.0, "running_in_rate": 1.0 / wear.running_in_depth_m}
@@ -349,11 +350,12 @@ def _rubbing(wear: Wear | None) -> dict[str, Any]:
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return what friction needs; without it places along the walls, and a speed to divide by."""
-    friction, along = scene.friction, {"slip_rows": geometry.slip_rows(scene), "slip_speed": 1.0}
+    """Return what friction needs; without it nothing but a speed to divide by, for scenes that run together."""
+    friction = scene.friction
     if friction is None:
-        return along
-    return along | dict(
+        return {"slip_speed": 1.0}
+    return dict(
+        slip_rows=geometry.slip_rows(scene),
         slip_arm_rows=geometry.slip_arm_rows(scene),
         friction=friction.coefficient,
         slip_speed=friction.regularisation_speed_m_s,
