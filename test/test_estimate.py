@@ -18,6 +18,7 @@ from test_study_analysis import BIAS, LAG_S, motion, write_bag
 from plow_twin import Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate import estimate as estimating
 from plow_twin.estimate.answer import followed
+from plow_twin.estimate.arrow import Arrow
 from plow_twin.estimate.bouncing import Bounced, _off_path, _regress, bias_of_hard
 from plow_twin.estimate.estimate import _with_gaps, estimate, summarise_bounced
 from plow_twin.estimate.fit import link_weights
@@ -576,6 +577,24 @@ def test_links_weigh_what_white_noise_of_acceleration_adds() -> None:
     for axis, density in enumerate(drift):
         covariance = np.linalg.inv(weights[np.ix_([axis, axis + 3], [axis, axis + 3])])
         assert covariance == pytest.approx(np.cov(added.T) * density, rel=0.05)
+
+
+@pytest.mark.parametrize("swings", [1, 2, 9])
+def test_the_normal_equations_of_linked_swings_are_solved_as_dense_ones_are(swings: int) -> None:
+    rng = np.random.default_rng(swings)
+    arrow, size = Arrow.empty(3, swings), 3 + 6 * swings
+    dense = np.zeros((size, size))
+    for swing, count in [(one, 6) for one in range(swings)] + [(one, 12) for one in range(swings - 1)]:
+        rows = rng.standard_normal((30, 3 + count))
+        arrow.add(swing, rows.T @ rows)
+        places = np.concatenate([np.arange(3), 3 + 6 * swing + np.arange(count)])
+        dense[np.ix_(places, places)] += rows.T @ rows
+    assert arrow.diagonal() == pytest.approx(np.diag(dense))
+    more, right = rng.random(size), rng.standard_normal((size, 2))
+    factor = arrow.plus(more).factorised()
+    inverse = np.linalg.inv(dense + np.diag(more))
+    assert factor.solve(right) == pytest.approx(inverse @ right, rel=1e-9, abs=1e-12)
+    assert factor.covariance() == pytest.approx(inverse[:3, :3], rel=1e-9, abs=1e-12)
 
 
 def test_a_rough_load_costs_little_accuracy() -> None:

@@ -396,7 +396,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
     size, not with its root. The step that a fit would still take is no part of what it knows.
     """
     size = len(fit.shared)
-    plain = fit.covariance[:size, :size]
+    plain = fit.covariance
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(plain)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else UNFINISHED)

@@ -14,14 +14,15 @@ Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteor
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, pairwise
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, SIZE, Unknowns
@@ -106,19 +107,30 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the normal equations: places among the unknowns (k,), rows and weighted rows (m, k), residuals (m,)."""
+    """A part of the normal equations: the shared unknowns and those of some swings in a row, from `swing` on.
 
-    places: NDArray[np.intp]
+    rows, weighted : (m, 17) or (m, 23)
+    residual : (m,)
+    """
+
+    swing: int
     rows: Array
     weighted: Array
     residual: Array
+
+    @property
+    def own(self) -> slice:
+        """Places of the swings' unknowns among all."""
+        first = SIZE + OWN * self.swing
+        return slice(first, first + self.rows.shape[1] - SIZE)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
     """The best point, its covariance and what is left over.
 
-    covariance : (11 + 6 s, 11 + 6 s)
+    covariance : (11, 11) of the shared unknowns
+    factor : the factorised normal equations of all unknowns
     noise : (3,) standard deviation of the measurements
     variance : (n, 3) variance of each measurement as weighted
     jitter : (n, 3) variance of what cannot be foretold
@@ -129,6 +141,7 @@ class Fit:
 
     point: Point
     covariance: Array
+    factor: Factor
     noise: Array
     variance: Array
     jitter: Array
@@ -154,7 +167,7 @@ class Fit:
     @property
     def deviation(self) -> Array:
         """Standard deviations of the shared unknowns, shape (11,)."""
-        deviation: Array = np.sqrt(np.diag(self.covariance)[:SIZE])
+        deviation: Array = np.sqrt(np.diag(self.covariance))
         return deviation
 
 
@@ -228,7 +241,7 @@ class Problem:
 
     def linearise(self, point: Point) -> Linear:
         """Return the Jacobians of the prediction and of the ends of the swings."""
-        rows, ends = np.zeros((len(point.residual), 3, SIZE + 6)), np.zeros((len(point.defect), 6, SIZE + 6))
+        rows, ends = np.zeros((len(point.residual), 3, SIZE + OWN)), np.zeros((len(point.defect), 6, SIZE + OWN))
         for j in (j for j in MOVING if j != DAMPING or self.unknowns.damped):
             rows[:, :, j], ends[:, :, j] = self._quotient(point, j)
         rows[:, :, BIAS] = np.eye(3)
@@ -305,53 +318,52 @@ def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations
     variance = noise**2 + JITTER_WEIGHT * jitter
     point.cost = problem.cost(point, variance)
     normal, gradient = normal_equations(problem, point, linear, variance)
-    covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
-    left = covariance @ gradient
+    factor = normal.factorised()
+    left = factor.solve(gradient)
     gain_left = float(gradient @ left)
-    return Fit(point, covariance, noise, variance, jitter, linear, left, gain_left, done, converged)
+    return Fit(point, factor.covariance(), factor, noise, variance, jitter, linear, left, gain_left, done, converged)
 
 
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
     """Yield for each swing what its measurements and its link to the next swing add to the normal equations."""
     z = np.abs(point.residual) / np.sqrt(variance)
     weight = np.nan_to_num(np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / variance) * np.isfinite(point.residual)
-    residual = np.nan_to_num(point.residual)
-    shared = np.arange(SIZE)
-    for index in range(problem.window.swings):
-        inside = point.swing == index
-        rows = linear.rows[inside].reshape(-1, SIZE + 6)
-        places = np.concatenate([shared, SIZE + 6 * index + np.arange(6)])
-        found = [Piece(places, rows, rows * weight[inside].reshape(-1, 1), residual[inside].ravel())]
+    weighted, residual = linear.rows * weight[:, :, None], np.nan_to_num(point.residual)
+    # times rise, so a swing's rows lie together
+    used = np.flatnonzero(point.swing >= 0)
+    edges = np.searchsorted(point.swing[used], np.arange(problem.window.swings + 1))
+    for index, (low, high) in enumerate(pairwise(edges.tolist())):
+        inside = slice(used[low], used[high - 1] + 1) if low < high else slice(0)
+        rows, own = linear.rows[inside].reshape(-1, SIZE + OWN), weighted[inside].reshape(-1, SIZE + OWN)
+        found = [Piece(index, rows, own, residual[inside].ravel())]
         if index < len(problem.link):
-            rows = np.hstack((-linear.ends[index], np.eye(6)))
-            places = np.concatenate([shared, SIZE + 6 * index + np.arange(12)])
-            found.append(Piece(places, rows, problem.link[index] @ rows, -point.defect[index]))
+            rows = np.hstack((-linear.ends[index], np.eye(OWN)))
+            found.append(Piece(index, rows, problem.link[index] @ rows, -point.defect[index]))
         yield found
 
 
-def normal_equations(problem: Problem, point: Point, linear: Linear, variance: Array) -> tuple[Array, Array]:
+def normal_equations(problem: Problem, point: Point, linear: Linear, variance: Array) -> tuple[Arrow, Array]:
     """Return the matrix and the right-hand side of the normal equations, prior included."""
     swings = problem.window.swings
-    size = SIZE + 6 * swings
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
-    for piece in itertools.chain.from_iterable(pieces(problem, point, linear, variance)):
-        normal[np.ix_(piece.places, piece.places)] += piece.weighted.T @ piece.rows
-        gradient[piece.places] += piece.weighted.T @ piece.residual
-    diagonal = np.diag_indices(size)
-    normal[diagonal] += np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / _START_SPREAD**2, swings)])
+    normal, gradient = Arrow.empty(SIZE, swings), np.zeros(SIZE + OWN * swings)
+    for piece in chain.from_iterable(pieces(problem, point, linear, variance)):
+        normal.add(piece.swing, piece.weighted.T @ piece.rows)
+        right = piece.weighted.T @ piece.residual
+        gradient[:SIZE] += right[:SIZE]
+        gradient[piece.own] += right[SIZE:]
     gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2
     gradient[SIZE:] += ((problem.window.states - point.states) / _START_SPREAD**2).ravel()
-    return normal, gradient
+    return normal.plus(np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / _START_SPREAD**2, swings)])), gradient
 
 
 def _descend(
-    problem: Problem, point: Point, variance: Array, normal: Array, gradient: Array, damping: float
+    problem: Problem, point: Point, variance: Array, normal: Arrow, gradient: Array, damping: float
 ) -> tuple[Point | None, float]:
     """Return the next point, or None where no step gains, and the damping for the next step."""
-    scale = np.diag(normal)
+    scale = normal.diagonal()
     deviations = np.concatenate([problem.deviation, np.tile(_START_SPREAD, problem.window.swings)])
     for _ in range(6):
-        step = np.linalg.solve(normal + damping * np.diag(scale), gradient)
+        step = normal.plus(damping * scale).factorised().solve(gradient)
         step *= min(1.0, _LONGEST_STEP / max(np.abs(step / deviations)[:SIZE].max(), 1e-12))
         step = np.clip(step, -deviations, deviations)
         shared = problem.unknowns.within(point.shared + step[:SIZE])
@@ -379,7 +391,7 @@ def unforeseen(problem: Problem, point: Point, jacobian: Array, seed: int, probe
         other = problem.evaluate(shared, point.states + states)
         if other is None:
             continue
-        change = np.zeros((len(inside), SIZE + 6))
+        change = np.zeros((len(inside), SIZE + OWN))
         change[:, :SIZE] = shared - point.shared
         change[inside, SIZE:] = states[point.swing[inside]]
         error = point.residual - other.residual - np.einsum("nij,nj->ni", jacobian, change)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,7 @@ class Forward:
         self._knots = pieces.knots
         self._scene, self._load = scene, load
         self._work, self._log = new_work(), np.zeros(_LOG_SIZE, EVENT)
+        self._last: tuple[Scene, tuple[bytes, bytes | None], Any, Any] | None = None
         #: work done so far, in steps of the series
         self.work = 0
 
@@ -93,12 +95,7 @@ class Forward:
         Motions or None
             None where the head leaves the model's range.
         """
-        segments = np.zeros(len(self._knots), SEGMENT)
-        segments["knot"] = self._knots
-        segments["start"], segments["slope"] = self._start * gain, self._slope * gain
-        compiled = compile_scene(scene, TOLERANCE, sampled=True)
-        if depth is not None:
-            compiled.params["penetration_rows"][4] -= depth
+        params, segments = self._compiled(scene, gain, depth)
         records = new_records(state_type(self._terms), len(starts))
         records["y"] = _bodies(states, scene.head.com_offset_m)
         if self._terms.hysteretic is not None:
@@ -111,12 +108,26 @@ class Forward:
         budgets = (_STEPS_PER_SECOND * spans).astype(np.int64) + _STEPS
         parts = Parts(self._terms, None, segments, self._implicit)
         code = run_restarts(
-            compiled.params, parts, records, self._work, totals, self._log, edges, budgets, times, q, v
+            params, parts, records, self._work, totals, self._log, edges, budgets, times, q, v
         )  # fmt: skip
         self.work += int(records["steps"].sum()) + _IMPLICIT_WORK * int(records["implicit_steps"].sum())
         if code != Status.OK or not np.isfinite(q).all():
             return None
         return Motions(q, v, np.array(totals["time_in_contact"]))
+
+    def _compiled(self, scene: Scene, gain: Array, depth: Array | None) -> tuple[Any, Any]:
+        """Return parameters and segments of the load; many runs in a row differ by their states alone."""
+        others = gain.tobytes(), None if depth is None else depth.tobytes()
+        if self._last is not None and self._last[:2] == (scene, others):
+            return self._last[2:]
+        segments = np.zeros(len(self._knots), SEGMENT)
+        segments["knot"] = self._knots
+        segments["start"], segments["slope"] = self._start * gain, self._slope * gain
+        params = compile_scene(scene, TOLERANCE, sampled=True).params
+        if depth is not None:
+            params["penetration_rows"][4] -= depth
+        self._last = scene, others, params, segments
+        return params, segments
 
 
 def _bodies(states: Array, offset: tuple[float, float]) -> Array:

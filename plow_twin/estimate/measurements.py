@@ -243,21 +243,30 @@ class Load:
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        stack = [(0, len(rows) - 1, np.inf)]
-        while stack:
-            left, right, least = stack.pop()
-            if right - left < 2:
-                continue
-            part = slice(left + 1, right)
-            along = ((self.t[part] - self.t[left]) / (self.t[right] - self.t[left]))[:, None]
-            error = np.abs(rows[part] - rows[left] - along * (rows[right] - rows[left])).max(axis=1)
-            worst = int(np.argmax(error))
-            # what is within a part that is left out is left out
-            least = min(least, float(error[worst]))
-            if least > share:
-                middle = left + 1 + worst
-                out[middle] = least
-                stack += [(left, middle, least), (middle, right, least)]
+        # all lines of one generation at once; what is within a line that is left out is left out
+        left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
+        while len(left):
+            inner = right - left > 1
+            left, right, least = left[inner], right[inner], least[inner]
+            if not len(left):
+                break
+            counts = right - left - 1
+            first = np.concatenate([[0], np.cumsum(counts)])
+            line = np.repeat(np.arange(len(left)), counts)
+            place = np.arange(first[-1]) + (left + 1 - first[:-1])[line]
+            along = (self.t[place] - self.t[left][line]) / (self.t[right] - self.t[left])[line]
+            chord = rows[right] - rows[left]
+            error = np.abs(rows[place] - rows[left][line] - along[:, None] * chord[line]).max(axis=1)
+            largest = np.maximum.reduceat(error, first[:-1])
+            # the first of the largest of each line
+            at = np.flatnonzero(error == largest[line])
+            middle = place[at[np.unique(line[at], return_index=True)[1]]]
+            least = np.minimum(least, largest)
+            split = least > share
+            left, right, middle, least = left[split], right[split], middle[split], least[split]
+            out[middle] = least
+            left, right = np.concatenate([left, middle]), np.concatenate([middle, right])
+            least = np.concatenate([least, least])
         return out
 
     def left_open(self) -> Array:

@@ -42,7 +42,7 @@ STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: swings are linked: what its samples do not tell between them adds up along a swing.
 _SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.03, np.inf)
 
-#: Most swings: the normal equations are dense.
+#: Most swings: what a fit costs grows with them.
 _MOST_SWINGS = 350
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.arrow import OWN
 from plow_twin.estimate.fit import Fit, Problem, pieces
 from plow_twin.estimate.measurements import FEWEST_POSES, Poses
 from plow_twin.estimate.start import noise_level
@@ -211,17 +212,20 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
     """Yield information and score of a change of some shared unknowns from each swing on, all else eliminated."""
     count = len(columns)
-    cross, own, score = np.zeros((len(fit.covariance), count)), np.zeros((count, count)), np.zeros(count)
+    size = SIZE + OWN * problem.window.swings
+    cross, own, score = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)
     swings = list(pieces(problem, fit.point, fit.linear, fit.variance))
     apart = math.ceil(len(swings) / MOMENTS)
     for index in range(len(swings) - 1, 1, -1):
         for piece in swings[index]:
             changed = piece.weighted[:, columns]
-            cross[piece.places] += piece.rows.T @ changed
+            crossed = piece.rows.T @ changed
+            cross[:SIZE] += crossed[:SIZE]
+            cross[piece.own] += crossed[SIZE:]
             own += changed.T @ piece.rows[:, columns]
             score += changed.T @ piece.residual
         if index < len(swings) - 1 and index % apart == 0:
-            yield own - cross.T @ fit.covariance @ cross, score.copy()
+            yield own - cross.T @ fit.factor.solve(cross), score.copy()
 
 
 @dataclass(frozen=True, eq=False)
