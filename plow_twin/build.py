@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 #: Rooms whose code decides the bits of a run.
-NUMERIC_ROOMS: Final = ("kernel", "model", "solve", "run", "stream", "record")
+NUMERIC_SUBPACKAGES: Final = ("kernel", "model", "solve", "run", "stream", "record")
 
 
 def package_version() -> str:
@@ -47,7 +47,7 @@ def build_fingerprint() -> Mapping[str, str]:
 def source_digest(package: Path) -> str:
     """Return 16 hexadecimal digits that stand for the sources of the numeric rooms in a package's folder."""
     digest = hashlib.sha256()
-    for room in NUMERIC_ROOMS:
-        for path in sorted((package / room).rglob("*.py")):
+    for subpackage in NUMERIC_SUBPACKAGES:
+        for path in sorted((package / subpackage).rglob("*.py")):
             digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]

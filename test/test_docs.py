@@ -34,8 +34,8 @@ def test_links_and_named_files_exist(page: Path) -> None:
         assert "://" in target or (page.parent / target).exists(), target
     for name in re.findall(r"`((?:plow_twin|config|test|docs|tools|benchmark|launch|examples)/[\w/.]+)`", text):
         assert (ROOT / name).exists(), name
-    rooms = "|".join(path.parent.name for path in (ROOT / "plow_twin").glob("*/__init__.py"))
-    for name in re.findall(rf"`((?:{rooms})/[\w/]+\.py)`", text):
+    subpackages = "|".join(path.parent.name for path in (ROOT / "plow_twin").glob("*/__init__.py"))
+    for name in re.findall(rf"`((?:{subpackages})/[\w/]+\.py)`", text):
         assert (ROOT / "plow_twin" / name).exists(), name
 
 
@@ -79,12 +79,12 @@ def test_the_figures_of_the_short_pages_are_those_measured() -> None:
         assert text in log
 
 
-def test_the_picture_of_the_rooms_is_the_script_s() -> None:
+def test_the_picture_of_the_subpackages_is_the_script_s() -> None:
     made = runpy.run_path(str(ROOT / "tools" / "architecture.py"))
     assert made["OUT"].read_text() == made["drawing"]()
-    rooms = {name for row in made["ROOMS"] for name, _ in row}
+    subpackages = {name for row in made["SUBPACKAGES"] for name, _ in row}
     folders = {path.parent.name for path in (ROOT / "plow_twin").glob("*/__init__.py")}
-    assert folders <= rooms
+    assert folders <= subpackages
 
 
 def test_the_tutorial_s_scene_is_the_example_s() -> None:

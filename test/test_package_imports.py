@@ -1,4 +1,4 @@
-"""The rooms of the package: who may import whom, and which library is let in where."""
+"""The subpackages: who may import whom, and which library is let in where."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from pathlib import Path
 import pytest
 
 import plow_twin
-from plow_twin.build import NUMERIC_ROOMS
+from plow_twin.build import NUMERIC_SUBPACKAGES
 from plow_twin.kernel.compiler import KERNEL_FOLDERS
 
 PACKAGE = Path(__file__).resolve().parent.parent / "plow_twin"
 
 SOLVER = {"errors", "kernel", "model", "solve"}
 CORE = SOLVER | {"run"}
-#: For each room of the package, the rooms it may import.
-ROOMS = {
+#: For each subpackage, those it may import.
+SUBPACKAGES = {
     "errors": set(),
     "build": set(),
     "kernel": {"errors"},
@@ -42,7 +42,7 @@ ROOMS = {
 #: Parts of scipy that are imported where they are used; numba looks at the package itself.
 SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.special")
 MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std")}
-#: Libraries beside numpy, by room.
+#: Libraries beside numpy, by subpackage.
 LIBRARIES = {
     "build": {"numba", "llvmlite"},
     "kernel": {"numba", "llvmlite"},
@@ -89,12 +89,13 @@ def _imports(path: Path) -> Iterator[str]:
 
 @pytest.mark.parametrize("path", _modules(), ids=lambda path: path.relative_to(PACKAGE).as_posix())
 def test_imports_point_one_way(path: Path) -> None:
-    room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-    rooms = {name.split(".")[1] for name in _imports(path) if name.startswith("plow_twin.")} - {room}
-    assert rooms <= ROOMS[room], f"{room} must not import {sorted(rooms - ROOMS[room])}"
+    subpackage = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    subpackages = {name.split(".")[1] for name in _imports(path) if name.startswith("plow_twin.")} - {subpackage}
+    forbidden = subpackages - SUBPACKAGES[subpackage]
+    assert not forbidden, f"{subpackage} must not import {sorted(forbidden)}"
     libraries = {name.split(".")[0] for name in _imports(path)} - {"plow_twin", "numpy"} - sys.stdlib_module_names
-    allowed = LIBRARIES.get(room, set())
-    assert libraries <= allowed, f"{room} must not import {sorted(libraries - allowed)}"
+    allowed = LIBRARIES.get(subpackage, set())
+    assert libraries <= allowed, f"{subpackage} must not import {sorted(libraries - allowed)}"
 
 
 def _module_name(path: Path) -> str:
@@ -129,14 +130,14 @@ def test_the_cache_stamp_and_the_build_fingerprint_cover_every_kernel() -> None:
     """A kernel outside would be read from the cache after a change, and replayed as the same build."""
     compiled = [path for path in _modules() if "plow_twin.kernel.compiler.kernel" in _imported_names(path)]
     assert len(compiled) > 10
-    rooms = {path.relative_to(PACKAGE).parts[0] for path in compiled}
-    assert rooms <= {*KERNEL_FOLDERS} and {*KERNEL_FOLDERS} <= {*NUMERIC_ROOMS}
-    assert all((PACKAGE / room).is_dir() for room in (*KERNEL_FOLDERS, *NUMERIC_ROOMS))
+    subpackages = {path.relative_to(PACKAGE).parts[0] for path in compiled}
+    assert subpackages <= {*KERNEL_FOLDERS} and {*KERNEL_FOLDERS} <= {*NUMERIC_SUBPACKAGES}
+    assert all((PACKAGE / subpackage).is_dir() for subpackage in (*KERNEL_FOLDERS, *NUMERIC_SUBPACKAGES))
     # numba's own decorator stands in one file only, whose change numba sees: it calls no kernel of another
     direct = {path.relative_to(PACKAGE).as_posix() for path in _modules() if "numba" in {*_imports(path)}}
     assert {name for name in direct if not name.startswith("kernel/")} == {"build.py", "record/template.py"}
     modules = {_module_name(path) for path in compiled}
-    assert not _module_imports(PACKAGE / "record/template.py", modules) and "record" in NUMERIC_ROOMS
+    assert not _module_imports(PACKAGE / "record/template.py", modules) and "record" in NUMERIC_SUBPACKAGES
 
 
 def _imported_names(path: Path) -> set[str]:

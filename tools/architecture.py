@@ -1,4 +1,4 @@
-"""Draw `docs/images/architecture.svg`: the rooms of the package from the ground up, and the way of a sample.
+"""Draw `docs/images/architecture.svg`: the subpackages of the package from the ground up, and the way of a sample.
 
 python tools/architecture.py
 """
@@ -10,9 +10,9 @@ from xml.sax.saxutils import escape
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "architecture.svg"
 WIDTH, ROW, GAP, LEFT = 920, 54, 14, 20
-HOUSE = 470
-#: From the top down; a room imports only from rows below it.
-ROOMS = (
+COLUMN = 470
+#: From the top down; a subpackage imports only from rows below it.
+SUBPACKAGES = (
     (("ros", "the node"), ("cli", "plow-twin")),
     (("study", "paper, calibration, sweep"), ("live", "runtime, bridges")),
     (("record", "MCAP, replay"), ("view", "rerun")),
@@ -49,23 +49,23 @@ def drawing() -> str:
     """Return the picture as SVG."""
     top = 44
     parts = []
-    for index, row in enumerate(ROOMS):
-        width = (HOUSE - GAP * (len(row) - 1)) / len(row)
+    for index, row in enumerate(SUBPACKAGES):
+        width = (COLUMN - GAP * (len(row) - 1)) / len(row)
         for place, (name, text) in enumerate(row):
             fill = "#d7e6f4" if name in CORE else "#f3f0e6"
             parts.append(box(LEFT + place * (width + GAP), top + index * ROW, width, name, text, fill))
-    x, width = LEFT + HOUSE + 60, WIDTH - HOUSE - LEFT - 80
+    x, width = LEFT + COLUMN + 60, WIDTH - COLUMN - LEFT - 80
     for index, (name, text) in enumerate(SAMPLE):
         y = top + index * ROW
         parts.append(box(x, y, width, name, text, "#e6f2e2"))
         if index:
             parts.append(f'<path d="M{x + width / 2:g} {y - 8:g} v7" class="arrow"/>')
-    height = top + ROW * len(ROOMS) + 34
-    base = top + ROW * len(ROOMS)
-    parts.append(f'<path d="M{LEFT + HOUSE + 24} {top} V{base - 10}" class="arrow"/>')
-    side = f'x="{LEFT + HOUSE + 40}" y="{(top + base) / 2:g}"'
+    height = top + ROW * len(SUBPACKAGES) + 34
+    base = top + ROW * len(SUBPACKAGES)
+    parts.append(f'<path d="M{LEFT + COLUMN + 24} {top} V{base - 10}" class="arrow"/>')
+    side = f'x="{LEFT + COLUMN + 40}" y="{(top + base) / 2:g}"'
     parts.append(
-        f'<text {side} transform="rotate(90 {LEFT + HOUSE + 40} {(top + base) / 2:g})" class="text">imports</text>'
+        f'<text {side} transform="rotate(90 {LEFT + COLUMN + 40} {(top + base) / 2:g})" class="text">imports</text>'
     )
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" width="{WIDTH}" height="{height}">'
@@ -74,9 +74,9 @@ def drawing() -> str:
         'marker-end:url(#tip)}</style><defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="6" '
         'markerHeight="6" orient="auto"><path d="M0 0L10 5L0 10z" fill="#4a5a6a"/></marker></defs>'
         f'<rect width="{WIDTH}" height="{height}" fill="white"/>'
-        f'<text x="{LEFT + HOUSE / 2:g}" y="26" class="head">rooms</text>'
+        f'<text x="{LEFT + COLUMN / 2:g}" y="26" class="head">subpackages</text>'
         f'<text x="{x + width / 2:g}" y="26" class="head">the way of a sample</text>'
-        f'<text x="{LEFT + HOUSE / 2:g}" y="{base + 16}" class="text">blue: the core (numpy, scipy, numba)</text>'
+        f'<text x="{LEFT + COLUMN / 2:g}" y="{base + 16}" class="text">blue: the core (numpy, scipy, numba)</text>'
     )
     return head + "\n".join(parts) + "</svg>\n"
 

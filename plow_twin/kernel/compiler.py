@@ -21,7 +21,7 @@ FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
 load_numba()
 
-#: Rooms that hold compiled functions, with all their folders.
+#: Subpackages that hold compiled functions, with all their folders.
 KERNEL_FOLDERS: Final = ("kernel", "model", "solve")
 
 
