@@ -7,12 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from plow_twin.run.twin import Twin
+from plow_twin.record.sending import PublicationBytes
+from plow_twin.run.twin import DEFAULT_BUDGET, Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driver import Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
 from plow_twin.stream.journal import Entry, Hold, Reset, Sample, Unload
+from plow_twin.stream.limits import excitation_limits
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.session import Session
 
@@ -249,3 +251,88 @@ def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
     list(bench.driver.samples([(T0 + i * MS, LOAD) for i in range(13, 20)], now_ns=0))
     frame = bench.driver.due()
     assert frame is not None and frame.finite and bench.driver.state is StreamState.RUNNING
+
+
+def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[float, float, float]]], int]]:
+    """Return calls of a driver: mostly one sample each, and now and then something that is not as usual."""
+    rng = np.random.default_rng(seed)
+    calls, stamp, now = [], T0, 0
+    kinds = ["late", "twice", "stray", "jump", "nan", "wild", "batch", "travel", "silence", "reset"]
+    for _ in range(count):
+        kind = str(rng.choice([*["usual"] * 120, *kinds]))
+        steps = 3 if kind == "batch" else 1
+        arrived = []
+        for _ in range(steps):
+            stamp, now = stamp + MS, now + MS
+            phase = 6.0 * (stamp - T0) * 1e-9
+            arrived.append((stamp, (90e3 * math.sin(phase), -11e3 * math.sin(phase), 85e3 * math.cos(1.7 * phase))))
+        match kind:
+            case "late":
+                arrived[0] = (stamp - int(rng.integers(2, 300)) * MS - 1, arrived[0][1])
+            case "twice":
+                arrived *= 2
+            case "stray":
+                arrived[0] = (stamp + 100 * NS_PER_S, arrived[0][1])
+            case "jump":
+                stamp, now = stamp - 50 * NS_PER_S, now + 4 * NS_PER_S  # more of them in a row are refused
+            case "nan":
+                arrived[0] = (stamp, (math.nan, 0.0, 0.0))
+            case "wild":
+                arrived[0] = (stamp, (1e9, 0.0, 0.0))
+        calls.append((kind, arrived, now))
+        if kind == "silence":
+            now += NS_PER_S
+    return calls
+
+
+@pytest.mark.parametrize("max_steps", [DEFAULT_BUDGET, 3])
+def test_the_short_way_of_a_sample_gives_what_the_long_one_gives(
+    max_steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bytes, journal, counters and all that a later sample depends on; with 3 steps an advance fails now and then."""
+    short = Session.go_straight_on
+    taken = [0]
+
+    def counted(session: Session, sample: Sample) -> tuple[int, Publication | None]:
+        taken[0] += 1
+        return short(session, sample)
+
+    monkeypatch.setattr(Session, "go_straight_on", counted)
+    calls, found = _troubled(3, 3000), []
+    for always_long in (False, True):
+        if always_long:
+            monkeypatch.setattr(Session, "goes_straight_on", lambda *_: False)
+        journal: list[Entry] = []
+        twin = Twin(SCENE, excitation="sampled", max_steps=max_steps)
+        session = Session(twin, on_entry=journal.append, rollback_span_s=1.0)
+        driver = Driver(session, Intake(limits=excitation_limits(SCENE)), Policy(excitation_timeout_s=0.5))
+        sent, states, messages = [], [], PublicationBytes("slide", "head")
+        for kind, arrived, now in calls:
+            published = list(driver.samples(arrived, now))
+            if kind == "silence":
+                published += [one for one in [driver.silence(now + NS_PER_S)] if one is not None]
+            elif kind == "travel":
+                driver.travel(arrived[0][0] + 20 * MS, 0.4)
+            elif kind == "reset":
+                driver.reset(arrived[0][0], "asked for")
+            for one in published:
+                sent.append((one.stamp_ns, one.held, one.corrected, one.marked, messages.write(one)))
+            states.append((session.snapshot(), tuple(session.wear_depth), session.history._snapshots[-1:]))
+        found.append((sent, states, list(map(repr, journal)), counters(driver), driver.state, driver.real_time.model_s))
+        if not always_long:
+            assert 0.6 * len(calls) < taken[0] < 0.97 * len(calls)
+    short_way, long_way = found
+    for one, other in zip(short_way, long_way, strict=True):
+        assert one == other
+    counted_as = short_way[3]
+    wanted = (
+        "rolled_back",
+        "holds",
+        "resets",
+        "jumps_back",
+        "dropped_stray",
+        "dropped_implausible",
+        "dropped_duplicate",
+    )
+    assert [name for name in wanted if not counted_as[name]] == []
+    assert bool(counted_as["solver_failures"]) == (max_steps == 3)

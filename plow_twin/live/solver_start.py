@@ -15,6 +15,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream import outputs
 
 #: Longest time for which a request to stop is not seen [s].
 _LOOK_S: Final = 0.05
@@ -89,6 +90,7 @@ def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
         max_evaluations=settings.max_evaluations or None,
     )
     compile_s = twin.warm_up()
+    outputs.warm_up()
     warm_up()
     return Prepared(scene, twin, compile_s)
 

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.record.outputs import head_numbers, publication_templates, side_by_side
-from plow_twin.record.template import Template, compiled, fill
+from plow_twin.record.outputs import head_numbers, publication_templates
+from plow_twin.record.template import STAMP_AT, Template, compiled, fill, stamp_word
+from plow_twin.record.words import set_number, set_word
+from plow_twin.solve.state import ROW
 from plow_twin.stream.outputs import CLEARANCE_NAMES, Publication, Slow
 
 #: Those messages, in the order in which they are sent.
@@ -28,34 +30,32 @@ class PublicationBytes:
     def __init__(self, frame_id: str, child_frame_id: str) -> None:
         templates = publication_templates(frame_id, child_frame_id)
         self._slow = {topic: _Filled(templates[topic]) for topic in ("clearance", "wear_rate")}
-        pairs, head = templates["contact_forces"], templates["head_state"]
-        self._buffers = [bytearray(pairs.data), bytearray(pairs.data), bytearray(head.data)]
-        self._arrays = [np.frombuffer(buffer, np.uint8) for buffer in self._buffers]
-        self._layouts = (pairs.data, pairs.places, head.data, head.places)
+        each = [templates[topic] for topic in _EACH]
+        ends = np.cumsum([0, *map(len, each)])
+        #: the three messages one behind the other; only stamps and numbers change
+        self._buffer = np.concatenate([template.data for template in each])
+        self._starts = ends[:-1].copy()
+        self._places = np.concatenate([start + template.places for start, template in zip(ends, each, strict=False)])
+        whole = self._buffer.data
+        self._parts = [(topic, whole[begin:end]) for topic, begin, end in zip(_EACH, ends, ends[1:], strict=False)]
 
     def write(self, publication: Publication) -> dict[str, bytes] | None:
         """Return the bytes by base name of the topic, forces first; None when a number is not finite."""
-        now = publication
-        finite = _write(
-            now.stamp_ns, now.penetration, now.rate, now.force, now.makes, now.impulse, now.peak, now.q, now.v,
-            *self._arrays, *self._layouts,
-        )  # fmt: skip
-        if not finite or (now.slow is not None and not publication.finite):
+        slow, stamp_ns = publication.slow, publication.stamp_ns
+        finite = _write(stamp_ns, publication.rows, self._buffer, self._starts, self._places)
+        if not finite or (slow is not None and not publication.finite):
             return None
-        found = dict(zip(_EACH, map(bytes, self._buffers), strict=True))
-        if now.slow is not None:
-            slow = {"clearance": now.slow.clearance, "wear_rate": now.slow.wear_rate}
-            found |= {topic: self._slow[topic].write(now.stamp_ns, numbers) for topic, numbers in slow.items()}
+        found = {topic: part.tobytes() for topic, part in self._parts}
+        if slow is not None:
+            for topic, numbers in (("clearance", slow.clearance), ("wear_rate", slow.wear_rate)):
+                found[topic] = self._slow[topic].write(stamp_ns, numbers)
         return found
 
 
 def warm_up() -> None:
     """Compile what is needed, or load it from the cache on disk."""
-    none, motion = np.zeros(PAIR_COUNT), np.zeros(3)
-    slow = Slow(np.zeros(len(CLEARANCE_NAMES)), none)
-    PublicationBytes("", "").write(
-        Publication(0, none, none, none, np.zeros(PAIR_COUNT, np.int64), none, none, motion, motion, slow)
-    )
+    slow = Slow(np.zeros(len(CLEARANCE_NAMES)), np.zeros(PAIR_COUNT))
+    PublicationBytes("", "").write(Publication.of_row(np.zeros((1, 1), ROW), stamp_ns=0, slow=slow))
 
 
 class _Filled:
@@ -75,17 +75,22 @@ _START: Final = np.zeros(1, np.int64)
 
 
 @compiled
-def _write(  # type: ignore[no-untyped-def]
-    stamp_ns, penetration, rate, force, makes, impulse, peak, q, v,
-    forces, peaks, head, pairs_data, pairs_places, head_data, head_places,
-):  # fmt: skip
-    """Write the three messages to `forces`, `peaks` and `head`; False when a number is not finite."""
-    start, stamp, motion, numbers = np.zeros(1, np.int64), np.full(1, stamp_ns), np.empty((1, 7)), np.empty((1, 24))
-    head_numbers(q.reshape(1, 3), v.reshape(1, 3), motion)
-    fill(head, start, head_data, head_places, stamp, motion)
-    side_by_side(penetration.reshape(1, 8), rate.reshape(1, 8), force.reshape(1, 8), numbers)
-    fill(forces, start, pairs_data, pairs_places, stamp, numbers)
-    total = motion.sum() + numbers.sum()
-    side_by_side(makes.reshape(1, 8), impulse.reshape(1, 8), peak.reshape(1, 8), numbers)
-    fill(peaks, start, pairs_data, pairs_places, stamp, numbers)
-    return np.isfinite(total + numbers.sum())
+def _write(stamp_ns, rows, buffer, starts, places):  # type: ignore[no-untyped-def]
+    """Write stamp and numbers of a `ROW` into the three messages; False when a number is not finite."""
+    row, motion, stamp = rows[0, 0], np.empty((1, 7)), stamp_word(stamp_ns)
+    head_numbers(row.q.reshape(1, 3), row.v.reshape(1, 3), motion)
+    for start in starts:
+        set_word(buffer, start + STAMP_AT, stamp)
+    total = 0.0
+    for pair in range(PAIR_COUNT):
+        numbers = (
+            row.penetration[pair], row.rate[pair], row.force[pair],
+            float(row.makes[pair]), row.impulse[pair], row.peak[pair],
+        )  # fmt: skip
+        for k in range(6):
+            set_number(buffer, places[8 * k + pair], numbers[k])
+            total += numbers[k]
+    for k in range(7):
+        set_number(buffer, places[48 + k], motion[0, k])
+        total += motion[0, k]
+    return np.isfinite(total)

@@ -87,7 +87,7 @@ def _fits(buffer: Bytes, start: int, length: int, data: Bytes, fixed: Bytes) -> 
 
 
 @compiled
-def _stamp(stamp_ns: int) -> int:
+def stamp_word(stamp_ns: int) -> int:
     """Return seconds and nanoseconds side by side, as they stand in a message."""
     seconds = stamp_ns // _SECOND_NS
     return (seconds & 0xFFFFFFFF) | ((stamp_ns - seconds * _SECOND_NS) << 32)
@@ -162,7 +162,7 @@ def differing(  # type: ignore[no-untyped-def]
         wrong = (word(buffer, start + last) ^ word(data, first + last)) & word(fixed, first + last)
         for i in range(size >> 3):
             wrong |= (word(buffer, start + 8 * i) ^ word(data, first + 8 * i)) & word(fixed, first + 8 * i)
-        wrong |= word(buffer, start + STAMP_AT) ^ _stamp(stamps[k][row])
+        wrong |= word(buffer, start + STAMP_AT) ^ stamp_word(stamps[k][row])
         first, numbers = place_ends[k], values[k]
         count = place_ends[k + 1] - first
         for i in range(count):
@@ -179,6 +179,6 @@ def fill(buffer, starts, data, places, stamps, values):  # type: ignore[no-untyp
         for k in range(data.size >> 3):
             set_word(buffer, start + 8 * k, word(data, 8 * k))
         set_word(buffer, start + last, word(data, last))
-        set_word(buffer, start + STAMP_AT, _stamp(stamps[n]))
+        set_word(buffer, start + STAMP_AT, stamp_word(stamps[n]))
         for k in range(places.size):
             set_word(buffer, start + places[k], word(values, 8 * (n * places.size + k)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time as _time
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,13 +39,13 @@ class Pace:
         self.record = first_of(self._records)
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
         # as bytes: numpy copies a record field by field, five times as slowly
-        self._bytes = self._records.view(np.uint8)
-        self._start = self._bytes.copy()
+        self._bytes = self._records.view(np.uint8).data
+        self._start = self._bytes.tobytes()
         self.saved = new_records(state_type, 1)
         self.max_wall_s = max_wall_s
         self.stopped = False
 
-    def run(self, work: Callable[[], bool]) -> None:
+    def run(self, work: Callable[..., bool], arguments: tuple[Any, ...] = ()) -> None:
         """Do slices of `work` until it says that all is done.
 
         Raises
@@ -55,7 +55,7 @@ class Pace:
         """
         self._bytes[:] = self._start
         begin = _time.perf_counter()
-        while not work():
+        while not work(*arguments):
             if self.stopped or _time.perf_counter() - begin >= self.max_wall_s:
                 raise OutOfTimeError
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
+import struct
 import time as _time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,8 +44,10 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Steps one advance may take before it gives up.
 DEFAULT_BUDGET = 50_000_000
-#: Rows made at once for advances one by one.
+#: Rows made at once for advances one by one: numpy takes as long for one as for hundreds.
 _STOCK = 256
+#: Time, load before and at a sample, as the kernels take them; a load.
+_SAMPLE, _LOAD = struct.Struct("=7d"), struct.Struct("=3d")
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
@@ -114,9 +117,18 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
-        self._stock, self._rows_left = np.zeros(0, ROW), 0
-        #: what advances to one sample, once its types are known
+        self._inertia_numbers = self._inertias.tolist()
+        #: rows for advances one by one, (1, 1) each
+        self._stock: list[NDArray[np.void]] = []
+        #: what advances to one sample, once its types are known, and what it is called with
         self._advance_one: Callable[..., bool] | None = None
+        self._sample, self._load = np.zeros(7), np.zeros(3)
+        self._times, ends = self._sample[:1], self._sample[1:].reshape(1, 2, 3)
+        self._before_row = (
+            self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, self._times,
+            ends, self._budget,
+        )  # fmt: skip
+        self._after_row = self._bound, self._pace.record
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
@@ -210,25 +222,35 @@ class Twin:
         ArgumentError
             As `advance`; nothing has changed then.
         """
+        rows = self.advance_row(t, wrench)
+        return AdvanceSeries.of(np.array([t]), rows[0], own=True)
+
+    def advance_row(self, t: float, wrench: Sequence[float]) -> NDArray[np.void]:
+        """Advance as `advance_sample` does; return the row alone as the kernels fill it: `ROW`, shape (1, 1).
+
+        Nobody else writes to it.
+        """
         if self.excitation != "sampled":
             raise ArgumentError("advance_sample: got excitation='scene', expected excitation='sampled'")
-        times = np.array([t])
-        check_times(self.time, times)
+        if not self._time.item() <= t < math.inf:
+            check_times(self.time, np.array([t]))
         if len(wrench) != 3 or not all(map(math.isfinite, wrench)):
             raise ArgumentError(f"wrench: got {wrench!r}, expected 3 finite numbers")
-        rows = self._new_row()
-        ends = np.empty((1, 2, 3))
-        ends[0, 0], ends[0, 1] = self._wrench, wrench
-        arguments = (
-            self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, times,
-            ends / self._inertias, self._budget, rows[None], self._bound, self._pace.record,
-        )  # fmt: skip
+        fx, fy, moment = wrench
+        fx0, fy0, moment0 = self._wrench.tolist()
+        mass, _, inertia = self._inertia_numbers
+        before = fx0 / mass, fy0 / mass, moment0 / inertia
+        _SAMPLE.pack_into(self._sample.data, 0, t, *before, fx / mass, fy / mass, moment / inertia)
+        if not self._stock:
+            self._stock = list(np.zeros((_STOCK, 1, 1), ROW))
+        rows = self._stock.pop()
+        arguments = *self._before_row, rows, *self._after_row
         if self._advance_one is None:
             self._advance_one = for_arguments(loop.advance_batch, arguments)
-        work = self._advance_one
-        self._in_slices(lambda: work(*arguments), times, ends[0, 1:], rows)
-        self._wrench = ends[0, 1]
-        return AdvanceSeries.of(times, rows, own=True)
+        self._in_slices(self._advance_one, arguments, self._times, None, rows[0])
+        _LOAD.pack_into(self._load.data, 0, fx, fy, moment)
+        self._wrench = self._load
+        return rows
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
         """Advance through many samples; the same bits as one `advance` each.
@@ -260,7 +282,7 @@ class Twin:
         ends = np.empty((1, len(times) + 1, 3))
         ends[0, 0], ends[0, 1:] = self._wrench, samples
         wrenches, members = ends / self._inertias, rows[None]
-        self._in_slices(lambda: loop.advance_batch(
+        self._in_slices(loop.advance_batch, (
             self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, times,
             wrenches, self._budget, members, self._bound, self._pace.record,
         ), times, samples, rows)  # fmt: skip
@@ -309,7 +331,7 @@ class Twin:
         status = np.zeros(len(t), np.int64)
         snapshots = np.zeros(len(marks), self._states.dtype)
         per = np.concatenate([self._wrench[None], wrench]) / self._inertias
-        self._in_slices(lambda: loop.advance_marked(
+        self._in_slices(loop.advance_marked, (
             self._params, self._parts, self._states, self._pace.saved, self._works, totals, t, per,
             self._budget, marks, snapshots, status, out, self._pace.record,
         ), t, wrench, out)  # fmt: skip
@@ -447,7 +469,7 @@ class Twin:
     def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
         check_times(self.time, times)
         rows = np.zeros(len(times), ROW)
-        self._in_slices(lambda: loop.advance_times(
+        self._in_slices(loop.advance_times, (
             self._compiled.params, self._parts, self._states, self._pace.saved, self._work, self._totals, times,
             self._budget, rows, self._bound, self._pace.record,
         ), times, None, rows)  # fmt: skip
@@ -455,7 +477,8 @@ class Twin:
 
     def _in_slices(
         self,
-        work: Callable[[], bool],
+        work: Callable[..., bool],
+        arguments: tuple[Any, ...],
         times: NDArray[np.float64],
         samples: NDArray[np.float64] | None,
         rows: NDArray[np.void] | None,
@@ -468,7 +491,7 @@ class Twin:
             With the rows of the advances that were done, where there are rows.
         """
         try:
-            self._pace.run(work)
+            self._pace.run(work, arguments)
         except (OutOfTimeError, KeyboardInterrupt) as stop:
             steps, done = self.steps, int(self._pace.record.row)
             self._go_back()
@@ -489,13 +512,6 @@ class Twin:
             loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
         for name in ("peak", "impulse", "makes"):
             self._all_totals[name] = 0
-
-    def _new_row(self) -> NDArray[np.void]:
-        """Return a row of zeros, (1,), cut from a stock: numpy takes as long for one as for hundreds."""
-        if self._rows_left == 0:
-            self._stock, self._rows_left = np.zeros(_STOCK, ROW), _STOCK
-        self._rows_left -= 1
-        return self._stock[self._rows_left : self._rows_left + 1]
 
     def _end_step(self) -> None:
         loop.interrupt_step(self._compiled.params, self._parts, self._state, self._work, self._totals)

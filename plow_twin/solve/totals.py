@@ -10,6 +10,25 @@ from plow_twin.solve.dense_output import time_along
 from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 
+@kernel(entry=True)
+def add_up(rows, makes, impulse, peak) -> int:
+    """Let the `ROW` of an advance, (1, 1), tell of all since the last one told, of which the three sums know.
+
+    Makes go on counting, impulse and peak begin anew. Returns the advance's status; after a failed one nothing changes.
+    """
+    row_of = rows[0, 0]
+    if row_of.status != 0:
+        return row_of.status
+    for pair in range(PAIR_COUNT):
+        makes[pair] += row_of.makes[pair]
+        row_of.makes[pair] = makes[pair]
+        row_of.impulse[pair] = impulse[pair] + row_of.impulse[pair]
+        if row_of.peak[pair] < peak[pair]:
+            row_of.peak[pair] = peak[pair]
+        impulse[pair] = peak[pair] = 0.0
+    return 0
+
+
 @kernel(fast=True)
 def _sums(w, order, h) -> None:
     """Write a bound of each force over [0, h] and its integrals: sum f_k h^k / (k+1), sum f_k h^k / (k+2).

@@ -102,8 +102,21 @@ class History:
         self._make_samples()
         self._samples += samples
         self._stamps_ns += [sample.stamp_ns for sample in samples]
-        newest_ns = self._stamps_ns[-1]
-        return not self._snapshots or newest_ns // self._spacing_ns != self._snapshots[-1][0] // self._spacing_ns
+        return not self.follows(self._stamps_ns[-1])
+
+    def follows(self, stamp_ns: int) -> bool:
+        """Tell whether a sample of that stamp asks for no snapshot."""
+        if not self._span_ns:
+            return True
+        return bool(self._snapshots) and stamp_ns // self._spacing_ns == self._snapshots[-1][0] // self._spacing_ns
+
+    def add_one(self, sample: Sample) -> None:
+        """Take in a sample that has been applied and that `follows`."""
+        if self._span_ns:
+            if self._later:
+                self._make_samples()
+            self._samples.append(sample)
+            self._stamps_ns.append(sample.stamp_ns)
 
     def add_travel(self, travel: Travel) -> None:
         """Take in a speed that has been applied; of those with one stamp the last one counts."""

@@ -181,6 +181,23 @@ class Intake:
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
+    def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
+        """Tell whether a sample is surely accepted, as most are; False: `jumps` and `judge` have to find out."""
+        newest_ns = self._newest_ns
+        if newest_ns is None or self.limits is None:
+            return False
+        ahead_ns = stamp_ns - max(newest_ns, reached_ns)
+        if not 0 < ahead_ns <= self.jump_forward_s * NS_PER_S:
+            return False
+        return self.limits.keep(self._newest_values, values, (stamp_ns - newest_ns) * 1e-9)
+
+    def accept(self, stamp_ns: int, values: Sequence[float]) -> None:
+        """Count a sample that `goes_on`."""
+        self.returned = False
+        self.counts[Verdict.ACCEPTED] += 1
+        self._since_first += 1
+        self._newest_ns, self._newest_values = stamp_ns, values
+
     def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
         """Count a sample that was dropped before it could be judged; what could not be read has no values."""
         if verdict.used:

@@ -31,6 +31,13 @@ class Limits:
         """Tell whether a value is larger than it can be."""
         return any(map(gt, map(abs, values), self.largest))
 
+    def keep(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
+        """Tell whether values are finite and nothing is exceeded, neither by them nor by their change."""
+        for old, value, largest, fastest in zip(before, values, self.largest, self.fastest, strict=True):
+            if not (abs(value) <= largest and abs(value - old) <= fastest * duration_s):
+                return False
+        return True
+
     def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
         """Tell whether a value has changed faster than it can."""
         most = [fastest * duration_s for fastest in self.fastest]

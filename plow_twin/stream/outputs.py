@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.running_in import with_running_in, without_running_in
 from plow_twin.model.scene import Scene
+from plow_twin.solve.state import ROW
+from plow_twin.solve.totals import add_up
 
 if TYPE_CHECKING:
     from plow_twin.run.advance import Advance, AdvanceSeries
@@ -66,6 +68,33 @@ class Publication:
     held: bool = False
     corrected: bool = False
     marked: bool = False
+
+    @classmethod
+    def of_row(cls, row: NDArray[np.void], **others: Any) -> Self:
+        """Return the publication whose numbers stand in a `ROW`, shape (1, 1), that nobody writes to any more.
+
+        `others` are stamp, slow part and marks. The numbers are taken out when they are asked for.
+        """
+        made = cls.__new__(cls)  # a frozen class sets its fields one by one
+        made.__dict__.update(others, row=row)
+        return made
+
+    def __getattr__(self, name: str) -> NDArray[Any]:
+        if name not in _ARRAYS:
+            raise AttributeError(name)
+        found: NDArray[Any] = self.__dict__["row"][name][0, 0]
+        self.__dict__[name] = found
+        return found
+
+    @property
+    def rows(self) -> NDArray[np.void]:
+        """The numbers as a `ROW`, shape (1, 1)."""
+        row: NDArray[np.void] | None = self.__dict__.get("row")
+        if row is None:
+            row = np.zeros((1, 1), ROW)
+            for name in _ARRAYS:
+                row[name] = getattr(self, name)
+        return row
 
     @property
     def finite(self) -> bool:
@@ -153,6 +182,11 @@ def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
         points = [with_running_in(scene.wear, begin + (steady - begin) * share) for share in (low, high)]
         return points[0], points[1]
     return initial + (wear_depth - initial) * low, initial + (wear_depth - initial) * high
+
+
+def warm_up() -> None:
+    """Compile what a publication of a single advance needs, or load it from the cache on disk."""
+    add_up(np.zeros((1, 1), ROW), np.zeros(PAIR_COUNT, np.int64), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT))
 
 
 class Outputs:
@@ -243,6 +277,22 @@ class Outputs:
         """Go back to what `pending` was: `state` does not hold it."""
         self._stamp_ns, self._advance = (self._stamp_ns, None) if pending is None else pending
 
+    @property
+    def told_all(self) -> bool:
+        """Whether there was no advance since the last publication."""
+        return self._advance is None
+
+    def pass_on(self, stamp_ns: int, row: NDArray[np.void]) -> Publication | None:
+        """Take in an advance that ended at a sample, as `add` and `take` do together; None when it failed.
+
+        `row` is a `ROW`, shape (1, 1), that becomes the publication's.
+        """
+        if add_up(row, self._makes, self._impulse, self._peak):
+            return None
+        self._stamp_ns, self._held = stamp_ns, False
+        slow = self._slow_part(row["wear_depth"][0, 0]) if self._is_slow_due() else None
+        return Publication.of_row(row, stamp_ns=stamp_ns, slow=slow, **self._take_marks())
+
     def restart(self) -> None:
         """Forget what has not been published; the makes go on counting."""
         self._advance = None
@@ -256,8 +306,6 @@ class Outputs:
         advance, self._advance = self._advance, None
         if advance is None:
             return None
-        corrected = self._corrected_ns is not None
-        mark = self._held or corrected
         publication = Publication.__new__(Publication)
         # all at once: a frozen class sets its fields one by one
         publication.__dict__.update(
@@ -270,15 +318,19 @@ class Outputs:
             peak=self._peak.copy(),
             q=advance.q,
             v=advance.v,
-            slow=self._slow_part(advance.wear_depth),
-            held=self._held,
-            corrected=corrected,
-            marked=mark or self._marked,
+            slow=self._slow_part(advance.wear_depth) if self._is_slow_due() else None,
+            **self._take_marks(),
         )
-        self._corrected_ns, self._marked = None, mark
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
         return publication
+
+    def _take_marks(self) -> dict[str, bool]:
+        """Return what is said of a publication beside its numbers; the next one is not corrected any more."""
+        corrected = self._corrected_ns is not None
+        mark, before = self._held or corrected, self._marked
+        self._corrected_ns, self._marked = None, mark
+        return {"held": self._held, "corrected": corrected, "marked": mark or before}
 
     def take_rows(self, stamps: NDArray[np.int64], rows: AdvanceSeries, taken: NDArray[np.int64]) -> Publications:
         """Take in good advances that ended at `stamps`, with a publication after each of the rows `taken` (rising).
@@ -350,10 +402,12 @@ class Outputs:
             clearance += self._shift
         return index, clearance, grown / elapsed_s[:, None]
 
-    def _slow_part(self, wear_depth: Array) -> Slow | None:
+    def _is_slow_due(self) -> bool:
         before_ns = self._slow_ns
-        if before_ns is not None and self._stamp_ns // SLOW_PERIOD_NS == before_ns // SLOW_PERIOD_NS:
-            return None
+        return before_ns is None or self._stamp_ns // SLOW_PERIOD_NS != before_ns // SLOW_PERIOD_NS
+
+    def _slow_part(self, wear_depth: Array) -> Slow:
+        before_ns = self._slow_ns
         grown, elapsed_s = np.zeros(PAIR_COUNT), 1.0
         if before_ns is not None and self._stamp_ns > before_ns:
             grown, elapsed_s = wear_depth - self._slow_wear_depth, (self._stamp_ns - before_ns) * 1e-9

@@ -38,7 +38,7 @@ from plow_twin.stream.journal import (
     Unused,
 )
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
-from plow_twin.stream.outputs import Outputs
+from plow_twin.stream.outputs import Outputs, Publication
 
 if TYPE_CHECKING:
     from plow_twin.run.advance import Advance, AdvanceSeries
@@ -103,11 +103,12 @@ class Session:
         #: the time that the model has reached [ns], None before the first stamp
         self.stamp_ns: int | None = None
         self.outputs = Outputs(twin.scene)
+        #: the latest advance, while nobody has asked for the wear at its end
+        self._row: NDArray[np.void] | None = None
         scene, self._sampled = twin.scene, twin.excitation == "sampled"
         #: what late samples can be worked into
         self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
-        #: wear depth of each pad [m], shape (8,)
-        self.wear_depth: NDArray[np.float64] = np.zeros(PAIR_COUNT)
+        self.wear_depth = np.zeros(PAIR_COUNT)
         if scene.wear is not None:
             self.wear_depth[:] = scene.wear.initial_depth_m
         if wear_depth is not None:
@@ -218,6 +219,50 @@ class Session:
                 self._on_entry(sample)
             yield self._work_in(part[0].stamp_ns, part) if late else self._run(part)
             self._count(len(part))
+
+    @property
+    def wear_depth(self) -> NDArray[np.float64]:
+        """Wear depth of each pad [m], shape (8,)."""
+        if self._row is not None:
+            self.wear_depth = self._row["wear_depth"][0, 0].copy()
+        return self._wear_depth
+
+    @wear_depth.setter
+    def wear_depth(self, wear_depth: NDArray[np.float64]) -> None:
+        self._wear_depth, self._row = wear_depth, None
+
+    def goes_straight_on(self, stamp_ns: int) -> bool:
+        """Tell whether a sample only moves the motion on and its publication tells of it alone: most are so."""
+        reached_ns = self.stamp_ns
+        return (
+            reached_ns is not None
+            and stamp_ns > reached_ns
+            and not self.held
+            and not self._travels
+            and self.twin.max_evaluations is None
+            and self.outputs.told_all
+            and self.history.follows(stamp_ns)
+        )
+
+    def go_straight_on(self, sample: Sample) -> tuple[int, Publication | None]:
+        """Apply a sample that `goes_straight_on`, and take what is to be published; the same bits as `apply_sample`.
+
+        Returns the status of the advance, and the publication or None when it failed.
+
+        Raises
+        ------
+        ValueError
+            As `apply`.
+        """
+        stamp_ns, origin_ns = sample.stamp_ns, self.origin_ns
+        assert origin_ns is not None, "a stamp has been reached"
+        self._on_entry(sample)
+        row = self.twin.advance_row((stamp_ns - origin_ns) * 1e-9, sample.wrench)
+        self.stamp_ns, self._row = stamp_ns, row
+        publication = self.outputs.pass_on(stamp_ns, row)
+        self.history.add_one(sample)
+        self._count(1)
+        return (0 if publication is not None else int(row["status"][0, 0])), publication
 
     @property
     def plain(self) -> bool:

@@ -31,6 +31,11 @@ class Steps:
         #: when the latest stray stamps were found out [ns]
         self._strays_ns: deque[int] = deque(maxlen=_MOST_STRAYS)
 
+    @property
+    def waits(self) -> bool:
+        """Whether a sample is kept back."""
+        return self._jumped is not None
+
     def settle(
         self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, reached_ns: int | None
     ) -> tuple[Timed, ...]:
