@@ -226,9 +226,24 @@ class Twin:
         return AdvanceSeries.of(np.array([t]), rows[0], own=True)
 
     def advance_row(self, t: float, wrench: Sequence[float]) -> NDArray[np.void]:
-        """Advance as `advance_sample` does; return the row alone as the kernels fill it: `ROW`, shape (1, 1).
+        """Advance as `advance_sample` does, and tell no more than the kernels do.
 
-        Nobody else writes to it.
+        Parameters
+        ----------
+        t : float
+            Model time in s, not before the present one.
+        wrench : sequence of float, length 3
+            Fx, Fy [N] and M [N m] about the cavity's centre at `t`.
+
+        Returns
+        -------
+        ndarray of `ROW`, shape (1, 1)
+            Nobody else writes to it.
+
+        Raises
+        ------
+        ArgumentError
+            As `advance`; nothing has changed then.
         """
         if self.excitation != "sampled":
             raise ArgumentError("advance_sample: got excitation='scene', expected excitation='sampled'")
