@@ -81,6 +81,13 @@ def test_a_managed_node_waits_refuses_nonsense_and_goes_through_all_states(tmp_p
         assert not _change(running, Transition.TRANSITION_CONFIGURE)
         assert probe.node.count_publishers("contact_forces") == 0
 
+        # nor is wear that could not be kept accepted: /proc takes no files, whoever asks
+        assert _set(running, "record_path", "").successful
+        assert _set(running, "wear_state_path", "/proc/self/wear").successful
+        assert not _change(running, Transition.TRANSITION_CONFIGURE)
+        assert "wear_state_path: got '/proc/self/wear', expected a folder that can be written to: " in running.twin.output()
+        assert _set(running, "wear_state_path", "").successful
+
         # around once more, on another scene, beside the first recording, and out by shutdown
         assert _set(running, "scene", "bench_kv").successful
         assert _set(running, "record_path", str(tmp_path / "first")).successful

@@ -28,12 +28,12 @@ class WearKeeper:
     Raises
     ------
     WearStateError
-        Another twin keeps its wear in the folder.
+        No file can be written to the folder, or another twin keeps its wear there.
     """
 
     def __init__(self, folder: Path, head: str, scene: Scene) -> None:
         self.folder, self._head, self._scene = folder, head, scene
-        self._claim = claim_folder(folder)
+        self._claim: int | None = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")

@@ -86,21 +86,19 @@ def load_wear(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None
     return state.depth_m
 
 
-def claim_folder(folder: Path) -> int | None:
+def claim_folder(folder: Path) -> int:
     """Make sure that no other twin keeps its wear in a folder, as long as the descriptor returned is open.
-
-    None where there is no folder yet and none can be made: saving will say so.
 
     Raises
     ------
     WearStateError
-        Another twin keeps its wear there: two would overwrite each other's.
+        No file can be written there, or another twin keeps its wear there: two would overwrite each other's.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError:
-        return None
+    except OSError as error:
+        raise _unwritable(folder, error) from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -108,7 +106,24 @@ def claim_folder(folder: Path) -> int | None:
         raise WearStateError(f"{folder}: another twin keeps its wear there, expected a folder for each") from None
     except OSError:  # a file system without locks
         pass
+    beside = _beside(folder)
+    try:
+        beside.touch()
+        beside.unlink()
+    except OSError as error:
+        os.close(descriptor)
+        raise _unwritable(folder, error) from error
     return descriptor
+
+
+def _unwritable(folder: Path, error: OSError) -> WearStateError:
+    reason = error.strerror or str(error)
+    return WearStateError(f"wear_state_path: got {str(folder)!r}, expected a folder that can be written to: {reason}")
+
+
+def _beside(folder: Path) -> Path:
+    """Return the file that is written before it takes the place of the old one."""
+    return folder / f".{FILE_NAME}.{os.getpid()}"
 
 
 def save_wear(folder: Path, state: WearState) -> None:
@@ -120,8 +135,7 @@ def save_wear(folder: Path, state: WearState) -> None:
         The disk does not take it; the old file is as it was.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / FILE_NAME
-    beside = folder / f".{FILE_NAME}.{os.getpid()}"
+    path, beside = folder / FILE_NAME, _beside(folder)
     record = {
         "version": VERSION,
         "head": state.head,
