@@ -85,7 +85,8 @@ def test_a_managed_node_waits_refuses_nonsense_and_goes_through_all_states(tmp_p
         assert _set(running, "record_path", "").successful
         assert _set(running, "wear_state_path", "/proc/self/wear").successful
         assert not _change(running, Transition.TRANSITION_CONFIGURE)
-        assert "wear_state_path: got '/proc/self/wear', expected a folder that can be written to: " in running.twin.output()
+        said = "wear_state_path: got '/proc/self/wear', expected a folder that can be written to: "
+        assert said in running.twin.output()
         assert _set(running, "wear_state_path", "").successful
 
         # around once more, on another scene, beside the first recording, and out by shutdown
