@@ -28,8 +28,8 @@ from rosbags.highlevel import AnyReader
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode
 from plow_twin.record.header import RunHeader
-from plow_twin.record.journal_codec import Dropped, from_message, to_message
-from plow_twin.record.messages import JointState, Odometry, WrenchStamped
+from plow_twin.record.journal_codec import Dropped, from_message, read_digests, to_message
+from plow_twin.record.messages import JointState, Odometry, Text, WrenchStamped
 from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import (
@@ -317,3 +317,27 @@ def test_a_sample_that_is_not_finite_is_refused(tmp_path: Path) -> None:
     message = WrenchStamped(BASE_NS, "slide_frame", (math.nan, 0.0, 0.0), (0.0, 0.0, 0.0))
     with pytest.raises(RecordingError, match=r"got \(nan, 0.0, 0.0\), expected finite"):
         from_message(message)
+
+
+def test_digests_are_read_in_compiled_code_as_from_their_text_or_left_to_it() -> None:
+    figures = "0123456789abcdef"
+    stamps = ["0", "-0", "-7", str(BASE_NS), str(2**63 - 1), str(-(2**63) + 1), str(2**63), "9" * 19, "9" * 20, "", "-"]
+    texts = [f'{{"kind": "digest", "stamp_ns": {stamp}, "digest": "{figures}"}}' for stamp in stamps]
+    texts += [
+        texts[3].replace(figures, other) for other in (figures[1:], figures + "0", figures.upper(), figures[::-1])
+    ]
+    texts += [texts[3][:-1], texts[3] + " ", texts[3].replace("digest", "hold", 1), texts[3].replace(": ", ":")]
+    data = [encode(Text(text)) for text in texts]
+    data += [data[3][:place] + bytes([data[3][place] ^ 1]) + data[3][place + 1 :] for place in range(len(data[3]))]
+    lengths = np.array([len(part) for part in data])
+    stamp_ns, digests = np.zeros(len(data), np.int64), np.zeros(len(data), np.uint64)
+    found, none, every = np.zeros(len(data), bool), np.zeros(len(data), bool), np.arange(len(data))
+    buffer = np.frombuffer(b"".join(data), np.uint8)
+    read_digests(buffer, np.cumsum(lengths) - lengths, lengths, none, every, stamp_ns, digests, found)
+    for index in np.flatnonzero(found).tolist():
+        expected = from_message(decode(data[index], Text.TYPE))
+        assert expected == Digest(int(stamp_ns[index]), f"{digests[index]:016x}"), texts[index : index + 1]
+    # of the texts those that are written so, with a stamp of 64 bits and 16 figures
+    assert np.flatnonzero(found[: len(texts)]).tolist() == [0, 1, 2, 3, 4, 5, 14]
+    # flipped bits: other stamps and digests, bytes that say nothing, and else no digest
+    assert 30 < found[len(texts) :].sum() < 2 + 19 + 16

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
+from numba.core import types
 
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.template import Bytes, Indexes, compiled
@@ -33,7 +34,13 @@ RECORD_LIMIT: Final = 256 * 1024 * 1024
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
 _ATTACHMENT: Final = 0x09
 _HEAD: Final = struct.Struct("<BQ")
-_INDEX_HEAD: Final = struct.Struct("<BQH")
+_HEAD_SIZE: Final = _HEAD.size
+#: A head and the number that an index record begins with [B].
+_INDEX_HEAD: Final = _HEAD.size + 2
+#: Heads of records looked up at once.
+_AHEAD: Final = 64
+#: The system's, to be called from compiled code: a recording has more heads than chunks that are opened.
+_pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
 MESSAGE_HEAD: Final = 31
@@ -122,10 +129,9 @@ class ChunkReader:
         with open_mcap(self.path) as stream:
             descriptor = stream.fileno()
             size = os.fstat(descriptor).st_size
-            place = len(MAGIC)
+            heads, place = _Heads(descriptor), len(MAGIC)
             while True:
-                head = os.pread(descriptor, _HEAD.size, place)
-                opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
+                opcode, length, _ = heads.at(place)
                 begin = place + _HEAD.size
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
@@ -137,11 +143,11 @@ class ChunkReader:
                     yield Messages.none()
                     if not self.more(stream, size):
                         break
-                    size = os.fstat(descriptor).st_size
+                    size, heads = os.fstat(descriptor).st_size, _Heads(descriptor)
                     continue
                 place = self.position = begin + length
                 if opcode == _MESSAGE:
-                    loose.append(head + os.pread(descriptor, length, begin))
+                    loose.append(os.pread(descriptor, _HEAD.size + length, begin - _HEAD.size))
                     if len(loose) >= 4096 or length > _SMALL:
                         opened.append(np.frombuffer(b"".join(loose), np.uint8))
                         loose = []
@@ -152,7 +158,7 @@ class ChunkReader:
                     yield from self._scan(opened, schemas)
                     opened = []
                 if opcode == _CHUNK:
-                    numbers, place = _indexed(descriptor, place, size)
+                    numbers, place = heads.indexed(place, size)
                     if not self._is_wanted(numbers):
                         continue
                     content = self._open(os.pread(descriptor, length, begin))
@@ -317,16 +323,56 @@ def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
     return found
 
 
-def _indexed(descriptor: int, place: int, size: int) -> tuple[set[int], int]:
-    """Return the channels in the index records from `place` on, and where these end."""
-    numbers: set[int] = set()
-    while place + _INDEX_HEAD.size <= size:
-        opcode, length, number = _INDEX_HEAD.unpack(os.pread(descriptor, _INDEX_HEAD.size, place))
-        if opcode != _MESSAGE_INDEX or place + _HEAD.size + length > size:
+class _Heads:
+    """The heads of a file's records one after the other, looked up many at a time."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._table = np.empty((_AHEAD, 4), np.int64)
+        self._rows: list[tuple[int, int, int, int]] = []
+        self._next = 0
+
+    def at(self, place: int) -> tuple[int, int, int]:
+        """Return opcode and length of the record at a place, and the number its content begins with; zeros for none."""
+        if self._next >= len(self._rows) or self._rows[self._next][0] != place:
+            count = look_ahead(self._descriptor, place, self._table)
+            self._rows, self._next = self._table[:count].tolist(), 0
+            if not self._rows:
+                os.pread(self._descriptor, 1, place)  # whoever has no more bytes for a reason says it here
+                return 0, 0, 0
+        _, opcode, length, number = self._rows[self._next]
+        self._next += 1
+        return opcode, length & (1 << 64) - 1, number
+
+    def indexed(self, place: int, size: int) -> tuple[set[int], int]:
+        """Return the channels in the index records from `place` on, and where these end."""
+        numbers: set[int] = set()
+        while place + _INDEX_HEAD <= size:
+            opcode, length, number = self.at(place)
+            if opcode != _MESSAGE_INDEX or place + _HEAD.size + length > size:
+                self._next = max(self._next - 1, 0)  # it is asked for again
+                break
+            numbers.add(number)
+            place += _HEAD.size + length
+        return numbers, place
+
+
+@compiled
+def look_ahead(descriptor, place, table):  # type: ignore[no-untyped-def]
+    """Fill rows with place, opcode, length and first number of the records from `place` on; return how many."""
+    head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
+    while count < len(table):
+        read = _pread(descriptor, head.ctypes.data, head.size, place)
+        if read < _HEAD_SIZE:
             break
-        numbers.add(number)
-        place += _HEAD.size + length
-    return numbers, place
+        length = word(head, 1)
+        table[count, 0], table[count, 1], table[count, 2] = place, head[0], length
+        table[count, 3] = np.int64(head[9]) | np.int64(head[10]) << 8
+        count += 1
+        if length < 0 or place + _HEAD_SIZE + length < 0:
+            break
+        place += _HEAD_SIZE + length
+    return count
 
 
 def _bytes(record: bytes) -> Bytes:

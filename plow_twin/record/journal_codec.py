@@ -5,13 +5,16 @@ from __future__ import annotations
 import base64
 import json
 import math
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
+import numpy as np
+
 from plow_twin.errors import RecordingError
 from plow_twin.record.messages import Message, Text, WrenchStamped
+from plow_twin.record.template import compiled
+from plow_twin.record.words import word
 from plow_twin.stream.journal import (
     Digest,
     Entry,
@@ -65,8 +68,16 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "loss": Loss,
     "dropped": Dropped,
 }
-#: A digest as it is written, with the zero at its end: it is what most lines of a journal are.
-_DIGEST: Final = re.compile(rb'\{"kind": "digest", "stamp_ns": (-?[0-9]{1,19}), "digest": "([0-9a-f]*)"\}\x00')
+#: A digest as it is written, before, between and after stamp and digest.
+_BEGIN: Final = np.frombuffer(b'{"kind": "digest", "stamp_ns": ', np.uint8)
+_MIDDLE: Final = np.frombuffer(b', "digest": "', np.uint8)
+_END: Final = np.frombuffer(b'"}\x00', np.uint8)
+_SHORTEST: Final = len(_BEGIN) + 1 + len(_MIDDLE) + 16 + len(_END)
+_ZERO, _A, _MINUS = ord("0"), ord("a"), ord("-")
+#: Place of the characters in a string message.
+_TEXT_AT: Final = 8
+#: Most of a stamp: the largest of 64 bits has as many.
+_FIGURES: Final = 19
 #: Fields that a line may lack.
 _OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
@@ -108,12 +119,49 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
     return _from_json(message.data, source)
 
 
-def digest_in(data: bytes) -> Digest | None:
-    """Return the digest that the CDR bytes of a string hold, or None for anything else."""
-    if data[:2] != b"\x00\x01" or int.from_bytes(data[4:8], "little") != len(data) - 8:
-        return None
-    found = _DIGEST.fullmatch(data, 8)
-    return None if found is None else Digest(int(found[1]), found[2].decode())
+@compiled
+def read_digests(buffer, starts, lengths, is_sample, chosen, stamps, digests, found):  # type: ignore[no-untyped-def]
+    """Read those of the `chosen` messages that are digests as they are written: most lines of a journal are.
+
+    `stamps` has an item for each message, `digests` and `found` for each chosen one. What is no sample and not found is
+    left to `from_message`: another kind, or a digest in other words.
+    """
+    for k in range(chosen.size):
+        n = chosen[k]
+        start, length = starts[n], lengths[n]
+        found[k] = False
+        if is_sample[n] or length < _TEXT_AT + _SHORTEST or start < 0 or start + length > buffer.size:
+            continue
+        end = start + length
+        place = start + _TEXT_AT
+        good = buffer[start] == 0 and buffer[start + 1] == 1
+        good &= word(buffer, start + 4) & 0xFFFFFFFF == length - _TEXT_AT
+        for i in range(_BEGIN.size):
+            good &= buffer[place + i] == _BEGIN[i]
+        place += _BEGIN.size
+        negative = buffer[place] == _MINUS
+        place += 1 if negative else 0
+        stamp, first = np.int64(0), place
+        while place < end and _ZERO <= buffer[place] <= _ZERO + 9:
+            stamp = 10 * stamp + np.int64(buffer[place] - _ZERO)
+            place += 1
+        good &= place == first + 1 or buffer[first] != _ZERO
+        good &= first < place <= first + _FIGURES and end - place == _MIDDLE.size + 16 + _END.size
+        if not good:
+            continue
+        for i in range(_MIDDLE.size):
+            good &= buffer[place + i] == _MIDDLE[i]
+        place += _MIDDLE.size
+        digest = np.uint64(0)
+        for i in range(16):
+            letter = np.int64(buffer[place + i])
+            figure = letter - _ZERO if letter <= _ZERO + 9 else letter - _A + 10
+            good &= _ZERO <= letter <= _ZERO + 9 or _A <= letter <= _A + 5
+            digest = digest << np.uint64(4) | np.uint64(figure & 15)
+        for i in range(_END.size):
+            good &= buffer[place + 16 + i] == _END[i]
+        if good and stamp >= 0:  # else it has gone round
+            stamps[n], digests[k], found[k] = -stamp if negative else stamp, digest, True
 
 
 def _from_json(text: str, source: str) -> Entry | Dropped:

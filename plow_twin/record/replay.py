@@ -23,15 +23,14 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS, AlarmCheck
 from plow_twin.record.cdr import decode, encode
-from plow_twin.record.chunks import scan
+from plow_twin.record.chunks import Messages, scan
+from plow_twin.record.comparing import Sent
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import (
     PUBLICATION_TOPICS,
-    SLOW_TOPICS,
     publication_messages,
-    publication_numbers,
     publication_templates,
 )
 from plow_twin.record.reader import (
@@ -45,7 +44,7 @@ from plow_twin.record.reader import (
 )
 from plow_twin.record.replay_report import Divergence, ReplayReport
 from plow_twin.record.sent_messages import SentMessages
-from plow_twin.record.template import Indexes, Templates, differing, read_numbers
+from plow_twin.record.template import Indexes, Templates, read_numbers
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
@@ -72,9 +71,8 @@ if TYPE_CHECKING:
 #: Topics that depend on the publication before: after a lost message they can be compared again from the next
 #: snapshot on.
 _CUMULATIVE: Final = frozenset({"contact_peaks", "clearance", "wear_rate"})
-#: By place in `PUBLICATION_TOPICS`, the last one for other topics.
-_IS_CUMULATIVE: Final = np.array([*(name in _CUMULATIVE for name in PUBLICATION_TOPICS), False])
-_IS_SLOW: Final = np.array([*(name in SLOW_TOPICS for name in PUBLICATION_TOPICS), False])
+#: By place in `PUBLICATION_TOPICS`.
+_IS_CUMULATIVE: Final = np.array([name in _CUMULATIVE for name in PUBLICATION_TOPICS])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 #: Receives the share of the file that has been replayed, 0..1.
@@ -181,9 +179,13 @@ class _Replay:
         count = len(entries)
         breaks = np.ones(count, bool)  # entries that no run goes on into
         breaks[1:] = np.diff(entries.sequence) != 1
-        for index, entry in sorted(entries.others.items()):
-            goes_on = not breaks[index] and (index - 1 not in entries.others or not breaks[index - 1])
-            if not (goes_on and isinstance(entry, Digest | Pose | PartOfPose | Gaps | Unused)):
+        digests = entries.digest_at
+        behind = digests > 0
+        behind[behind] = ~entries.sample[digests[behind] - 1]
+        for index in sorted({*entries.rest, *digests[behind | breaks[digests]].tolist()}):
+            goes_on = not breaks[index] and (index == 0 or entries.sample[index - 1] or not breaks[index - 1])
+            still = index not in entries.rest or isinstance(entries.rest[index], Pose | PartOfPose | Gaps | Unused)
+            if not (goes_on and still):
                 breaks[index : index + 2] = True
         samples = np.flatnonzero(entries.sample)
         late = samples[1:][np.diff(entries.stamp_ns[samples]) < 0]  # worked in one by one
@@ -235,7 +237,7 @@ class _Replay:
     def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
         """Apply a run of samples and digests at once and compare what was sent; False: nothing was done."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
-        digests = sorted(index for index, entry in entries.others.items() if isinstance(entry, Digest))
+        digests = entries.digest_at
         stamps = entries.stamp_ns[entries.sample]
         before = self.session.snapshot(), self.session.outputs.pending, self.session.origin_ns
         self.messages, self.publications = None, None
@@ -259,11 +261,15 @@ class _Replay:
         self.resumed = False
         self.first_ns = int(stamps[0]) if self.first_ns is None else self.first_ns
         first_step = self.report.steps - len(stamps)
+        computed = np.frombuffer(bytes.fromhex("".join(found.digests)), ">u8")
         differences = [
-            (first_step + int(done[index]) - 1, digest.stamp_ns, "digest", "digest", digest.digest, computed)
-            for index, computed in zip(digests, found.digests, strict=True)
-            if isinstance(digest := entries.others[index], Digest) and digest.digest != computed
-        ]
+            (
+                first_step + int(done[index]) - 1, int(entries.stamp_ns[index]), "digest", "digest",
+                f"{entries.digest[number]:016x}", found.digests[number],
+            )
+            for number in np.flatnonzero(computed != entries.digest).tolist()
+            for index in (digests[number],)
+        ]  # fmt: skip
         self.report.digests_compared += len(digests)
         self.next_sequence = (int(entries.sequence[-1]) + 1) & _SEQUENCE_MASK
         self.in_a_row += len(entries)
@@ -319,56 +325,33 @@ class _Replay:
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
         """Form the publications that were sent and compare their messages; return the differences."""
-        sequence, kind = sent.sequence[begin:end], sent.kind[begin:end]
-        after = done[sequence - entries.sequence[0]] - 1  # row after which each was sent
-        published = np.zeros(len(stamps), bool)
-        published[after[kind >= 0]] = True
-        taken, publication = np.flatnonzero(published), np.cumsum(published)[after] - 1
+        first = int(entries.sequence[0])
+        found = Sent(sent.sequence[begin:end], sent.kind[begin:end], done, first, len(stamps))
+        taken = found.taken
         publications = self.session.outputs.take_rows(stamps, rows, taken)
         if len(taken) and taken[-1] == len(stamps) - 1:
             self.publications = publications
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
-            for index, entry in sorted(entries.others.items())
+            for index, entry in sorted(entries.rest.items())
             if isinstance(entry, Pose)
         ]
-        first_sent = sequence[kind >= 0][np.searchsorted(after[kind >= 0], taken)]
-        self.alarms.publications(first_sent & _SEQUENCE_MASK, first_step + taken, publications, poses)
-        slow = np.full(len(taken) + 1, -1)
-        slow[publications.slow_index] = np.arange(len(publications.slow_index))
-        row = np.where(_IS_SLOW[kind], slow[publication], publication)
-        counts = np.bincount(kind[kind >= 0], minlength=len(PUBLICATION_TOPICS)).tolist()
-        for name, count in zip(PUBLICATION_TOPICS, counts, strict=True):
-            skipped = name in _CUMULATIVE and not self.outputs_synced
-            (self.report.not_compared if skipped else self.report.compared)[name] += count
-        if not self.outputs_synced:
-            kind = np.where(_IS_CUMULATIVE[kind], -1, kind)
-        wrong = self._differing(sent, begin, kind, row, publications)
-        found = []
-        for index in np.flatnonzero(wrong).tolist():
-            record, place = sent.record(begin + index), int(publication[index])
-            where = self._difference(record, publications[place])
-            if where is not None:
-                found.append(
-                    (first_step + int(taken[place]), record.publish_time_ns, self.topics[record.topic], *where)
-                )
-        return found
-
-    def _differing(
-        self, sent: SentMessages, begin: int, kind: Indexes, row: Indexes, publications: Publications
-    ) -> NDArray[np.bool_]:
-        """Tell which messages from `begin` on are not those of their kind and row."""
-        wrong = np.zeros(len(kind), bool)
-        numbers = publication_numbers(publications)
-        stamps, values = zip(*(numbers[name] for name in PUBLICATION_TOPICS), strict=True)
-        packed = self.templates
-        for messages, first, last in sent.pieces(begin, begin + len(kind)):
-            here = slice(first - begin, last - begin)
-            differing(
-                messages.buffer, messages.start, messages.length, kind[here], row[here], packed.data, packed.fixed,
-                packed.ends, packed.places, packed.place_ends, stamps, values, wrong[here],
-            )  # fmt: skip
-        return wrong
+        self.alarms.publications(found.first_sequence & _SEQUENCE_MASK, first_step + taken, publications, poses)
+        compared = self.outputs_synced | ~_IS_CUMULATIVE
+        for name, count, known in zip(PUBLICATION_TOPICS, found.counts.tolist(), compared.tolist(), strict=True):
+            (self.report.compared if known else self.report.not_compared)[name] += count
+        found.expect(publications, self.templates, compared)
+        differences = []
+        for messages, from_, to in sent.pieces(begin, end):
+            chosen = slice(from_ - begin, to - begin)
+            wrong = np.flatnonzero(found.differing(messages, chosen))
+            for index in wrong.tolist():
+                record, advance = sent.record(from_ + index), int(found.after[from_ - begin + index])
+                where = self._difference(record, publications[int(found.publication[advance])])
+                if where is not None:
+                    topic = self.topics[record.topic]
+                    differences.append((first_step + advance, record.publish_time_ns, topic, *where))
+        return differences
 
     def _difference(self, record: OutputRecord, publication: Publication) -> tuple[str, str, str] | None:
         """Return what differs between a recorded message and that of a publication, computed as the node does."""
@@ -526,12 +509,10 @@ def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> N
     sample = sample_template("")
     read_numbers(buffer, none, none, sample.data, sample.fixed, sample.places, none, np.zeros((0, 6)), flags)
     if done.rows is not None:
-        numbers = publication_numbers(session.outputs.take_rows(stamps, done.rows, np.arange(2)))
-        stamps_of, values = zip(*(numbers[name] for name in PUBLICATION_TOPICS), strict=True)
-        differing(
-            buffer, none, none, none, none, templates.data, templates.fixed, templates.ends, templates.places,
-            templates.place_ends, stamps_of, values, flags,
-        )  # fmt: skip
+        publications = session.outputs.take_rows(stamps, done.rows, np.arange(2))
+        sent = Sent(none, none, np.arange(2), 0, 2)
+        sent.expect(publications, templates, ~_IS_CUMULATIVE)
+        sent.differing(Messages.none(), slice(0))
 
 
 def _hash(data: bytes) -> str:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.outputs import head_numbers, publication_templates
 from plow_twin.record.template import STAMP_AT, Template, compiled, fill, stamp_word
-from plow_twin.record.words import set_number, set_word
+from plow_twin.record.words import bits, set_word
 from plow_twin.solve.state import ROW
 from plow_twin.stream.outputs import CLEARANCE_NAMES, Publication, Slow
 
@@ -88,9 +88,9 @@ def _write(stamp_ns, rows, buffer, starts, places):  # type: ignore[no-untyped-d
             float(row.makes[pair]), row.impulse[pair], row.peak[pair],
         )  # fmt: skip
         for k in range(6):
-            set_number(buffer, places[8 * k + pair], numbers[k])
+            set_word(buffer, places[8 * k + pair], bits(numbers[k]))
             total += numbers[k]
     for k in range(7):
-        set_number(buffer, places[48 + k], motion[0, k])
+        set_word(buffer, places[48 + k], bits(motion[0, k]))
         total += motion[0, k]
     return np.isfinite(total)

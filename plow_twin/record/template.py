@@ -134,43 +134,6 @@ class Templates:
 
 
 @compiled
-def differing(  # type: ignore[no-untyped-def]
-    buffer, starts, lengths, kinds, rows, data, fixed, ends, places, place_ends, stamps, values, different
-):
-    """Compare each message with its template filled with stamp and numbers of its row, byte for byte.
-
-    Parameters
-    ----------
-    kinds : ndarray of int64, shape (n,)
-        Which template a message has; below 0: it is not compared.
-    rows : ndarray of int64, shape (n,)
-        Row of its stamp and numbers; below 0: there should be no message, it differs.
-    stamps, values : tuple of ndarray, shapes (m,) and (m, count)
-        Of each kind.
-    different : ndarray of bool, shape (n,)
-        Receives what was found.
-    """
-    for n in range(starts.size):
-        k, row, start = kinds[n], rows[n], starts[n]
-        if k < 0:
-            continue
-        first, size = ends[k], ends[k + 1] - ends[k]
-        different[n] = True
-        if row < 0 or lengths[n] != size or start < 0 or start + size > buffer.size:
-            continue
-        last = size - 8
-        wrong = (word(buffer, start + last) ^ word(data, first + last)) & word(fixed, first + last)
-        for i in range(size >> 3):
-            wrong |= (word(buffer, start + 8 * i) ^ word(data, first + 8 * i)) & word(fixed, first + 8 * i)
-        wrong |= word(buffer, start + STAMP_AT) ^ stamp_word(stamps[k][row])
-        first, numbers = place_ends[k], values[k]
-        count = place_ends[k + 1] - first
-        for i in range(count):
-            wrong |= word(buffer, start + places[first + i]) ^ word(numbers, 8 * (row * count + i))
-        different[n] = wrong != 0
-
-
-@compiled
 def fill(buffer, starts, data, places, stamps, values):  # type: ignore[no-untyped-def]
     """Write the template with stamp and numbers of row n from `starts[n]` on."""
     last = data.size - 8

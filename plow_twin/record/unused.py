@@ -26,7 +26,7 @@ class InputCounts:
     def add(self, entries: Entries) -> None:
         """Count entries of a journal."""
         self._count(self.source, "used", int(entries.sample.sum()))
-        for entry in entries.others.values():
+        for entry in entries.rest.values():
             self.add_entry(entry)
 
     def add_entry(self, entry: Entry | Dropped) -> None:

@@ -42,17 +42,15 @@ def _set_word(typingctx: Any, data: Any, place: Any, value: Any) -> Any:
     return types.void(data, place, value), codegen
 
 
-def _set_number(typingctx: Any, data: Any, place: Any, value: Any) -> Any:
-    """Write a float64 to the eight bytes from byte `place` of a contiguous array on; nothing is checked."""
+def _bits(typingctx: Any, number: Any) -> Any:
+    """Return the bits of a float64 as an int64."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        number = builder.bitcast(arguments[2], _WORD)
-        builder.store(number, _place(context, builder, signature, arguments), align=1)
-        return context.get_dummy_value()
+        return builder.bitcast(arguments[0], _WORD)
 
-    return types.void(data, place, types.float64), codegen
+    return types.int64(types.float64), codegen
 
 
 word = cast("Callable[[Any, Any], Any]", intrinsic(_word))
 set_word = cast("Callable[[Any, Any, Any], None]", intrinsic(_set_word))
-set_number = cast("Callable[[Any, Any, float], None]", intrinsic(_set_number))
+bits = cast("Callable[[float], int]", intrinsic(_bits))

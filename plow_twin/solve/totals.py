@@ -29,6 +29,34 @@ def add_up(rows, makes, impulse, peak) -> int:
     return 0
 
 
+@kernel(entry=True)
+def sum_windows(rows, taken, makes, impulse, peak, all_makes, impulses, peaks) -> None:
+    """Sum the rows of advances up to each of those `taken` (rising), after which a window begins.
+
+    Parameters
+    ----------
+    rows : tuple of ndarray, shape (n, 8)
+        Makes, impulse and peak of each advance.
+    makes, impulse, peak : ndarray, shape (8,)
+        Makes so far, impulse and peak of the window under way; they are brought up to the last row.
+    all_makes, impulses, peaks : ndarray, shape (m, 8)
+        Receive what they are at each row taken.
+    """
+    made, pushed, reached = rows
+    window = 0
+    for n in range(len(made)):
+        for pair in range(PAIR_COUNT):
+            makes[pair] += made[n, pair]
+            impulse[pair] += pushed[n, pair]
+            peak[pair] = max(peak[pair], reached[n, pair])
+        if window < taken.size and taken[window] == n:
+            for pair in range(PAIR_COUNT):
+                all_makes[window, pair], impulses[window, pair] = makes[pair], impulse[pair]
+                peaks[window, pair] = peak[pair]
+                impulse[pair] = peak[pair] = 0.0
+            window += 1
+
+
 @kernel(fast=True)
 def _sums(w, order, h) -> None:
     """Write a bound of each force over [0, h] and its integrals: sum f_k h^k / (k+1), sum f_k h^k / (k+2).

@@ -17,7 +17,7 @@ from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.running_in import with_running_in, without_running_in
 from plow_twin.model.scene import Scene
 from plow_twin.solve.state import ROW
-from plow_twin.solve.totals import add_up
+from plow_twin.solve.totals import add_up, sum_windows
 
 if TYPE_CHECKING:
     from plow_twin.run.advance import Advance, AdvanceSeries
@@ -337,27 +337,21 @@ class Outputs:
 
         The same bits as `add` for each row and `take` after those rows.
         """
-        first = np.concatenate(([0], taken[:-1] + 1)) if len(taken) else taken
         # after each row: views instead of copies
         chosen: NDArray[np.int64] | slice = slice(None) if len(taken) == len(stamps) else taken
-        begins = chosen if isinstance(chosen, slice) else first
-        impulse, peak = rows.impulse[begins] + 0.0, rows.peak[begins].copy()
-        if len(taken):
-            impulse[0] = self._impulse + rows.impulse[0]
-            np.maximum(self._peak, rows.peak[0], out=peak[0])
-        lengths = taken - first
-        for offset in range(1, int(lengths.max(initial=0)) + 1):
-            longer = np.flatnonzero(lengths >= offset)
-            impulse[longer] += rows.impulse[first[longer] + offset]
-            peak[longer] = np.maximum(peak[longer], rows.peak[first[longer] + offset])
-        makes = self._makes + np.cumsum(rows.makes, axis=0)
+        eight = (len(taken), PAIR_COUNT)
+        makes, impulse, peak = np.empty(eight, np.int64), np.empty(eight), np.empty(eight)
+        self._makes, self._impulse, self._peak = self._makes.copy(), self._impulse.copy(), self._peak.copy()
+        sum_windows(
+            (rows.makes, rows.impulse, rows.peak), taken, self._makes, self._impulse, self._peak, makes, impulse, peak
+        )
         slow_index, clearance, wear_rate = self._slow_rows(stamps[chosen], rows.wear_depth[chosen])
         publications = Publications(
             stamp_ns=stamps[chosen],
             penetration=rows.penetration[chosen],
             rate=rows.rate[chosen],
             force=rows.force[chosen],
-            makes=makes[chosen],
+            makes=makes,
             impulse=impulse,
             peak=peak,
             q=rows.q[chosen],
@@ -366,13 +360,8 @@ class Outputs:
             clearance=clearance,
             wear_rate=wear_rate,
         )
-        self._makes, self._stamp_ns = makes[-1].copy(), int(stamps[-1])
+        self._stamp_ns = int(stamps[-1])
         begin = int(taken[-1]) + 1 if len(taken) else 0
-        if len(taken):
-            self._impulse, self._peak = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
-        left = np.concatenate((self._impulse[None], rows.impulse[begin:]))
-        self._impulse = np.add.accumulate(left)[-1].copy()
-        self._peak = np.maximum(self._peak, rows.peak[begin:].max(axis=0, initial=0.0))
         self._advance = rows[len(stamps) - 1] if begin < len(stamps) else None
         if len(taken):
             self._corrected_ns = None
