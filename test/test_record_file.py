@@ -26,7 +26,7 @@ from record_support import BASE_NS, Run, chunk_spans, paper_entries, record_run,
 from rosbags.highlevel import AnyReader
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.cdr import decode, encode
+from plow_twin.record.cdr import decode, encode, typestore
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests, to_message
 from plow_twin.record.messages import JointState, Odometry, Text, WrenchStamped
@@ -341,3 +341,9 @@ def test_digests_are_read_in_compiled_code_as_from_their_text_or_left_to_it() ->
     assert np.flatnonzero(found[: len(texts)]).tolist() == [0, 1, 2, 3, 4, 5, 14]
     # flipped bits: other stamps and digests, bytes that say nothing, and else no digest
     assert 30 < found[len(texts) :].sum() < 2 + 19 + 16
+
+
+@given(st.text())
+def test_a_string_has_the_bytes_that_rosbags_gives_it(text: str) -> None:
+    types = typestore()
+    assert encode(Text(text)) == bytes(types.serialize_cdr(types.types[Text.TYPE](text), Text.TYPE))

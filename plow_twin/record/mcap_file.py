@@ -38,23 +38,27 @@ class ChunkBuilder:
 
     def add(self, channel: int, sequence: int, log_time_ns: int, publish_time_ns: int, data: bytes) -> None:
         """Add one message."""
-        self.add_bytes([(channel, sequence, log_time_ns, publish_time_ns, data)])
+        head = _MESSAGE_HEAD.pack(5, 22 + len(data), channel, sequence, log_time_ns, publish_time_ns)
+        place = self.reserve(len(head) + len(data))
+        self._buffer[place : self.size] = np.frombuffer(head + data, np.uint8)
+        self._note(*(np.array([number]) for number in (channel, log_time_ns, place)))
 
-    def add_bytes(self, messages: Iterable[tuple[int, int, int, int, bytes]]) -> None:
-        """Add messages: channel, sequence, log and publish time [ns], data."""
-        parts: list[bytes] = []
-        heads: list[tuple[int, int, int]] = []
-        for channel, sequence, log_time_ns, publish_time_ns, data in messages:
-            size = len(data)
-            heads.append((channel, log_time_ns, MESSAGE_HEAD + size))
-            parts += (_MESSAGE_HEAD.pack(5, 22 + size, channel, sequence, log_time_ns, publish_time_ns), data)
-        if not heads:
-            return
-        channels, times, sizes = np.array(heads, np.int64).T
-        records = np.frombuffer(b"".join(parts), np.uint8)
-        place = self.reserve(len(records))
-        self._buffer[place : place + len(records)] = records
-        self._note(channels, times, place + np.cumsum(sizes) - sizes)
+    def add_bytes(
+        self,
+        channel: Indexes,
+        sequence: Indexes,
+        log_time_ns: Indexes,
+        publish_time_ns: Indexes,
+        length: Indexes,
+        data: bytes,
+    ) -> None:
+        """Add messages, (n,) each, whose data have these lengths and stand one behind the other."""
+        sizes = MESSAGE_HEAD + length
+        ends = np.cumsum(sizes)
+        starts = self.reserve(int(ends[-1]) if len(ends) else 0) + ends - sizes
+        heads(self._buffer, starts, channel, sequence, log_time_ns, publish_time_ns, length)
+        spread(self._buffer, starts + MESSAGE_HEAD, length, np.frombuffer(data, np.uint8))
+        self._note(channel, log_time_ns, starts)
 
     def add_many(
         self,
@@ -67,10 +71,10 @@ class ChunkBuilder:
         values: Any,
     ) -> None:
         """Fill in many messages of one template, at places within what `reserve` has returned."""
-        places = starts + MESSAGE_HEAD
-        heads(self._buffer, starts, channel, sequence, log_time_ns, np.maximum(stamp_ns, 0), len(template))
-        fill(self._buffer, places, template.data, template.places, stamp_ns, values)
-        self._note(np.full(len(starts), channel), log_time_ns, starts)
+        channels, length = np.full(len(starts), channel), np.full(len(starts), len(template))
+        heads(self._buffer, starts, channels, sequence, log_time_ns, np.maximum(stamp_ns, 0), length)
+        fill(self._buffer, starts + MESSAGE_HEAD, template.data, template.places, stamp_ns, values)
+        self._note(channels, log_time_ns, starts)
 
     def reserve(self, size: int) -> int:
         """Return the place of `size` new bytes."""
@@ -108,13 +112,23 @@ class ChunkBuilder:
 
 @compiled
 def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  # type: ignore[no-untyped-def]
-    """Write opcode, length, channel, sequence and times of messages whose data have `length` bytes."""
+    """Write opcode, length, channel, sequence and times of messages whose data have these lengths."""
     for n in range(starts.size):
-        start = starts[n]
-        set_word(buffer, start, 5 | (length + 22) << 8)
-        set_word(buffer, start + 8, (length + 22) >> 56 | channel << 8 | sequence[n] << 24)
+        start, size = starts[n], length[n] + 22
+        set_word(buffer, start, 5 | size << 8)
+        set_word(buffer, start + 8, size >> 56 | channel[n] << 8 | sequence[n] << 24)
         set_word(buffer, start + 15, log_time[n])
         set_word(buffer, start + 23, publish_time[n])
+
+
+@compiled
+def spread(buffer, starts, length, data):  # type: ignore[no-untyped-def]
+    """Copy messages, which stand one behind the other in `data`, to where each begins."""
+    place = 0
+    for n in range(starts.size):
+        start, end = starts[n], place + length[n]
+        buffer[start : start + length[n]] = data[place:end]
+        place = end
 
 
 class ByteFile(Protocol):

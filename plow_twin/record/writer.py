@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -40,6 +40,8 @@ class _Part:
     path: Path
     file: McapFile
     channels: dict[str, tuple[int, str]] = field(default_factory=dict)
+    #: numbers of the publications' channels by base name of the topic
+    sent: dict[str, int] = field(default_factory=dict)
 
     def facts(self) -> PartFacts:
         counts = [
@@ -157,16 +159,23 @@ class RunWriter:
             )
         self._close_full_chunks()
 
-    def write_sent(self, publications: Iterable[tuple[int, int, int, Mapping[str, bytes]]]) -> None:
+    def write_sent(
+        self, sequence: Indexes, log_time_ns: Indexes, stamp_ns: Indexes, sent: Sequence[Mapping[str, bytes]]
+    ) -> None:
         """Write what was sent of publications: journal entry before, log time, stamp [ns], bytes by base name."""
-        channels = {
-            name: self._channel(self.header.topic(name), template.message_type)
-            for name, template in self._templates.items()
-        }
+        channels = self._part.sent
+        if not channels:
+            for name, template in self._templates.items():
+                channels[name] = self._channel(self.header.topic(name), template.message_type)
+        each = np.fromiter(map(len, sent), np.int64, len(sent))
+        data = [message for messages in sent for message in messages.values()]
         self._outputs.add_bytes(
-            (channels[name], sequence & _SEQUENCE_MASK, max(0, log_time_ns), max(0, stamp_ns), data)
-            for sequence, log_time_ns, stamp_ns, messages in publications
-            for name, data in messages.items()
+            np.array([channels[name] for messages in sent for name in messages], np.int64),
+            np.repeat(sequence & _SEQUENCE_MASK, each),
+            np.repeat(np.maximum(log_time_ns, 0), each),
+            np.repeat(np.maximum(stamp_ns, 0), each),
+            np.fromiter(map(len, data), np.int64, len(data)),
+            b"".join(data),
         )
         self._close_full_chunks()
 
@@ -333,6 +342,7 @@ def warm_up_writer(header: RunHeader) -> None:
         builder = ChunkBuilder("zstd")
         builder.reserve(MESSAGE_HEAD + len(template))
         builder.add_many(1, template, one, one, one, one, np.zeros((1, template.count)))
+        builder.add_bytes(one, one, one, one, one, b"0")
     pairs, motion = np.zeros(PAIR_COUNT), np.zeros(3)
     still = Publication(0, pairs, pairs, pairs, np.zeros(PAIR_COUNT, np.int64), pairs, pairs, motion, motion, None)
     publication_numbers(Publications.of([still]))
