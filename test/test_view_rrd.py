@@ -283,3 +283,12 @@ def test_a_place_that_cannot_be_written_is_named(run: Run, tmp_path: Path) -> No
     blocked.write_text("")
     with pytest.raises(RecordingError, match="cannot be written"):
         to_rrd(run.file, blocked / "run.rrd")
+
+
+def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
+    blueprint = layout.blueprint(Section.of(load_scene(scene_path("paper"))), 3.0)
+    curves = blueprint.root_container.contents[1]
+    names = [getattr(part, "name", None) for part in curves.contents]
+    share = curves.row_shares[names.index("Corners that carry force")] / sum(curves.row_shares)
+    # of 620 pixels curves have 555; title, time axis, name and lane take 87, as drawn in a window of 1000 x 620
+    assert share * 555.0 > 87.0
