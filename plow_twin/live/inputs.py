@@ -100,6 +100,8 @@ class Inputs:
 
     def other_senders(self) -> list[str]:
         """Return the inputs on which another sender than the one followed sends too."""
+        if not self._other_heard_ns:
+            return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._other_heard_ns.items() if now_ns - heard_ns < _OTHER_SENDER_NS]
 
@@ -110,7 +112,9 @@ class Inputs:
 
     def waited(self, messages: int, longest_s: float) -> None:
         """Take note of how many messages waited in the queue, and how long the first of them [s]."""
-        self._queue_peak = (max(self._queue_peak[0], messages), max(self._queue_peak[1], longest_s))
+        most, before_s = self._queue_peak
+        if messages > most or longest_s > before_s:
+            self._queue_peak = (max(most, messages), max(before_s, longest_s))
 
     def take_queue_peak(self) -> tuple[int, float]:
         """Return the most messages that waited in the queue, and their longest wait [s], since the last call."""
@@ -124,14 +128,17 @@ class Inputs:
         """
         lost = self.senders.lost
         followed = self.senders.hear(sender, number)
-        self.unused.note_lost(self._source, sender, self.senders.lost - lost)
+        if self.senders.lost != lost:
+            self.unused.note_lost(self._source, sender, self.senders.lost - lost)
+        if followed and self.active and fits:
+            return True
         if not followed:
             self._other_heard(self._source, sender, stamp_ns, values)
         elif not self.active:
             self._intake.refuse(Verdict.INACTIVE, stamp_ns, values)
-        elif not fits:
+        else:
             self._intake.refuse(Verdict.MALFORMED, stamp_ns, values)
-        return followed and self.active and fits
+        return False
 
     def _other_heard(self, topic: str, sender: bytes, stamp_ns: int, values: Sequence[float]) -> None:
         """Take note of a message of a sender that is not followed."""

@@ -47,8 +47,8 @@ class Front(Protocol):
     def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
         """Send the messages of a publication; call `forces_sent` right after the forces.
 
-        Returns the bytes that were sent by base name of the topic; None, and nothing is sent, when a number is not
-        finite.
+        Returns the bytes that were sent by base name of the topic, none of them where nothing is recorded; None, and
+        nothing is sent, when a number is not finite.
         """
 
     def publish_quality(self, marks: JointState) -> None:
@@ -102,8 +102,12 @@ class Publishing:
         self.held_frames = self.corrected_frames = 0
         #: steady time at which what is published next was received [ns]; 0: it answers no message
         self.received_ns = 0
-        #: newest pose that was published
-        self.q: NDArray[np.float64] | None = None
+        self._newest: Publication | None = None
+
+    @property
+    def q(self) -> NDArray[np.float64] | None:
+        """Newest pose that was published."""
+        return None if self._newest is None else self._newest.q
 
     def publish(self, publication: Publication | None) -> None:
         """Send a publication, take note of its age and its alarms, and hand it to the recording."""
@@ -113,11 +117,11 @@ class Publishing:
         if sent is None:
             self.withheld += 1
             return
-        self.q = publication.q
-        self.held_frames += publication.held
-        self.corrected_frames += publication.corrected
-        marks = quality(publication, self._frame_id) if publication.marked else None
-        if marks is not None:
+        self._newest, marks = publication, None
+        if publication.marked:
+            self.held_frames += publication.held
+            self.corrected_frames += publication.corrected
+            marks = quality(publication, self._frame_id)
             self._front.publish_quality(marks)
         self.published += 1
         changed = self.alarms.take(publication)

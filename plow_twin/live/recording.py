@@ -77,6 +77,8 @@ class Recording:
             on_error=on_error,
         )
         self._recorder = in_free_folder(Path(settings.record_path), make)
+        #: takes a journal entry; a loss is counted by the recorder
+        self.journal: Callable[[Entry], bool] = self._recorder.journal
 
     @property
     def path(self) -> Path:
@@ -87,10 +89,6 @@ class Recording:
     def counters(self) -> RecorderCounters:
         """Counters as of now."""
         return self._recorder.counters
-
-    def journal(self, entry: Entry) -> None:
-        """Take a journal entry; a loss is counted by the recorder."""
-        self._recorder.journal(entry)
 
     def publication(self, publication: Publication, sent: Mapping[str, bytes]) -> None:
         """Take the messages of a publication that has been published; `sent`: their bytes, where there are some."""
@@ -106,6 +104,11 @@ class Recording:
     def behind(self) -> bool:
         """Whether so much is queued that losses are near."""
         return self._recorder.counters.queued > _QUEUE_SIZE // 2
+
+    @property
+    def wants_snapshot(self) -> bool:
+        """Whether `renew` has something to do."""
+        return self._recorder.snapshot_wanted
 
     def renew(self, session: Session) -> bool:
         """Journal a snapshot when entries were lost and there is room again; tell whether that was so."""

@@ -443,11 +443,13 @@ class Runtime:
 
     def _advanced(self) -> None:
         if self.recording:
-            self._renew_recording()
+            if self.recording.wants_snapshot:
+                self._renew_recording()
             if self._front.follows_samples and self.recording.behind:
                 # nothing is late: a bounded pause lets the recorder's thread catch up
                 time.sleep(_CATCH_UP_S)
-        seen = (self.driver.state, tuple(self.inputs.other_senders()), self.unsteady)
+        unsteady = self.driver.unsteady(time.monotonic_ns())
+        seen = (self.driver.state, tuple(self.inputs.other_senders()), unsteady)
         if seen != self._seen:
             self._seen = seen
             self._front.changed()

@@ -175,8 +175,9 @@ class Recorder:
     @property
     def snapshot_wanted(self) -> bool:
         """Something was lost and there is room again, or a part ends: journal a `Snapshot` now to go on from."""
-        due = self._snapshot_due or self._split_due
-        return due and self._accepting and not self._paused and len(self._queue) < self._queue_size // 2
+        if not (self._snapshot_due or self._split_due):
+            return False
+        return self._accepting and not self._paused and len(self._queue) < self._queue_size // 2
 
     @property
     def counters(self) -> RecorderCounters:
@@ -209,6 +210,9 @@ class Recorder:
         now = self._now_ns()
         with self._lock:
             snapshot = isinstance(entry, Snapshot)
+            if not (snapshot or self._journal_gap) and self._room(1, self._queue_size):  # as nearly always
+                self._push_entry(now, entry)
+                return True
             notes = len(self._output_gaps) if snapshot else 0
             room = self._room(notes + (2 if self._journal_gap else 1), self._queue_size)
             if (self._journal_gap == 0 or snapshot) and room:

@@ -37,19 +37,29 @@ class PublicationBytes:
         self._starts = ends[:-1].copy()
         self._places = np.concatenate([start + template.places for start, template in zip(ends, each, strict=False)])
         whole = self._buffer.data
-        self._parts = [(topic, whole[begin:end]) for topic, begin, end in zip(_EACH, ends, ends[1:], strict=False)]
+        #: each of them by base name of its topic, in the order in which they are sent
+        self.parts = [(topic, whole[begin:end]) for topic, begin, end in zip(_EACH, ends, ends[1:], strict=False)]
 
     def write(self, publication: Publication) -> dict[str, bytes] | None:
         """Return the bytes by base name of the topic, forces first; None when a number is not finite."""
+        return self.taken() | self.slow(publication) if self.fill(publication) else None
+
+    def fill(self, publication: Publication) -> bool:
+        """Write the messages that each publication has into `parts`; False when a number of it is not finite."""
+        finite = _write(publication.stamp_ns, publication.rows, self._buffer, self._starts, self._places)
+        return bool(finite) and (publication.slow is None or publication.finite)
+
+    def taken(self) -> dict[str, bytes]:
+        """Return what `fill` has written, by base name of the topic."""
+        return {topic: part.tobytes() for topic, part in self.parts}
+
+    def slow(self, publication: Publication) -> dict[str, bytes]:
+        """Return the messages of its slow part, if it has one."""
         slow, stamp_ns = publication.slow, publication.stamp_ns
-        finite = _write(stamp_ns, publication.rows, self._buffer, self._starts, self._places)
-        if not finite or (slow is not None and not publication.finite):
-            return None
-        found = {topic: part.tobytes() for topic, part in self._parts}
-        if slow is not None:
-            for topic, numbers in (("clearance", slow.clearance), ("wear_rate", slow.wear_rate)):
-                found[topic] = self._slow[topic].write(stamp_ns, numbers)
-        return found
+        if slow is None:
+            return {}
+        numbers = {"clearance": slow.clearance, "wear_rate": slow.wear_rate}
+        return {topic: self._slow[topic].write(stamp_ns, found) for topic, found in numbers.items()}
 
 
 def warm_up() -> None:

@@ -87,7 +87,9 @@ class RosFront:
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))
-        self._publishers = OutputPublishers(node, settings.frame_id, settings.child_frame_id)
+        self._publishers = OutputPublishers(
+            node, settings.frame_id, settings.child_frame_id, kept=runtime.recording is not None
+        )
         made.callback(self._publishers.close)
         self._alarms = node.create_publisher(RosDiagnosticStatus, "alarms", LATCHED)
         made.callback(node.destroy_publisher, self._alarms)
@@ -114,7 +116,7 @@ class RosFront:
         return int(self._node.get_clock().now().nanoseconds)
 
     def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
-        """Publish the messages of a publication, if all its numbers are finite."""
+        """Publish the messages of a publication, if all its numbers are finite; return those that a recording keeps."""
         return self._publishers.publish(publication, forces_sent)
 
     def publish_quality(self, marks: JointState) -> None:

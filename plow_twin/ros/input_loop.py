@@ -61,6 +61,8 @@ class InputLoop:
         #: the first one always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
+        #: when the next one is due
+        self._due = 0.0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._signs = [self._wake]
         self._thread = threading.Thread(target=self._run, name="plow_twin_inputs", daemon=True)
@@ -87,7 +89,7 @@ class InputLoop:
         with self._turns:
             for timer in self._timers:
                 timer.restart()
-            self._active = active
+            self._active, self._due = active, 0.0
         self._look_again()
 
     def close(self) -> None:
@@ -113,36 +115,28 @@ class InputLoop:
 
     def _run(self) -> None:
         try:
-            left: set[int] = set()
+            left: list[int] = []  # queues that may not be empty
             while not self._stopped:
-                left = self._go(left.union(self._ready(0.0 if left else self._pause_s())))
+                pause_s = 0.0 if left else max(0.0, self._due - time.monotonic())
+                ready = select.select(self._signs, (), (), pause_s)[0]
+                if self._wake in ready:
+                    os.eventfd_read(self._wake)
+                    ready.remove(self._wake)
+                if left:
+                    ready = list({*left, *ready})
+                with self._turns:
+                    left = [fd for fd in ready if self._queues[fd].take(_MOST)]
+                    if time.monotonic() >= self._due:
+                        self._look_at_timers()
         except Exception as error:  # a thread that ended unseen would be a twin that stands still
             self.error = error
             self._on_error(error)
 
-    def _pause_s(self) -> float:
-        return max(0.0, min([timer.due for timer in self._running()]) - time.monotonic())
-
-    def _running(self) -> list[Timer]:
-        return self._timers if self._active else self._timers[:1]
-
-    def _ready(self, pause_s: float) -> list[int]:
-        """Wait until something has come, a timer is due, or somebody wakes the loop; return the queues that have."""
-        ready = select.select(self._signs, (), (), pause_s)[0]
-        if self._wake in ready:
-            os.eventfd_read(self._wake)
-            ready.remove(self._wake)
-        return ready
-
-    def _go(self, ready: set[int]) -> set[int]:
-        """Empty queues and do what is due, in a turn; return the queues that may not be empty."""
-        with self._turns:
-            left = {fd for fd in ready if self._queues[fd].take(_MOST)}
-            now = time.monotonic()
-            for timer in self._running():
-                if now >= timer.due:
-                    timer.look()
-        return left
+    def _look_at_timers(self) -> None:
+        timers = self._timers if self._active else self._timers[:1]
+        for timer in timers:
+            timer.look()
+        self._due = min(timer.due for timer in timers)
 
     def _look_at_all(self) -> None:
         for queue in self._queues.values():

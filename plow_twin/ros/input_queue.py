@@ -1,21 +1,22 @@
 """The queue of one input, emptied in one go, each message with the publisher it came from and its number there.
 
-rclpy hands messages over one by one and without the publisher's identity; the C interface below it (rcl, a public and
-stable one) tells it, and writes to an eventfd when something has come: that needs neither executor nor interpreter. Of
-rclpy's own it touches `Node._subscriptions`, so that no executor takes from the queue as well.
+The C interface below rclpy tells it, and writes to an eventfd when something has come: that needs neither executor nor
+interpreter. Of rclpy's own it touches `Node._subscriptions`, so that no executor takes from the queue as well.
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
+import struct
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 from typing import Final, NamedTuple
 
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+
+from plow_twin.ros.rcl import SerializedMessage, libraries
 
 _FIRST_CAPACITY: Final = 1024
 
@@ -28,21 +29,6 @@ class Taken(NamedTuple):
     received_ns: int
     data: bytes
     sent_ns: int = 0
-
-
-class _Allocator(ctypes.Structure):
-    _fields_ = [(name, ctypes.c_void_p) for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")]
-
-
-class _Bytes(ctypes.Structure):
-    """`rcutils_uint8_array_t`."""
-
-    _fields_ = [
-        ("buffer", ctypes.c_void_p),
-        ("length", ctypes.c_size_t),
-        ("capacity", ctypes.c_size_t),
-        ("allocator", _Allocator),
-    ]
 
 
 class _Info(ctypes.Structure):
@@ -59,28 +45,10 @@ class _Info(ctypes.Structure):
     ]
 
 
+#: Of `_Info`: times of sending and of reception, number, publisher; of `SerializedMessage`: where it is, and length.
+_INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
 #: What rcl answers when the queue is empty.
 _NOTHING_TAKEN: Final = 401
-
-
-@cache
-def _libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
-    """Return rcl and rcutils, which rclpy has loaded already."""
-    rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
-    rcutils.rcutils_get_default_allocator.restype = _Allocator
-    rcutils.rcutils_uint8_array_init.argtypes = [
-        ctypes.POINTER(_Bytes),
-        ctypes.c_size_t,
-        ctypes.POINTER(_Allocator),
-    ]
-    rcl.rcl_take_serialized_message.argtypes = [
-        ctypes.c_void_p,
-        ctypes.POINTER(_Bytes),
-        ctypes.POINTER(_Info),
-        ctypes.c_void_p,
-    ]
-    rcl.rcl_subscription_set_on_new_message_callback.argtypes = [ctypes.c_void_p] * 3
-    return rcl, rcutils
 
 
 @cache
@@ -93,10 +61,10 @@ def _count_up() -> ctypes.c_void_p:
     return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
 
-def _new_buffer() -> _Bytes:
+def _new_buffer() -> SerializedMessage:
     """Return a buffer that rcl fills and grows."""
-    _, rcutils = _libraries()
-    buffer, allocator = _Bytes(), rcutils.rcutils_get_default_allocator()
+    _, rcutils = libraries()
+    buffer, allocator = SerializedMessage(), rcutils.rcutils_get_default_allocator()
     if rcutils.rcutils_uint8_array_init(buffer, _FIRST_CAPACITY, allocator):
         raise MemoryError(f"input queue: no buffer of {_FIRST_CAPACITY} B")
     return buffer
@@ -122,9 +90,10 @@ class InputQueue:
 
     def __init__(self, node: Node, subscription: Subscription, on_batch: Callable[[list[Taken]], None]) -> None:
         self._node, self._subscription, self._on_batch = node, subscription, on_batch
-        rcl, _ = _libraries()
+        rcl, _ = libraries()
         self._take, self._listen = rcl.rcl_take_serialized_message, rcl.rcl_subscription_set_on_new_message_callback
         self._buffer, self._info = _new_buffer(), _Info()
+        self._places = ctypes.byref(self._buffer), ctypes.byref(self._info)
         self._signs = 0
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         # no executor shall take from it as well
@@ -138,8 +107,11 @@ class InputQueue:
         As many are asked for as signs have come, or `most` where `all_there_are` says so: to ask in vain takes a fifth
         of a sample's time.
         """
-        with suppress(BlockingIOError):  # asked without a sign
-            self._signs += os.eventfd_read(self.fd)
+        try:
+            signs = os.eventfd_read(self.fd)
+        except BlockingIOError:  # asked without a sign
+            signs = 0
+        self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
         taken = self._taken(wanted)
         # where the queue has overrun there were more signs than messages
@@ -155,19 +127,20 @@ class InputQueue:
         os.close(self.fd)
         self._node._subscriptions.append(self._subscription)
         self._node.destroy_subscription(self._subscription)
-        _libraries()[1].rcutils_uint8_array_fini(ctypes.byref(self._buffer))
+        libraries()[1].rcutils_uint8_array_fini(ctypes.byref(self._buffer))
 
     def _taken(self, most: int) -> list[Taken]:
         taken: list[Taken] = []
-        info, buffer, take = self._info, self._buffer, self._take
-        with self._subscription.handle:
-            pointer = self._subscription.handle.pointer
+        handle, take = self._subscription.handle, self._take
+        with handle:
+            pointer = handle.pointer
             while len(taken) < most:
-                answer = take(pointer, buffer, info, None)
+                answer = take(pointer, *self._places, None)
                 if answer:
                     break
-                data = ctypes.string_at(buffer.buffer, buffer.length)
-                taken.append(Taken(bytes(info.publisher), info.number, info.received_ns, data, info.source_ns))
+                sent_ns, received_ns, number, sender = _INFO.unpack_from(self._info)
+                data = ctypes.string_at(*_PLACE.unpack_from(self._buffer))
+                taken.append(Taken(sender, number, received_ns, data, sent_ns))
             else:
                 answer = 0
         if answer not in (0, _NOTHING_TAKEN):

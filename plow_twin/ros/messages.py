@@ -15,7 +15,10 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-Wrench = tuple[float, float, float]
+#: Stamp [ns] and numbers of a message, whether they are a load, and whether one outside the plane is not zero.
+Read = tuple[int, tuple[float, ...], bool, bool]
+#: What cannot be read at all.
+UNREADABLE: Final[Read] = (0, (), False, False)
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
 #: Stamp and length of the publication's name, then force and torque; big endian and little endian.
@@ -42,11 +45,10 @@ def set_stamp(header: Header, stamp: int) -> None:
     header.stamp.sec, header.stamp.nanosec = divmod(stamp, NS_PER_S)
 
 
-def read_wrench(data: bytes) -> tuple[int, Wrench, bool] | None:
-    """Return stamp [ns], Fx, Fy [N] and M [N m], and whether a component outside the plane is not zero.
+def read_wrench(data: bytes) -> Read:
+    """Return what the CDR bytes of a `WrenchStamped` hold: Fx, Fy [N] and M [N m].
 
-    `data` are the CDR bytes of a `WrenchStamped`; None when they do not hold one. One sample costs a tenth of what
-    rclpy's own message objects cost.
+    One sample costs a tenth of what rclpy's own message objects cost.
     """
     try:
         start, numbers = _WRENCH_LAYOUTS[data[1] & 1]
@@ -54,8 +56,8 @@ def read_wrench(data: bytes) -> tuple[int, Wrench, bool] | None:
         # numbers of 8 bytes are aligned to 8, counted from behind the 4 bytes of the encapsulation
         fx, fy, fz, mx, my, mz = numbers.unpack_from(data, 4 + (start.size + length + 7) // 8 * 8)
     except (struct.error, IndexError):
-        return None
-    return seconds * NS_PER_S + nanoseconds, (fx, fy, mz), fz != 0.0 or mx != 0.0 or my != 0.0
+        return UNREADABLE
+    return seconds * NS_PER_S + nanoseconds, (fx, fy, mz), True, fz != 0.0 or mx != 0.0 or my != 0.0
 
 
 def ros_status(status: plain.DiagnosticStatus) -> DiagnosticStatus:

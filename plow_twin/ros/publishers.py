@@ -15,6 +15,7 @@ from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.record.sending import PublicationBytes
 from plow_twin.ros.messages import ros_joint_state
 from plow_twin.ros.qos import KEPT_OUTPUT, OUTPUT
+from plow_twin.ros.rcl import Sender
 from plow_twin.stream.outputs import Publication
 
 #: Output topics that follow from the motion, with their types.
@@ -24,30 +25,47 @@ TOPICS: Final[dict[str, type]] = {
 
 
 class OutputPublishers:
-    """Publishers of all outputs of a publication."""
+    """Publishers of all outputs of a publication.
 
-    def __init__(self, node: Node, frame_id: str, child_frame_id: str) -> None:
+    Parameters
+    ----------
+    node
+        The node.
+    frame_id, child_frame_id
+        Frames named in the messages.
+    kept
+        Whether the bytes sent are wanted: for a recording.
+    """
+
+    def __init__(self, node: Node, frame_id: str, child_frame_id: str, *, kept: bool) -> None:
         self._node = node
         self._publishers = {
             # sent on change only: a late reader gets those of before
             topic: node.create_publisher(kind, topic, KEPT_OUTPUT if topic == QUALITY else OUTPUT)
             for topic, kind in TOPICS.items()
         }
-        self._bytes = PublicationBytes(frame_id, child_frame_id)
+        self._bytes, self._kept = PublicationBytes(frame_id, child_frame_id), kept
+        self._senders = [Sender(self._publishers[topic], part) for topic, part in self._bytes.parts]
 
     def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> dict[str, bytes] | None:
         """Publish the messages of a publication, forces first; `forces_sent` is called right after them.
 
-        Returns their bytes; None, and nothing is published, when a number is not finite.
+        Returns their bytes where they are to be kept; None, and nothing is published, when a number is not finite.
         """
-        publishers, messages = self._publishers, self._bytes.write(publication)
-        if messages is None:
+        if not self._bytes.fill(publication):
             return None
-        for topic, data in messages.items():
-            publishers[topic].publish(data)
-            if topic == "contact_forces":
-                forces_sent()
-        return messages
+        forces, peaks, head = self._senders
+        forces.send()
+        forces_sent()
+        peaks.send()
+        head.send()
+        found = self._bytes.taken() if self._kept else {}
+        if publication.slow is not None:
+            slow = self._bytes.slow(publication)
+            for topic, data in slow.items():
+                self._publishers[topic].publish(data)
+            found |= slow
+        return found
 
     def publish_quality(self, marks: JointState) -> None:
         """Publish the marks of a publication."""
@@ -55,5 +73,6 @@ class OutputPublishers:
 
     def close(self) -> None:
         """Take the publishers off the node."""
+        self._senders.clear()
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)

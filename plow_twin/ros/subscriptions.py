@@ -20,7 +20,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
-from plow_twin.ros.messages import deviations, read_wrench, stamp_ns
+from plow_twin.ros.messages import UNREADABLE, Read, deviations, read_wrench, stamp_ns
 from plow_twin.ros.qos import OVERRIDABLE, sensor_input
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
@@ -30,10 +30,6 @@ _SLOW_DEPTH: Final = 200
 #: Publishers whose numbers are remembered; the oldest is forgotten.
 _MOST_PUBLISHERS: Final = 256
 _PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
-#: Stamp [ns] and numbers of a message, whether they are a load, and whether one outside the plane is not zero.
-_Read = tuple[int, tuple[float, ...], bool, bool]
-#: What cannot be read at all.
-_UNREADABLE: Final[_Read] = (0, (), False, False)
 
 
 class Subscriptions:
@@ -69,7 +65,7 @@ class Subscriptions:
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._inputs.unused.name_of = self._name_of
-        read_sample = {"excitation": self._read_wrench, "tool_forces": self._read_tool_forces}
+        read_sample = {"excitation": read_wrench, "tool_forces": self._read_tool_forces}
         for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
             take = self._samples if topic == self._source else self._not_selected
             self._subscribe(kind, topic, depth, partial(take, topic, read_sample[topic]))
@@ -138,22 +134,25 @@ class Subscriptions:
         """Count the gaps in the publishers' numbers, and hand the messages on."""
         inputs, following = self._inputs, self._following
         for message in batch:
-            key = (topic, message.sender)
+            key, number = (topic, message.sender), message.number
             expected = following.get(key)
+            if expected == number:
+                following[key] = number + 1
+                continue
             if expected is None:
                 # what was sent before the first one heard is counted where it is known who was there: `senders`
-                expected = message.number
+                expected = number
                 if len(following) >= _MOST_PUBLISHERS:
                     following.pop(next(iter(following)))
-            if message.number != expected:
-                missed = message.number - expected if message.number > expected else -1
+            if number != expected:
+                missed = number - expected if number > expected else -1
                 inputs.lost = max(0, inputs.lost + missed)
                 if topic != self._source:
                     inputs.unused.note_lost(topic, message.sender, missed)
-            following[key] = max(expected, message.number + 1)
+            following[key] = max(expected, number + 1)
         take(batch)
 
-    def _samples(self, topic: str, read: Callable[[bytes], _Read], batch: list[Taken]) -> None:
+    def _samples(self, topic: str, read: Callable[[bytes], Read], batch: list[Taken]) -> None:
         """Take in what has been in the queue of the selected source."""
         inputs = self._inputs
         inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
@@ -170,29 +169,23 @@ class Subscriptions:
                 self._intake.out_of_plane += out_of_plane
                 fx, fy, moment = values
                 arrived.append((stamp, (fx, fy, moment)))
-        self._hand_over(arrived)
+        if arrived:
+            self._on_samples(arrived)
 
     def _hand_over(self, arrived: list[Arrival]) -> None:
         if arrived:
             self._on_samples(arrived)
 
-    def _not_selected(self, topic: str, read: Callable[[bytes], _Read], batch: list[Taken]) -> None:
+    def _not_selected(self, topic: str, read: Callable[[bytes], Read], batch: list[Taken]) -> None:
         for message in batch:
             stamp, values, _, _ = read(message.data)
             self._inputs.arriving = (topic, message.sender)
             self._intake.refuse(Verdict.NOT_SELECTED, stamp, values)
 
-    def _read_wrench(self, data: bytes) -> _Read:
-        found = read_wrench(data)
-        if found is None:
-            return _UNREADABLE
-        stamp, wrench, out_of_plane = found
-        return stamp, wrench, True, out_of_plane
-
-    def _read_tool_forces(self, data: bytes) -> _Read:
+    def _read_tool_forces(self, data: bytes) -> Read:
         message = _message(data, JointState)
         if message is None:
-            return _UNREADABLE
+            return UNREADABLE
         wrench = self._tool_forces.wrench(message.name, message.effort)
         values = tuple(message.effort) if wrench is None else wrench
         return stamp_ns(message.header), values, wrench is not None, False

@@ -37,6 +37,8 @@ class Pace:
     def __init__(self, state_type: np.dtype[np.void], implicit: bool, max_wall_s: float) -> None:
         self._records = new_records(PACE, 1)
         self.record = first_of(self._records)
+        #: the same for calls: of a record numba asks for an attribute, which numpy looks up in Python
+        self.argument = self._records[0]
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
         # as bytes: numpy copies a record field by field, five times as slowly
         self._bytes = self._records.view(np.uint8).data

@@ -128,7 +128,7 @@ class Twin:
             self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, self._times,
             ends, self._budget,
         )  # fmt: skip
-        self._after_row = self._bound, self._pace.record
+        self._after_row = self._bound, self._pace.argument
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)

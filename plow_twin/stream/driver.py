@@ -148,9 +148,11 @@ class Driver:
         status, publication = self.session.go_straight_on(sample)
         self._advanced(now_ns)
         self._judge_advance(status, StreamState.RUNNING)
+        if publication is not None:
+            return (publication,)
         self._give_up_after_failures(now_ns)
         self._find_newest()
-        return () if publication is None else (publication,)
+        return ()
 
     def _settled(self, arrived: Sequence[Arrival], now_ns: int) -> Iterator[Arrival]:
         settle, session = self._steps.settle, self.session

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 _BINS_PER_DECADE: Final = 50
 _LOWEST_S: Final = 1e-6
 _DECADES: Final = 8
+_BINS: Final = _BINS_PER_DECADE * _DECADES
 
 
 class DurationHistogram:
@@ -18,7 +19,7 @@ class DurationHistogram:
 
     def __init__(self) -> None:
         # a list: one of its items is counted up in a tenth of the time of an array's
-        self._counts = [0] * (_BINS_PER_DECADE * _DECADES)
+        self._counts = [0] * _BINS
         self._counted = np.zeros(len(self._counts), np.int64)
         self.largest_s = 0.0
 
@@ -31,12 +32,10 @@ class DurationHistogram:
         """Count one duration [s]; outside the range it falls into the end bin, a negative one counts as none."""
         if not duration_s >= 0.0:
             return
-        self.largest_s = max(self.largest_s, duration_s)
-        if duration_s <= _LOWEST_S:
-            index = 0
-        else:
-            index = min(int(math.log10(duration_s / _LOWEST_S) * _BINS_PER_DECADE), len(self._counts) - 1)
-        self._counts[index] += 1
+        if duration_s > self.largest_s:
+            self.largest_s = duration_s
+        index = int(math.log10(duration_s / _LOWEST_S) * _BINS_PER_DECADE) if duration_s > _LOWEST_S else 0
+        self._counts[index if index < _BINS else -1] += 1
 
     def quantile(self, share: float) -> float:
         """Return the duration [s] that the given share of all does not exceed; NaN when there is none."""

@@ -291,7 +291,9 @@ class Outputs:
             return None
         self._stamp_ns, self._held = stamp_ns, False
         slow = self._slow_part(row["wear_depth"][0, 0]) if self._is_slow_due() else None
-        return Publication.of_row(row, stamp_ns=stamp_ns, slow=slow, **self._take_marks())
+        if self._marked or self._corrected_ns is not None:
+            return Publication.of_row(row, stamp_ns=stamp_ns, slow=slow, **self._take_marks())
+        return Publication.of_row(row, stamp_ns=stamp_ns, slow=slow)
 
     def restart(self) -> None:
         """Forget what has not been published; the makes go on counting."""

@@ -51,7 +51,7 @@ class Senders:
         else:
             self.ignored += 1
             self._other = sender
-        self._next[sender] = max(expected, number + 1)
+        self._next[sender] = number + 1 if number >= expected else expected
         return followed
 
     def alive(self, present: Collection[bytes]) -> None:

@@ -77,6 +77,8 @@ class Steps:
     def unsteady(self, now_ns: int) -> bool:
         """Tell whether many stamps were stray lately."""
         strays_ns = self._strays_ns
+        if not strays_ns:
+            return False
         if len(strays_ns) < _MOST_STRAYS or now_ns - strays_ns[-1] >= _WINDOW_NS:
             return False
         return strays_ns[-1] - strays_ns[0] < _WINDOW_NS

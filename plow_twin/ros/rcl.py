@@ -1,0 +1,73 @@
+"""The C interface below rclpy, a public and stable one, for what is done with each sample: serialised messages.
+
+rclpy hands messages over one by one, without the publisher's identity, and looks at the type of each one sent.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any
+
+
+class Allocator(ctypes.Structure):
+    """`rcutils_allocator_t`."""
+
+    _fields_ = [(name, ctypes.c_void_p) for name in ("allocate", "deallocate", "reallocate", "zero_allocate", "state")]
+
+
+class SerializedMessage(ctypes.Structure):
+    """`rcutils_uint8_array_t`."""
+
+    _fields_ = [
+        ("buffer", ctypes.c_void_p),
+        ("length", ctypes.c_size_t),
+        ("capacity", ctypes.c_size_t),
+        ("allocator", Allocator),
+    ]
+
+
+@cache
+def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
+    """Return rcl and rcutils, which rclpy has loaded already."""
+    rcl, rcutils = ctypes.CDLL("librcl.so"), ctypes.CDLL("librcutils.so")
+    rcutils.rcutils_get_default_allocator.restype = Allocator
+    rcutils.rcutils_uint8_array_init.argtypes = [
+        ctypes.POINTER(SerializedMessage),
+        ctypes.c_size_t,
+        ctypes.POINTER(Allocator),
+    ]
+    rcl.rcl_take_serialized_message.argtypes = [ctypes.c_void_p] * 4
+    rcl.rcl_subscription_set_on_new_message_callback.argtypes = [ctypes.c_void_p] * 3
+    return rcl, rcutils
+
+
+@cache
+def _publish() -> Any:
+    # with the interpreter's lock, as rclpy: to give it up and wait for it takes longer than to send
+    publish = ctypes.PyDLL("librcl.so").rcl_publish_serialized_message
+    publish.argtypes = [ctypes.c_void_p] * 3
+    return publish
+
+
+class Sender:
+    """Send the same bytes, whatever stands in them, on a topic again and again.
+
+    Parameters
+    ----------
+    publisher
+        A publisher of rclpy; nothing is sent any more once it has been destroyed.
+    data
+        Contiguous bytes that can be written to: a CDR message.
+    """
+
+    def __init__(self, publisher: Any, data: memoryview) -> None:
+        self._publisher, self._data = publisher, (ctypes.c_uint8 * len(data)).from_buffer(data)
+        self._message = SerializedMessage(ctypes.addressof(self._data), len(data), len(data))
+        self._arguments = ctypes.c_void_p(publisher.handle.pointer), ctypes.byref(self._message), None
+        self._publish = _publish()
+
+    def send(self) -> None:
+        """Send the bytes as they are now."""
+        if self._publish(*self._arguments):
+            self._publisher.publish(bytes(self._data))  # which says what is wrong
