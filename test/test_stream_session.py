@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plow_twin.errors import ArgumentError
+from plow_twin.live.wear_keeper import WearKeeper
 from plow_twin.model.loads import compile_loads
-from plow_twin.model.scene import Contact, Scene, Wear
+from plow_twin.model.scene import Contact, Scene, Table, Wear
 from plow_twin.run.batch import TwinBatch
+from plow_twin.run.simulate import simulate
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -207,6 +210,33 @@ def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
         seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
         np.testing.assert_allclose(after.slow.wear_rate * seconds, grown, atol=1e-18)
     assert max(publication.slow.wear_rate.max() for publication in slow if publication.slow is not None) > 0.0
+
+
+def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_after_a_restart(tmp_path: Path) -> None:
+    wear = Wear(1e-12, 0.015, 2.0, sliding="total", running_in_ratio=4.0, running_in_depth_m=2e-5)
+    scene = replace(SCENE, wear=wear)
+    samples = Table("samples", 2e-3 * np.arange(STEPS), WRENCH)
+
+    def lived(kept: WearKeeper) -> np.ndarray:
+        session = Session(Twin(scene, excitation="sampled"), wear_depth=kept.load())
+        for index in range(STEPS):
+            session.apply(_sample(index))
+        session.close()
+        kept.close(session.wear_depth)
+        return session.wear_depth
+
+    def offline(before: np.ndarray) -> np.ndarray:
+        worn = replace(scene, loads=(samples,), wear=replace(wear, initial_depth_m=tuple(before.tolist())))
+        return simulate(worn, 2e-3 * (STEPS - 1), 0.1, tol=Twin(scene).tol).wear_depth
+
+    new = lived(WearKeeper(tmp_path, "head 7", scene))
+    # within what the solver's tolerance leaves of the motion
+    assert new == pytest.approx(offline(np.zeros(8)), rel=1e-3, abs=1e-12)
+    assert new.max() > 1.5 * wear.running_in_depth_m
+    worn = lived(WearKeeper(tmp_path, "head 7", scene))
+    assert worn == pytest.approx(offline(new), rel=1e-3, abs=1e-12)
+    # pads that have run in wear as many times slower as they are told to
+    assert (worn - new).max() < 0.6 * new.max()
 
 
 def test_a_speed_at_which_the_damping_lets_no_contact_last_is_refused_by_name() -> None:

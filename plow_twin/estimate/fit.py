@@ -286,10 +286,13 @@ def link_weights(spans: Array, drift: Array) -> Array:
     return weights
 
 
-def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations: int, seed: int = 0) -> Fit | None:
+def fit(
+    problem: Problem, shared: Array, states: Array, noise: Array, iterations: int, enough: float = 0.3, seed: int = 0
+) -> Fit | None:
     """Fit from a starting point; None where the model cannot be run there.
 
-    `noise`, shape (3,), is a first guess; `seed` draws the displacements that show what cannot be foretold.
+    `noise`, shape (3,), is a first guess; a step that gains less than `enough` of the cost is the last one; `seed`
+    draws the displacements that show what cannot be foretold.
     """
     point = problem.evaluate(problem.unknowns.within(shared), states)
     if point is None:
@@ -310,7 +313,7 @@ def fit(problem: Problem, shared: Array, states: Array, noise: Array, iterations
         gained = point.cost - trial.cost
         point = trial
         linear = problem.linearise(point)
-        if gained < 0.3:
+        if gained < enough:
             converged = True
             break
         jitter = unforeseen(problem, point, linear.rows, seed)

@@ -53,6 +53,13 @@ def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[In
     return out
 
 
+def askew(problem: Problem, found: Fit) -> float:
+    """Return chi^2 of the linearised step of the four turns: whether the motion shows walls that are worn askew."""
+    step, covariance = _joint_step(problem, found)
+    turn = step[SIZE:]
+    return float(turn @ np.linalg.solve(covariance[SIZE:, SIZE:], turn))
+
+
 def turned(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
     """Fit again with walls that are turned, from a fit without; None where the model cannot be run there."""
     forward = problem.forward.renewed()

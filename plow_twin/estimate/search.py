@@ -42,6 +42,8 @@ STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
 #: swings are linked: what its samples do not tell between them adds up along a swing.
 _SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.03, np.inf)
 
+#: Gain in the cost below which the beginnings of swings are fitted well enough to go on with all of them.
+_ENOUGH = 30.0
 #: Most swings: what a fit costs grows with them.
 _MOST_SWINGS = 350
 
@@ -76,12 +78,18 @@ def refine(
     hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest, horizon = _SHORT if hard else _LONG if drift is None else _BROAD
+    if drift is not None and not hard:
+        # as long as what the load leaves open moves the head by less than the sensor's noise
+        shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), _LONG[0])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
     starts = [shared, *([range_of_hard(unknowns, poses, shared)] if hard else [])]
-    fits = [fit(near, start, better_states(near, start, states_at(window, start)), noise, 10) for start in starts]
+    fits = []
+    for start in starts:
+        states = better_states(near, start, states_at(window, start))
+        fits.append(fit(near, start, states, noise, 10, *(() if hard else (_ENOUGH,))))
     found = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
     if found is None:
         return None

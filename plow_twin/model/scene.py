@@ -402,17 +402,16 @@ def _check_fields(part: Any, path: str) -> Iterator[Problem]:
 def _check_number(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
     if value is None and spec.default is None:
         return
-    expected = describe(spec)
     if isinstance(spec.default, tuple) or isinstance(value, (tuple, list, np.ndarray)):
         length = len(spec.default) if isinstance(spec.default, tuple) else None
         if not isinstance(value, (tuple, list, np.ndarray)) or length is None or len(value) != length:
-            yield Problem(key, value, f"{length or 1} number(s): {expected}")
+            yield Problem(key, value, f"{length or 1} number(s): {describe(spec)}")
             return
         for index, item in enumerate(value):
             if not _admissible(item, spec.metadata):
-                yield Problem(f"{key}[{index}]", item, expected)
+                yield Problem(f"{key}[{index}]", item, describe(spec))
     elif not _admissible(value, spec.metadata):
-        yield Problem(key, value, expected)
+        yield Problem(key, value, describe(spec))
 
 
 def _admissible(value: Any, metadata: Mapping[str, Any]) -> bool:
