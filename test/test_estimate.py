@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from record_support import STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin
 from scenes import ROOT, gaps_at, preset
@@ -20,7 +21,7 @@ from plow_twin import Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate import estimate as estimating
 from plow_twin.estimate.answer import followed
 from plow_twin.estimate.arrow import Arrow
-from plow_twin.estimate.bouncing import Bounced, _off_path, _regress, bias_of_hard
+from plow_twin.estimate.bouncing import Bounced, _delay, _Eye, _likelier, _off_path, _regress, bias_of_hard
 from plow_twin.estimate.estimate import _with_gaps, estimate, summarise_bounced
 from plow_twin.estimate.fit import link_weights
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
@@ -205,6 +206,50 @@ def test_a_biased_sensor_behind_a_hard_contact_is_found_out(turn: float) -> None
     assert (np.abs(found - bias) < [5e-4, 5e-4, 1.5e-3]).all()
 
 
+def test_a_bias_moves_what_a_hard_motion_is_like_as_little_as_it_is_found() -> None:
+    """What was left of a turn, 3e-4 rad on the whole, moved the measured motion among drawn ones, which had none."""
+    truth = draw(replace(GROUPS["hard"], periods=4.0), 3)
+    eye = _Eye(Unknowns(truth.nominal), truth.poses, truth.load.period())
+    bias = np.array([1e-4, -1e-4, 6e-4])
+    plain, moved = eye.features(eye.q), eye.features(eye.q + bias)
+    np.testing.assert_allclose(moved[2:5] - plain[2:5], bias, atol=5e-5)
+    np.testing.assert_allclose(moved[:2], plain[:2], atol=3e-6)
+    np.testing.assert_allclose(moved[5:], plain[5:], rtol=0.02, atol=1e-5)
+
+
+def test_the_delay_is_where_the_measured_path_is_nearest_to_drawn_ones() -> None:
+    rng = np.random.default_rng(5)
+    t = np.arange(2000) * 0.01
+
+    def seen(delay: float) -> NDArray[np.float64]:
+        phase = 2.0 * np.pi * (t - delay) / 2.0
+        path = 1e-2 * np.stack([np.sin(phase), np.cos(2.0 * phase), np.sin(3.0 * phase)], axis=1)
+        return np.asarray(path + 1e-3 * rng.standard_normal((len(t), 3)))
+
+    eye = _Eye(Unknowns(preset("paper")), Poses.of(t, seen(0.05))[0], 2.0)
+    features, drawn = rng.standard_normal((40, 3)), [seen(0.0) for _ in range(40)]
+    assert _delay(eye, features, drawn, np.zeros(3)) == pytest.approx(0.05, abs=3e-3)
+
+
+def test_another_law_is_told_by_what_classifies_draws_of_both() -> None:
+    """The classes differ along one direction of little scatter, where no single feature tells them apart."""
+    rng = np.random.default_rng(5)
+    across = np.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0]) / np.sqrt(2.0)
+
+    def like(count: int, label: float) -> NDArray[np.float64]:
+        common = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        rows = 0.1 * rng.standard_normal((count, 6)) + rng.standard_normal((count, 1)) * common
+        return np.asarray(rows + 0.4 * label * across)
+
+    believed, other = like(100, 0.0), like(60, 1.0)
+    right = np.array([_likelier(believed, other, row) for row in like(100, 0.0)])
+    wrong = np.array([_likelier(believed, other, row) for row in like(100, 1.0)])
+    assert abs(right.mean()) < 0.4
+    assert right.std() == pytest.approx(1.0, abs=0.3)
+    assert (right > estimating.MOST_OTHER_LAW).mean() < 0.05
+    assert (wrong > estimating.MOST_OTHER_LAW).mean() > 0.8
+
+
 def test_behind_a_soft_contact_the_fit_tells_the_bias(known: list[tuple[Truth, Estimate]]) -> None:
     truth, _ = known[0]
     assert not bias_of_hard(Unknowns(truth.nominal), truth.poses).any()
@@ -228,7 +273,7 @@ def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
     unknowns = Unknowns(preset("paper"))
     poses, _ = Poses.of(np.arange(100) * 0.01, np.zeros((100, 3)))
     two = np.full(2, 1e-2)
-    bounced = Bounced(two, two, two, two, (-8.0, 500.0), (0.0, 1.0), np.ones(3), 1.0, 1.0)
+    bounced = Bounced(two, two, np.zeros(3), np.ones(3), (-8.0, 500.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0)
     text = json.dumps(summarise_bounced(unknowns, poses, bounced, 0, 0).as_dict(), allow_nan=False)
     assert json.loads(text)["stiffness"]["p95"] > 1e9
 

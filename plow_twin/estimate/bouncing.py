@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
-from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches
+from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches, smooth_width
 from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, Unknowns
 from plow_twin.model import geometry
 
@@ -31,20 +31,21 @@ Array = NDArray[np.float64]
 SURE, POSSIBLE = 3e-4, 1e-3
 #: Scatter of the largest reaches in units of the noise, and in m, below which they are all of one place: a hard wall.
 NARROW, NARROW_M = 1.58, 8e-4
-#: Biases of theta that are tried in rad, and about the best of them, by a parabola at last that reaches so far;
-#: quantiles of the reaches whose distance is to be least; what such a bias is wrong by in rad (set on seeds 25900 to
-#: 25907 of the benchmark).
+#: Biases of theta that are tried in rad, and about the best of them, by a parabola that reaches so far; quantiles of
+#: the reaches whose distance is to be least.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
-_NEAR_TURNS: Final = np.linspace(-3e-3, 3e-3, 13)
 _FINEST_TURN: Final = 3e-3
+_NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
 _MIDDLE, _FARTHEST = (0.4, 0.7), (0.9, 0.99)
-TURN_DEVIATION = 4e-4
-#: Most rows that it is looked for in.
-_MOST_ROWS = 2000
+#: Most rows that it is looked for in, and that its last part is.
+_MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
 #: Quantiles between which reaches are averaged, from the wall's middle to the farthest.
 _WINDOWS: Final = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
 #: Parts of a period in which the scatter is told.
 _PHASES = 20
+#: Span in s over which the pose is averaged for a second look at the reach; parts of a period over which it is averaged
+#: for a third, and the shares of them, the farthest, whose mean is taken.
+_AVERAGED_S, _REACH_PHASES, _FARTHEST_PARTS = 0.05, 40, (0.1, 0.2, 0.33)
 #: Parts of a period in which the path is told, and fewest measurements in one.
 _PATH_PHASES, _FEWEST_OF_PHASE = 40, 9
 #: Draws near the measured motion that are compared with the others as it is; share of the variance common to all
@@ -56,7 +57,15 @@ _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = 4
 #: Draws of each round.
-_DRAWS: Final = (40, 40, 40)
+_DRAWS: Final = (30, 30, 40)
+#: The law that a linear contact may have instead of the one believed; draws of it, and the steps after which no further
+#: one is made; median share of the critical damping that they have, and the deviation of its logarithm.
+_OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
+_OTHER_DRAWS, _OTHER_WORK = 60, 1_500_000
+_DAMPING_SHARE, _SHARE_DEVIATION = 0.2, 0.6
+#: Distances in rows over which the changes of pose and reaches are told, and what a coefficient is held to zero by in
+#: telling the law.
+_CHANGES, _LAW_RIDGE = (1, 2, 4, 8, 16, 32), 1.0
 #: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
 _NEAR, _RIDGE = 0.7, 0.3
 #: The same for the regression of what is left over, and a square that counts as nothing.
@@ -86,12 +95,14 @@ class Bounced:
     """What the comparison tells.
 
     clearance, clearance_deviation : (2,) in m; infinite where it could not be found
-    bias : (2,) of x and y in m with its deviation
+    bias : (3,) of x, y in m and theta in rad with its deviation
     ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
     noise : (3,) standard deviation of the measurements
     distance : of the measured motion from the drawn ones near it, over that of drawn ones among themselves
     path : how far mean and scatter of the pose over the load's period are from what the drawn motions foretell, as a
         normal deviate of how far the drawn ones are from what the others foretell
+    law : how much more the motion is like those of another law of the contact, as a normal deviate of how much those
+        of the law believed are; 0 where no other is known
     """
 
     clearance: Array
@@ -103,9 +114,10 @@ class Bounced:
     noise: Array
     distance: float
     path: float
+    law: float
 
 
-def bounces(unknowns: Unknowns, poses: Poses, softness: float) -> bool:
+def bounces(unknowns: Unknowns, poses: Poses, softness: float = math.inf) -> bool:
     """Tell whether the contact is so hard that this way is the right one; `softness` is a first estimate in m."""
     noise = _reach_noise(unknowns, _whole(poses))
     return softness < SURE or (_is_narrow(unknowns, poses) and (softness < POSSIBLE or noise < POSSIBLE))
@@ -137,74 +149,196 @@ def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
     which the farthest reaches lie closest together. A bias of y turns with the head into its reach along x.
     """
     q = _whole(poses)
-    q = q[:: len(q) // _MOST_ROWS + 1]
     bias = np.zeros(3)
-    for turns in (_TURNS, _NEAR_TURNS, _NEAR_TURNS):
-        right, left, top, bottom = _reach(unknowns, q - bias)[2]
-        bias[:2] += 0.5 * np.array([left - right, bottom - top])
-        widths = [_width(unknowns, q - bias - [0.0, 0.0, turn]) for turn in turns]
-        bias[2] += turns[int(np.argmin(widths))]
-    curve, slope, _ = np.polyfit(_NEAR_TURNS, widths, 2)
-    if curve > 0.0:
-        bias[2] += float(np.clip(-0.5 * slope / curve, -_FINEST_TURN, _FINEST_TURN)) - turns[int(np.argmin(widths))]
+    bias[:2] = _off_centre(_reach(unknowns, q)[2])
+    few = _few(q, _MOST_ROWS) - bias
+    bias[2] = _TURNS[int(np.argmin(_widths(unknowns, few, _TURNS)))]
+    bias += _near_bias(unknowns, q - bias)
     return bias if _is_narrow(unknowns, poses.moved(-bias)) else np.zeros(3)
 
 
-def _width(unknowns: Unknowns, q: Array) -> float:
-    """Return how far apart the farthest reaches lie, all walls together, in m."""
-    ordered = np.sort(reaches(unknowns.scene, q), axis=0)
-    middle, farthest = (
-        ordered[int(low * len(q)) : max(int(high * len(q)), int(low * len(q)) + 1)].mean(axis=0).sum()
-        for low, high in (_MIDDLE, _FARTHEST)
+def _near_bias(unknowns: Unknowns, q: Array) -> Array:
+    """Return a small bias, shape (3,); it is found for drawn motions too, so that its error is known."""
+    q = _few(q, _MOST_NEAR_ROWS)
+    bias = np.zeros(3)
+    for _ in range(2):
+        bias[:2] += _off_centre(_reach(unknowns, q - bias)[2])
+        widths = _widths(unknowns, q - bias, _NEAR_TURNS)
+        curve, slope, _ = np.polyfit(_NEAR_TURNS, widths, 2)
+        least = -0.5 * slope / curve if curve > 0.0 else _NEAR_TURNS[int(np.argmin(widths))]
+        bias[2] += float(np.clip(least, -_FINEST_TURN, _FINEST_TURN))
+    return bias
+
+
+def _few(q: Array, most: int) -> Array:
+    """Return every n-th row, at most `most`."""
+    return q[:: len(q) // most + 1]
+
+
+def _off_centre(reach: Array) -> Array:
+    """Return by how much the reaches toward right, left, top and bottom are off the middle, shape (2,), in m."""
+    right, left, top, bottom = reach
+    return 0.5 * np.array([left - right, bottom - top])
+
+
+def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
+    """Return how far apart the farthest reaches lie with each bias of theta, all walls together, in m."""
+    count = len(q)
+    (low, middle), (far, farthest) = (
+        (int(start * count), max(int(end * count), int(start * count) + 1)) for start, end in (_MIDDLE, _FARTHEST)
     )
-    return float(farthest - middle)
+    widths = []
+    for turn in turns:
+        reach = reaches(unknowns.scene, q - [0.0, 0.0, turn])
+        reach.partition(sorted({low, min(middle, count - 1), far, min(farthest, count - 1)}), axis=0)
+        widths.append(float((reach[far:farthest].mean(axis=0) - reach[low:middle].mean(axis=0)).sum()))
+    return np.array(widths)
 
 
 def compare(forward: Forward, unknowns: Unknowns, poses: Poses, period: float, seed: int = 0) -> Bounced | None:
     """Compare the measured motion with drawn ones; None where too few can be run."""
     eye = _Eye(unknowns, poses, period)
     measured = eye.features(eye.q)
-    paths: list[Array] = []
-    rng, most_work = np.random.default_rng(seed), forward.work + _MOST_WORK
+    drawn = _Drawn(forward, unknowns, eye, np.random.default_rng(seed))
+    most_work = forward.work + _MOST_WORK
     centre = range_of_motion(unknowns.scene, poses)[0] - _OVERRATED
-    mean = np.array([_LN_PENETRATION[0], unknowns.nominal()[DAMPING], 1.0, 1.0, 1.0])
-    spread = np.array([_LN_PENETRATION[1], _DAMPING if unknowns.damped else 0.0, _GAIN, _GAIN, _GAIN])
-    features: list[Array] = []
-    targets: list[Array] = []
     found: _Regressed | None = None
+    delay = 0.0
     for count, about in zip(_DRAWS, _CLEARANCE, strict=True):
-        for _ in range(count):
-            if forward.work > most_work:
-                break
-            numbers = mean + spread * rng.standard_normal(5)
-            numbers[0] = np.clip(numbers[0], *np.log(_BOUNDS))
-            clearance = np.maximum(centre + about * rng.standard_normal(2), 5e-4)
-            looked = eye.look(forward, clearance, numbers, rng)
-            if looked is not None:
-                seen, path = looked
-                features.append(seen)
-                paths.append(path)
-                targets.append(np.concatenate([clearance - seen[:2], -seen[2:4], numbers]))
-        if len(features) < _FEWEST:
+        drawn.add(count, centre, about, delay, most_work)
+        if len(drawn.features) < _FEWEST:
             return None
-        found = _regress(np.array(features)[:, 4:], np.array(targets), measured[4:])
+        features = np.array(drawn.features)
+        if found is None:
+            delay = _delay(eye, features[:, 5:], drawn.q, measured[5:])
+            # those of the first round were seen at other times: only their phase is set right
+            paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
+            drawn.q.clear()
+        found = _regress(features[:, 5:], np.array(drawn.targets), measured[5:])
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
     assert found is not None
+    paths += [eye.paths(q, _OF_DRAWN_S) for q in drawn.q]
     # what still moves has not been found
     deviation = np.hypot(found.deviation[:2], moved)
     deviation[np.abs(moved) > _ASTRAY] = np.inf
     return Bounced(
         centre,
         deviation,
-        measured[2:4] + found.value[2:4],
-        found.deviation[2:4],
-        (float(found.value[4]), _WIDENED_SOFTNESS * float(found.deviation[4])),
-        (float(found.value[5]), float(found.deviation[5])),
+        measured[2:5] + found.value[2:5],
+        found.deviation[2:5],
+        (float(found.value[5]), _WIDENED_SOFTNESS * float(found.deviation[5])),
+        (float(found.value[6]), float(found.deviation[6])),
         eye.noise,
         found.distance,
-        _off_path(eye.paths(eye.q, _LAGS_S), np.array(features)[:, 4:], paths, measured[4:]),
+        _off_path(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
+        _of_other_law(drawn, centre, delay),
     )
+
+
+class _Drawn:
+    """Draws of one law: features, targets, changes and, until it is cleared, the motion as it is seen, one each."""
+
+    def __init__(self, forward: Forward, unknowns: Unknowns, eye: _Eye, rng: np.random.Generator) -> None:
+        self.forward, self.unknowns, self.eye, self.rng = forward, unknowns, eye, rng
+        self.features: list[Array] = []
+        self.targets: list[Array] = []
+        self.changes: list[Array] = []
+        self.q: list[Array] = []
+
+    def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
+        """Draw motions with clearances `about` `centre`, both in m, seen `delay` s late, until the work is done."""
+        for _ in range(count):
+            if self.forward.work > most_work:
+                return
+            numbers = self._numbers()
+            clearance = np.maximum(centre + about * self.rng.standard_normal(2), 5e-4)
+            q = self.eye.look(self.forward, self.unknowns, clearance, numbers, delay, self.rng)
+            if q is not None:
+                seen = self.eye.features(q)
+                self.features.append(seen)
+                self.targets.append(np.concatenate([clearance - seen[:2], -seen[2:5], numbers]))
+                self.changes.append(self.eye.changes(q))
+                self.q.append(q)
+
+    def _numbers(self) -> Array:
+        """Return the logarithms of penetration and damping and three gains, shape (5,)."""
+        damping = self.unknowns.nominal()[DAMPING]
+        mean = np.array([_LN_PENETRATION[0], damping, 1.0, 1.0, 1.0])
+        spread = np.array([_LN_PENETRATION[1], _DAMPING if self.unknowns.damped else 0.0, _GAIN, _GAIN, _GAIN])
+        drawn = self.rng.standard_normal(5)
+        numbers: Array = mean + spread * drawn
+        numbers[0] = np.clip(numbers[0], *np.log(_BOUNDS))
+        if self.unknowns.scene.contact.law in _OTHER_LAW.values():
+            # a share of the critical damping of the head's mass, whatever the stiffness
+            stiffness = self.unknowns.force / math.exp(numbers[0])
+            critical = 2.0 * math.sqrt(stiffness * self.unknowns.scene.head.mass_kg)
+            numbers[1] = math.log(_DAMPING_SHARE * critical) + _SHARE_DEVIATION * drawn[1]
+        return numbers
+
+    def of_other_law(self) -> _Drawn | None:
+        """Return none yet of the law that the contact may have instead, None where no such is known."""
+        contact = self.unknowns.scene.contact
+        law = _OTHER_LAW.get(contact.law)
+        if law is None or contact.exponent != 1.0:
+            return None
+        scene = replace(self.unknowns.scene, contact=replace(contact, law=law, damping=1.0, restitution=None))
+        return _Drawn(self.forward.of(scene), replace(self.unknowns, scene=scene), self.eye, self.rng)
+
+    def like(self) -> Array:
+        """Return what the motions are like, shape (n, m)."""
+        return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
+
+
+def _delay(eye: _Eye, features: Array, drawn: list[Array], measured: Array) -> float:
+    """Return the delay in s with which the measured path is nearest to that of motions drawn without one."""
+    paths = np.array([eye.paths(q, np.zeros(1))[0] for q in drawn])
+    seen = eye.paths(eye.q, _LAGS_S)
+    there = np.isfinite(paths).all(axis=0) & np.isfinite(seen).all(axis=0)
+    if there.sum() < _PATH_PHASES:
+        return 0.0
+    value, left = _Near.to(features, measured).left_over(paths[:, there])
+    off = ((seen[:, there] - value) ** 2 / (left**2).mean(axis=0)).sum(axis=1)
+    # no pose is measured before it is there
+    return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
+
+
+def _of_other_law(drawn: _Drawn, centre: Array, delay: float) -> float:
+    """Return how much more the measured motion is like those of another law; 0 where no other is known.
+
+    Goodness of fit alone does not tell laws apart whose motions are nearly alike; what classifies draws of both does
+    (choice of a model by classification: Pudlo et al., Bioinformatics 32 (2016) 859).
+    """
+    other = drawn.of_other_law()
+    if other is None:
+        return 0.0
+    other.add(_OTHER_DRAWS, centre, _CLEARANCE[-1], delay, _OTHER_WORK)
+    drawn.forward.work += other.forward.work
+    if len(other.features) < _FEWEST:
+        return 0.0
+    eye = drawn.eye
+    return _likelier(drawn.like(), other.like(), np.concatenate([eye.features(eye.q)[5:], eye.changes(eye.q)]))
+
+
+def _likelier(believed: Array, other: Array, measured: Array) -> float:
+    """Return how much more features (m,) are like `other` (k, m) than like `believed` (n, m), as a normal deviate.
+
+    A label of the two, each class weighing the same, is regressed; the deviate is among those of the believed ones,
+    each as it is told without it.
+    """
+    features = np.concatenate([believed, other])
+    sizes = [len(believed), len(other)]
+    label = np.repeat([0.0, 1.0], sizes)
+    weight = np.repeat(0.5 * len(label) / np.array(sizes), sizes)
+    z = (features - measured) / (features.std(axis=0) + 1e-12)
+    basis = np.concatenate([np.ones((len(z), 1)), z], axis=1)
+    ridge = np.diag([0.0] + [_LAW_RIDGE] * z.shape[1])
+    inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
+    beta = inverse @ (basis.T @ (weight * label))
+    leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
+    told = label - (label - basis @ beta) / (1.0 - np.minimum(leverage, 0.95))
+    right = told[: len(believed)]
+    return float((beta[0] - right.mean()) / right.std(ddof=1))
 
 
 def _off_path(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
@@ -337,13 +471,18 @@ class _Eye:
         self._period = period
         #: until then a motion forgets where it began, which a delay makes another place
         self._settled = poses.t - poses.t[0] >= period
+        self._whole = self._there.all(axis=1)
+        if self._whole.sum() <= _FEWEST_WHOLE:
+            self._whole = np.ones(len(poses.t), np.bool_)
+        self._smooth = smooth_width(poses, _AVERAGED_S)
+        self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * _REACH_PHASES).astype(int)
         self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * _PHASES).astype(int), _PHASES - 1)
 
     def look(
-        self, forward: Forward, clearance: Array, numbers: Array, rng: np.random.Generator
-    ) -> tuple[Array, Array] | None:
-        """Return the features and the path of a simulated motion; None where it cannot be run."""
-        unknowns = self._unknowns
+        self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
+        rng: np.random.Generator,
+    ) -> Array | None:  # fmt: skip
+        """Return a simulated motion as it is seen, `delay` s late; None where it cannot be run."""
         vector = unknowns.nominal()
         vector[[GX, GY]], vector[DAMPING] = clearance, numbers[1]
         vector[GAIN] = np.clip(numbers[2:5], 0.7, 1.3)
@@ -353,12 +492,9 @@ class _Eye:
         start = np.concatenate([self.q[0], np.zeros(3)])
         start += np.array([1e-3, 1e-3, 4e-3, 0.05, 0.05, 0.2]) * rng.standard_normal(6)
         white = rng.standard_normal(self.q.shape)
-        edges = np.array([0, len(self._t)])
-        run = forward.run(replace(scene, contact=contact), vector[GAIN], self._t[:1] - 0.1, start[None], edges, self._t)
-        if run is None:
-            return None
-        seen = self._seen(run.q, white)
-        return self.features(seen), self.paths(seen, _OF_DRAWN_S)
+        edges, t = np.array([0, len(self._t)]), self._t - delay
+        run = forward.run(replace(scene, contact=contact), vector[GAIN], t[:1] - 0.1, start[None], edges, t)
+        return None if run is None else self._seen(run.q, white)
 
     def paths(self, q: Array, lags_s: Array) -> Array:
         """Return the path for each of some lags, shape (lags, 240)."""
@@ -400,10 +536,16 @@ class _Eye:
         return q if self._there.all() else filled(Poses(self._t, np.where(self._there, q, np.nan)))
 
     def features(self, q: Array) -> Array:
-        """Return reach of the clearances, half the difference of the reaches, then what the motion is like."""
-        whole = self._there.all(axis=1)
-        reach = _reach(self._unknowns, q[whole] if whole.sum() > _FEWEST_WHOLE else q)
+        """Return reach of the clearances, the bias that is found, then what the motion is like."""
+        whole = q[self._whole]
+        bias = _near_bias(self._unknowns, whole)
+        whole = whole - bias
+        reach = _reach(self._unknowns, whole)
         right, left, top, bottom = reach[1]
+        bias[:2] += _off_centre(reach[1])
+        sums = np.array([right + left, top + bottom])
+        averaged = np.concatenate([self._averaged(whole), self._by_phase(whole)])
+        averaged = averaged[:, [0, 2]] + averaged[:, [1, 3]] - sums
         scatter = []
         for i in range(3):
             parts = np.array([
@@ -413,8 +555,35 @@ class _Eye:
             ])  # fmt: skip
             calm = np.sort(parts)[: max(len(parts) // 3, 1)]
             scatter += [math.log(calm.mean() + 1e-9), math.log(parts.mean() + 1e-9)] if len(parts) else [0.0, 0.0]
-        sums = [right + left, top + bottom, 0.5 * (left - right), 0.5 * (bottom - top)]
-        return np.array([*sums, *(reach[2] - reach[0]), *(reach[2] - reach[1]), *scatter])
+        like = [reach[2] - reach[0], reach[2] - reach[1], scatter, averaged.ravel()]
+        return np.concatenate([sums, bias, *like])
+
+    def changes(self, q: Array) -> Array:
+        """Return logarithms of how much pose and reaches change within some distances: how the bounces die out."""
+        rows = np.concatenate([q, reaches(self._unknowns.scene, q)], axis=1)
+        parts = []
+        for apart in _CHANGES:
+            if len(rows) > 2 * apart + 1:
+                change = rows[2 * apart :] - 2.0 * rows[apart:-apart] + rows[: -2 * apart]
+                parts += [change.std(axis=0), np.abs(change).mean(axis=0)]
+        return np.log(np.concatenate(parts) + 1e-12)
+
+    def _averaged(self, q: Array) -> Array:
+        """Return the reaches as `_reach` of the pose averaged over a few rows, in which noise counts less."""
+        even = np.full(self._smooth, 1.0 / self._smooth)
+        if self._smooth > 1:
+            q = np.stack([np.convolve(column, even, "valid") for column in q.T], axis=1)
+        return _reach(self._unknowns, q)
+
+    def _by_phase(self, q: Array) -> Array:
+        """Return mean reaches in the phases of the load in which they are farthest, shape (3, 4): where it rests."""
+        reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
+        count = np.bincount(phase, minlength=_REACH_PHASES + 1)
+        known = count > 0
+        means = np.stack([np.bincount(phase, one, len(count))[known] / count[known] for one in reach.T], axis=1)
+        means.sort(axis=0)
+        parts = [means[-max(int(share * len(means)), 1) :].mean(axis=0) for share in _FARTHEST_PARTS]
+        return np.stack(parts)
 
 
 def _reach(unknowns: Unknowns, q: Array) -> Array:

@@ -73,6 +73,10 @@ class Forward:
         """Return another one for the same motions, with no work done."""
         return Forward(self._scene, self._load)
 
+    def of(self, scene: Scene) -> Forward:
+        """Return one of another nominal scene under the same load, with no work done."""
+        return Forward(scene, self._load)
+
     def run(
         self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array,
         depth: Array | None = None,
