@@ -298,7 +298,7 @@ def _delay(eye: _Eye, features: Array, drawn: list[Array], measured: Array) -> f
     if there.sum() < _PATH_PHASES:
         return 0.0
     value, left = _Near.to(features, measured).left_over(paths[:, there])
-    off = ((seen[:, there] - value) ** 2 / (left**2).mean(axis=0)).sum(axis=1)
+    off = ((seen[:, there] - value) ** 2 / ((left**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
     # no pose is measured before it is there
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
@@ -474,7 +474,7 @@ class _Eye:
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:
             self._whole = np.ones(len(poses.t), np.bool_)
-        self._smooth = smooth_width(poses, _AVERAGED_S)
+        self._smooth = max(min(smooth_width(poses, _AVERAGED_S), int(self._whole.sum()) // 8), 1)
         self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * _REACH_PHASES).astype(int)
         self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * _PHASES).astype(int), _PHASES - 1)
 
