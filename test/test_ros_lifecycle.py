@@ -102,6 +102,35 @@ def test_a_managed_node_waits_refuses_nonsense_and_goes_through_all_states(tmp_p
     assert RunReader(tmp_path / "first_2").header.parameters["scene"] == "bench_kv"
 
 
+def test_a_request_beside_a_cleanup_is_answered_and_the_node_lives(tmp_path: Path) -> None:
+    with bench(tmp_path) as running:
+        node, at = running.probe.node, f"{running.namespace}/plow_twin"
+        change = node.create_client(ChangeState, f"{at}/change_state")
+        asked = [node.create_client(Trigger, f"{at}/{name}") for name in ("acknowledge_alarms", "mark", "reset")]
+        running.probe.until(lambda: all(one.service_is_ready() for one in (change, *asked)), "services")
+        running.probe.pause(0.5)
+
+        def beside(transition: int) -> None:
+            """Send requests before and after that of a transition, faster than they are answered."""
+            request = ChangeState.Request(transition=Transition(id=transition))
+            before = [one.call_async(Trigger.Request()) for one in asked]
+            changed = change.call_async(request)
+            after = [one.call_async(Trigger.Request()) for one in asked]
+            running.probe.until(lambda: all(one.done() for one in (changed, *before, *after)), "answers")
+            assert changed.result().success
+            answers = [one.result() for one in (*before, *after)]
+            refused = [answer.message for answer in answers if "expected a configured node" in answer.message]
+            assert refused and not any(answer.success for answer in answers if answer.message in refused)
+
+        assert _change(running, Transition.TRANSITION_DEACTIVATE)
+        for _ in range(3):
+            beside(Transition.TRANSITION_CLEANUP)
+            assert _change(running, Transition.TRANSITION_CONFIGURE)
+        beside(Transition.TRANSITION_INACTIVE_SHUTDOWN)
+        assert _state(running) == "finalized"
+        assert running.twin.stop() == 0
+
+
 def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
     given = ["excitation_source:=drum", "tolerance:=.nan", "jump_back:=-3", "input_depth:=5.5", "autostart:=1"]
     settings = [word for item in given for word in ("-p", item)]

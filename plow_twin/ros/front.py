@@ -1,4 +1,4 @@
-"""The live twin on ROS 2: topics, timers and services around a runtime."""
+"""The live twin on ROS 2: topics, timers and answers around a runtime."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any, Final
 from diagnostic_msgs.msg import DiagnosticStatus as RosDiagnosticStatus
 from rclpy.node import Node
 from sensor_msgs.msg import JointState as RosJointState
-from std_srvs.srv import Trigger
 
 from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.live.runtime import Runtime
@@ -104,10 +103,7 @@ class RosFront:
         self.subscriptions = Subscriptions(node, runtime, loop, self.turns, self.changed)
         for rate_hz, do in runtime.periodic():
             loop.every(1.0 / rate_hz, do)
-        services = Services(runtime, self.changed)
-        for name in SERVICES:
-            service = node.create_service(Trigger, f"~/{name}", self._answer(getattr(services, name)))
-            made.callback(node.destroy_service, service)
+        self._services = Services(runtime, self.changed)
         runtime.start()
         loop.start()
 
@@ -156,24 +152,19 @@ class RosFront:
             self.runtime.deactivate()
         self._loop.run_timers(False)
 
+    def answer(self, name: str) -> tuple[bool, str]:
+        """Do what a service of that name is for; return whether it was done, and a text for who asked."""
+        with self.turns:
+            if self.runtime.waits_for_clock:
+                return False, "use_sim_time is set and nothing has come on /clock yet"
+            done: tuple[bool, str] = getattr(self._services, name)()
+            return done
+
     def close(self) -> list[str]:
         """Release everything, last things first; return what was lost, in words."""
         self.deactivate()
         self._made.close()
         return self._lost
-
-    def _answer(
-        self, do: Callable[[], tuple[bool, str]]
-    ) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
-        def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            with self.turns:
-                if self.runtime.waits_for_clock:
-                    response.success, response.message = False, "use_sim_time is set and nothing has come on /clock yet"
-                else:
-                    response.success, response.message = do()
-            return response
-
-        return answer
 
     def _failed(self, error: Exception) -> None:
         self.say_error(f"the inputs are read no more: {''.join(traceback.format_exception(error))}")

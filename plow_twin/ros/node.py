@@ -7,6 +7,7 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any, Final
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -14,6 +15,7 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from std_srvs.srv import Trigger
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.live import diagnostics
@@ -24,7 +26,7 @@ from plow_twin.live.solver_start import Preparation, key
 from plow_twin.record import messages as plain
 from plow_twin.record import sending
 from plow_twin.ros.connections import LOOK_S, Connections, WithoutEvents
-from plow_twin.ros.front import RosFront
+from plow_twin.ros.front import SERVICES, RosFront
 from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
@@ -66,6 +68,9 @@ class TwinNode(WithoutEvents, LifecycleNode):
             self.get_logger().warning(f"refused by the system: {refused}")
         self._status = self.create_publisher(DiagnosticStatus, "status", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
+        for name in SERVICES:
+            # for good: a request that waits when its service is destroyed ends rclpy's executor
+            self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
         # steady: reports go on when /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
@@ -166,6 +171,13 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._kept_wear[runtime.identity] = tuple(runtime.driver.session.wear_depth.tolist())
         for lost in front.close():
             self.get_logger().error(lost)
+
+    def _answer(self, name: str, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._front is None:
+            response.message = f"lifecycle: got {self.lifecycle}, expected a configured node"
+        else:
+            response.success, response.message = self._front.answer(name)
+        return response
 
     def _configured(self) -> RosFront:
         if self._front is None:
