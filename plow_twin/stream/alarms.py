@@ -180,21 +180,21 @@ class Alarms:
 
     def take_many(self, publications: Publications) -> Iterator[int]:
         """Take in publications, none of them held; yield the index of each that has changed a level, right after it."""
-        peaks = publications.peak.max(axis=1)
-        values = {"force": peaks, "wear_rate": publications.wear_rate.max(axis=1, initial=0.0)}
-        values["clearance"] = publications.clearance[:, :2].max(axis=1, initial=-math.inf)
+        values = {"force": publications.peak, "wear_rate": publications.wear_rate}
+        values["clearance"] = publications.clearance[:, :2]
         quiet = all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms)
         growth = self.alarms.get("clearance_rate")
         if self._model is not None or not quiet or (growth is not None and growth.lowest < math.inf):
             yield from (index for index in range(len(publications)) if self.take(publications[index]))
             return
-        stamps_ns = publications.stamp_ns[publications.slow_index].tolist()
-        for stamp_ns, clearance in zip(stamps_ns, values["clearance"].tolist(), strict=True):
-            if growth is not None:
-                growth.take(self._growth(stamp_ns, clearance), stamp_ns, self._duration_ns)
-        for name, found in values.items():
-            if name in self.alarms and len(found):
-                self.alarms[name].take(float(found[-1]), int(publications.stamp_ns[-1]), self._duration_ns)
+        rate, stamps_ns = 0.0, publications.stamp_ns[publications.slow_index].tolist()
+        for stamp_ns, clearance in zip(stamps_ns, values["clearance"].max(axis=1).tolist(), strict=True):
+            rate = self._growth(stamp_ns, clearance)
+        # of what changes nothing the newest is remembered
+        newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
+        for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
+            if name in self.alarms:
+                self.alarms[name].take(value, int(publications.stamp_ns[-1]), self._duration_ns)
 
     def take_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
         """Take in a measured pose (x, y [m], theta [rad]); True when a level has changed."""
