@@ -32,6 +32,8 @@ from plow_twin.stream.journal import Digest, Entry, Sample
 _PENDING: Final = 65_536
 #: A batch is made when so many entries, or the sixteenth part of so many chunks, have come: their cost is shared.
 _LEAST: Final = 8192
+#: The same without messages that were sent, which take most of the memory.
+_LEAST_ALONE: Final = 32_768
 #: Size of a recording of all outputs at 1 kHz for each second [B].
 _BYTES_PER_S: Final = 400_000
 _HALF, _WHOLE = 2**31, 2**32
@@ -364,6 +366,7 @@ class _Merger:
     def __init__(self, reader: RunReader, outputs: bool) -> None:
         self._run = reader
         self._with_outputs = outputs
+        self._least = _LEAST if outputs else _LEAST_ALONE
         header = reader.header
         self._journal = (header.samples_topic, header.entries_topic)
         self._template = sample_template(header.frame_id)
@@ -413,7 +416,7 @@ class _Merger:
         if sent and self._with_outputs:
             chosen = messages if len(sent) == np.count_nonzero(counts) else _of(messages, sent)
             self._outputs.append(Outputs(chosen, self._unwrap(chosen.sequence), dict(self._topics)))
-        if self._count < _LEAST and len(self._outputs) < _LEAST // 16:
+        if self._count < self._least and len(self._outputs) < _LEAST // 16:
             return
         newest = max((part.newest for part in self._outputs), default=-1)
         if not self._with_outputs or self._count > _PENDING:
