@@ -362,7 +362,7 @@ class Outputs:
             clearance=clearance,
             wear_rate=wear_rate,
         )
-        self._stamp_ns = int(stamps[-1])
+        self._stamp_ns, self._held = int(stamps[-1]), False
         begin = int(taken[-1]) + 1 if len(taken) else 0
         self._advance = rows[len(stamps) - 1] if begin < len(stamps) else None
         if len(taken):
