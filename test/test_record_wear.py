@@ -10,18 +10,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plow_twin.live.wear_keeper import WearKeeper
-from plow_twin.record.wear_state import FILE_NAME, WearState, WearStateError, load_wear, save_wear, scene_identity
+from plow_twin.live.wear_keeper import KeptWear, WearKeeper
+from plow_twin.record.wear_state import (
+    FILE_NAME,
+    WearState,
+    WearStateError,
+    load_wear,
+    save_wear,
+    scene_identity,
+    wear_content,
+)
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 
 SCENE = load_scene(scene_path("paper"))
 DEPTH = tuple(0.05 / 3.0 * index for index in range(8))
+NEW, WORN = np.zeros(8), np.full(8, 1e-3)
 
 
-def _save(folder: Path) -> Path:
-    save_wear(folder, WearState("head 7", scene_identity(SCENE), DEPTH))
+def _save(folder: Path, depth: tuple[float, ...] = DEPTH) -> Path:
+    save_wear(folder, wear_content(WearState("head 7", scene_identity(SCENE), depth)))
     return folder / FILE_NAME
+
+
+def _saved(keeper: WearKeeper, depth: np.ndarray) -> str:
+    """Have depths saved and wait for it; return the error."""
+    keeper.save(depth)
+    assert keeper._writing is not None
+    keeper._writing.result()
+    return keeper.error
 
 
 def test_what_was_saved_is_loaded_to_the_bit_and_nothing_else_stays_behind(tmp_path: Path) -> None:
@@ -77,7 +94,82 @@ def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypat
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        save_wear(tmp_path, WearState("head 7", scene_identity(SCENE), (1.0,) * 8))
+        _save(tmp_path, (0.1,) * 8)
     monkeypatch.undo()
     assert load_wear(tmp_path, "head 7", SCENE) == DEPTH
     assert os.listdir(tmp_path) == [FILE_NAME]
+
+
+def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) -> None:
+    # as a volume that is mounted late: another folder is there of a sudden, with the wear of before
+    folder, volume = tmp_path / "wear", tmp_path / "volume"
+    volume.mkdir()
+    path = _save(volume)
+    keeper = WearKeeper(folder, "head 7", SCENE)
+    assert keeper.load() is None and _saved(keeper, NEW) == ""
+    folder.rename(tmp_path / "beneath")
+    volume.rename(folder)
+    for _ in range(2):
+        assert "is not the file that this twin has read or written" in _saved(keeper, WORN)
+    assert load_wear(folder, "head 7", SCENE) == DEPTH
+    with pytest.raises(WearStateError, match="another twin keeps its wear there"):
+        WearKeeper(folder, "head 7", SCENE)
+    # the one of before is back; then it is written to by somebody, then removed
+    folder.rename(volume)
+    (tmp_path / "beneath").rename(folder)
+    assert _saved(keeper, WORN) == "" and load_wear(folder, "head 7", SCENE) == tuple(WORN)
+    _save(folder)
+    assert _saved(keeper, 2.0 * WORN) and load_wear(folder, "head 7", SCENE) == DEPTH
+    (folder / FILE_NAME).unlink()
+    assert _saved(keeper, 2.0 * WORN) == "" and load_wear(folder, "head 7", SCENE) == tuple(2.0 * WORN)
+    keeper.close(2.0 * WORN)
+    assert load_wear(path.parent, "head 7", SCENE) == DEPTH
+
+
+def test_a_folder_that_is_made_anew_is_claimed_anew(tmp_path: Path) -> None:
+    folder = tmp_path / "wear"
+    first = WearKeeper(folder, "head 7", SCENE)
+    assert _saved(first, NEW) == ""
+    folder.rename(tmp_path / "old")
+    assert _saved(first, WORN) == "" and load_wear(folder, "head 7", SCENE) == tuple(WORN)
+    with pytest.raises(WearStateError, match="another twin keeps its wear there"):
+        WearKeeper(folder, "head 7", SCENE)
+    folder.rename(tmp_path / "older")
+    second = WearKeeper(folder, "head 7", SCENE)
+    second.close(WORN)
+    second = WearKeeper(folder, "head 7", SCENE)
+    assert "another twin keeps its wear there" in _saved(first, NEW)
+    second.close(WORN)
+    first.release()
+    assert load_wear(folder, "head 7", SCENE) == tuple(WORN)
+
+
+@pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.parametrize("waited", [False, True])
+def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waited: bool, replaced: bool
+) -> None:
+    keeper = WearKeeper(tmp_path, "head 7", SCENE)
+    assert keeper.load() is None and _saved(keeper, NEW) == ""
+    with monkeypatch.context() as full:
+        calls: list[int] = []
+
+        def fail(descriptor: int) -> None:
+            calls.append(descriptor)
+            if len(calls) == 1 + waited:  # of the file, or of the folder, when the new file is there already
+                raise OSError(28, "No space left on device")
+
+        full.setattr(os, "fsync", fail)
+        assert "No space" in _saved(keeper, WORN)
+    with monkeypatch.context() as full:
+        full.setattr(os, "fsync", lambda descriptor: os.fstat(-1))
+        keeper.close(2.0 * WORN)
+    kept = keeper.kept(2.0 * WORN)
+    if replaced:
+        _save(tmp_path)
+    again = WearKeeper(tmp_path, "head 7", SCENE)
+    assert again.load(kept) == (DEPTH if replaced else tuple(2.0 * WORN))
+    assert again.load(KeptWear(tuple(3.0 * WORN))) == load_wear(tmp_path, "head 7", SCENE)
+    again.close(2.0 * WORN)
+    assert again.kept(WORN) == KeptWear(tuple(WORN))
+    assert load_wear(tmp_path, "head 7", SCENE) == tuple(2.0 * WORN)

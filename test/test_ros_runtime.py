@@ -106,6 +106,23 @@ def test_no_runtime_outlives_its_cycle() -> None:
     assert gc.get_freeze_count() == 0
 
 
+def test_wear_that_the_disk_did_not_take_outlives_a_cleanup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    with _node(wear_state_path=str(tmp_path)) as node:
+        assert node.start() and node.runtime is not None
+        node.runtime.driver.set_wear(node.runtime.stamp_ns, (1e-4,) * 8, "test")
+        assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        assert node.start() and node.runtime is not None
+        node.runtime.driver.set_wear(node.runtime.stamp_ns, (2e-4,) * 8, "test")
+        with monkeypatch.context() as disk:
+            disk.setattr(os, "fsync", full)
+            assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        assert node.start() and node.runtime is not None
+        assert node.runtime.driver.session.wear_depth.tolist() == [2e-4] * 8
+
+
 def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
     with _node() as node:
         assert node.start()

@@ -19,7 +19,7 @@ from plow_twin.live.inputs import Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
 from plow_twin.live.publishing import Front, Publishing
 from plow_twin.live.solver_start import Prepared
-from plow_twin.live.wear_keeper import WearKeeper
+from plow_twin.live.wear_keeper import KeptWear, WearKeeper
 from plow_twin.model.scene import Scene, fastest_travel
 from plow_twin.record.alarms import alarms_of
 from plow_twin.record.messages import DiagnosticStatus
@@ -54,7 +54,7 @@ class Runtime:
     prepared
         Scene and twin, the solver compiled; nobody else may use the twin.
     kept_wear
-        Wear depths [m] of earlier runtimes of this process, by the scene's identity.
+        Wear of earlier runtimes of this process, by the scene's identity.
 
     Raises
     ------
@@ -69,7 +69,7 @@ class Runtime:
         front: Front,
         settings: Settings,
         prepared: Prepared,
-        kept_wear: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
+        kept_wear: Mapping[str, KeptWear] = MappingProxyType({}),
     ) -> None:
         self._front = front
         self.settings = settings
@@ -89,7 +89,8 @@ class Runtime:
         self.wear_keeper: WearKeeper | None = None
         #: what the wear's identity is
         self.identity = scene_identity(self.scene)
-        depth = kept_wear.get(self.identity)
+        kept = kept_wear.get(self.identity)
+        depth = kept.depth_m if kept else None
         self.alarms = alarms_of(asdict(settings))
         # refuses, here and not while samples come, what the settings would change
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
@@ -97,7 +98,9 @@ class Runtime:
             if settings.wear_state_path:
                 self.wear_keeper = WearKeeper(Path(settings.wear_state_path), settings.hardware_id, self.scene)
                 made.callback(self.wear_keeper.release)
-                depth = self.wear_keeper.load() or depth
+                depth = self.wear_keeper.load(kept)
+                if kept and kept.older_files and depth == kept.depth_m:
+                    front.say_error(f"{settings.wear_state_path}: the file is older than the wear of this process")
             self.recording = self._record()
             if self.recording:
                 made.callback(self.recording.close)
@@ -161,6 +164,11 @@ class Runtime:
     def wear_error(self) -> str:
         """Why the wear could not be saved; empty: it could, or it is not kept."""
         return self.wear_keeper.error if self.wear_keeper else ""
+
+    def kept_wear(self) -> KeptWear:
+        """Return the wear for the next runtime of this process; after the close."""
+        depth = self.driver.session.wear_depth
+        return self.wear_keeper.kept(depth) if self.wear_keeper else KeptWear(tuple(depth.tolist()))
 
     @property
     def recorder_state(self) -> str:

@@ -4,17 +4,47 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.scene import Scene
-from plow_twin.record.wear_state import WearState, claim_folder, load_wear, save_wear, scene_identity
+from plow_twin.record.wear_state import (
+    FILE_NAME,
+    WearState,
+    WearStateError,
+    claim_folder,
+    parse_wear,
+    read_wear,
+    save_wear,
+    scene_identity,
+    wear_content,
+)
+
+
+@dataclass(frozen=True)
+class KeptWear:
+    """Wear that an earlier runtime of this process left.
+
+    Attributes
+    ----------
+    depth_m
+        Depths [m].
+    older_files
+        What a file may hold that these depths should have replaced and could not.
+    """
+
+    depth_m: tuple[float, ...]
+    older_files: tuple[bytes, ...] = ()
 
 
 class WearKeeper:
     """The wear of one head in one scene, in a folder.
+
+    Only a file that this keeper has read or written is replaced: another one, of a volume that was mounted meanwhile
+    or of somebody who put it there, is wear that nobody has used yet.
 
     Parameters
     ----------
@@ -36,15 +66,31 @@ class WearKeeper:
         self._claim: int | None = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
+        self._own: tuple[bytes, ...] = ()  # what the file may hold: what was read, or written the last time
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
         self._writing: Future[None] | None = None
         #: why it could not be saved the last time; empty: it could
         self.error = ""
 
-    def load(self) -> tuple[float, ...] | None:
-        """Return the saved depths [m], or None when none have been saved; raises as `load_wear`."""
-        self._saved = load_wear(self.folder, self._head, self._scene)
-        return self._saved
+    def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
+        """Return the depths [m] to go on with, or None when there are none.
+
+        Those of the file, unless it is the one that the `kept` ones could not replace.
+
+        Raises
+        ------
+        WearStateError
+            As `parse_wear`.
+        """
+        found = read_wear(self.folder)
+        if found is not None:
+            self._own = (found,)
+            self._saved = parse_wear(found, self.folder / FILE_NAME, self._head, self._scene)
+        return kept.depth_m if kept is not None and found in (None, *kept.older_files) else self._saved
+
+    def kept(self, depth: NDArray[np.float64]) -> KeptWear:
+        """Return depths [m] for the next runtime of this process; after the close."""
+        return KeptWear(tuple(depth.tolist()), self._own if self.error else ())
 
     def save(self, depth: NDArray[np.float64]) -> None:
         """Save depths [m] unless they are saved already; does not wait for the disk."""
@@ -70,8 +116,28 @@ class WearKeeper:
 
     def _save(self, values: tuple[float, ...]) -> None:
         try:
-            save_wear(self.folder, WearState(self._head, self._identity, values))
-        except OSError as error:
+            if not self._is_claimed():
+                # moved, removed or hidden by a mount: who has the folder of that name now is to be found out
+                self.release()
+                self._claim = claim_folder(self.folder)
+            found = read_wear(self.folder)
+            if found not in (None, *self._own):
+                raise WearStateError(
+                    f"{self.folder / FILE_NAME} is not the file that this twin has read or written and is left as it "
+                    "is: clean up and configure to go on with its wear, or move it away to have that of this twin saved"
+                )
+            content = wear_content(WearState(self._head, self._identity, values))
+            self._own = (content,) if found is None else (found, content)
+            save_wear(self.folder, content)
+            self._own = (content,)
+        except (OSError, WearStateError) as error:
             self.error = f"{self.folder}: wear not saved: {error}"
         else:
             self._saved, self.error = values, ""
+
+    def _is_claimed(self) -> bool:
+        """Tell whether the folder of that name is the one that this twin has claimed."""
+        try:
+            return self._claim is not None and os.path.samestat(os.fstat(self._claim), self.folder.stat())
+        except FileNotFoundError:
+            return False

@@ -58,21 +58,37 @@ def check_depth(depth_m: Sequence[float], scene: Scene) -> None:
 
 
 def load_wear(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None:
-    """Return the saved depths [m], or None when none have been saved.
+    """Return the saved depths [m], or None when none have been saved; raises as `read_wear` and `parse_wear`."""
+    content = read_wear(folder)
+    return None if content is None else parse_wear(content, folder / FILE_NAME, head, scene)
+
+
+def read_wear(folder: Path) -> bytes | None:
+    """Return what the file in a folder holds, or None when there is none.
 
     Raises
     ------
     WearStateError
-        The file cannot be read, is damaged, or is that of another head or scene.
+        It cannot be read.
     """
     path = folder / FILE_NAME
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_bytes()
     except FileNotFoundError:
         return None
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise WearStateError(f"{path}: cannot be read: {error}") from error
-    state = _parse(text, path)
+
+
+def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[float, ...]:
+    """Return the depths [m] that the content of a file holds.
+
+    Raises
+    ------
+    WearStateError
+        It is damaged, or that of another head or scene.
+    """
+    state = _parse(content, path)
     for name, got, expected in (("head", state.head, head), ("scene", state.scene, scene_identity(scene))):
         if got != expected:
             raise WearStateError(
@@ -126,16 +142,8 @@ def _beside(folder: Path) -> Path:
     return folder / f".{FILE_NAME}.{os.getpid()}"
 
 
-def save_wear(folder: Path, state: WearState) -> None:
-    """Write the depths so that after a crash at any time the file is the old one or the new one, whole.
-
-    Raises
-    ------
-    OSError
-        The disk does not take it; the old file is as it was.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path, beside = folder / FILE_NAME, _beside(folder)
+def wear_content(state: WearState) -> bytes:
+    """Return what a file of that wear, saved now, holds."""
     record = {
         "version": VERSION,
         "head": state.head,
@@ -143,9 +151,22 @@ def save_wear(folder: Path, state: WearState) -> None:
         "saved": datetime.now(UTC).isoformat(timespec="seconds"),
         "depth_m": dict(zip(PAIR_NAMES, state.depth_m, strict=True)),
     }
+    return (json.dumps(record, indent=1) + "\n").encode()
+
+
+def save_wear(folder: Path, content: bytes) -> None:
+    """Write a file so that after a crash at any time it is the old one or the new one, whole.
+
+    Raises
+    ------
+    OSError
+        The disk does not take it; the file is the old one, or the new one when the disk does not answer for it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path, beside = folder / FILE_NAME, _beside(folder)
     try:
-        with beside.open("w", encoding="utf-8") as stream:
-            stream.write(json.dumps(record, indent=1) + "\n")
+        with beside.open("wb") as stream:
+            stream.write(content)
             stream.flush()
             os.fsync(stream.fileno())
         beside.replace(path)
@@ -155,9 +176,9 @@ def save_wear(folder: Path, state: WearState) -> None:
     sync_path(folder)
 
 
-def _parse(text: str, path: Path) -> WearState:
+def _parse(content: bytes, path: Path) -> WearState:
     try:
-        record: dict[str, Any] = json.loads(text)
+        record: dict[str, Any] = json.loads(content)
         version = record["version"]
         if version != VERSION:
             raise WearStateError(f"{path}: version: got {version!r}, expected {VERSION}")

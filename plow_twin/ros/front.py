@@ -16,6 +16,7 @@ from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Prepared
+from plow_twin.live.wear_keeper import KeptWear
 from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.messages import ros_joint_state, ros_status
@@ -63,7 +64,7 @@ class RosFront:
         settings: Settings,
         changed: Callable[[], None],
         prepared: Prepared,
-        kept_wear: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
+        kept_wear: Mapping[str, KeptWear] = MappingProxyType({}),
     ) -> None:
         self._node = node
         self.name: str = node.get_fully_qualified_name()
@@ -79,9 +80,7 @@ class RosFront:
             self._make(settings, prepared, kept_wear, made)
             self._made = made.pop_all()
 
-    def _make(
-        self, settings: Settings, prepared: Prepared, kept_wear: Mapping[str, tuple[float, ...]], made: ExitStack
-    ) -> None:
+    def _make(self, settings: Settings, prepared: Prepared, kept_wear: Mapping[str, KeptWear], made: ExitStack) -> None:
         """Make everything on the node; what is made is noted to be undone, on an error too."""
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)

@@ -23,6 +23,7 @@ from plow_twin.live.parameters import Settings
 from plow_twin.live.realtime import apply_realtime
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Preparation, key
+from plow_twin.live.wear_keeper import KeptWear
 from plow_twin.record import messages as plain
 from plow_twin.record import sending
 from plow_twin.ros.connections import LOOK_S, Connections, WithoutEvents
@@ -58,8 +59,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self.lifecycle = "unconfigured"
         #: why the last configure failed
         self.reason = ""
-        #: wear depths of the scenes that have been configured: cleanup does not lose them
-        self._kept_wear: dict[str, tuple[float, ...]] = {}
+        #: wear of the scenes that have been configured: cleanup does not lose them
+        self._kept_wear: dict[str, KeptWear] = {}
         self._preparation: Preparation | None = None
         self._health = diagnostics.Health()
         self._published_status: tuple[Any, ...] = ()
@@ -168,9 +169,11 @@ class TwinNode(WithoutEvents, LifecycleNode):
         if front is None:
             return
         runtime = front.runtime
-        self._kept_wear[runtime.identity] = tuple(runtime.driver.session.wear_depth.tolist())
-        for lost in front.close():
-            self.get_logger().error(lost)
+        try:
+            for lost in front.close():
+                self.get_logger().error(lost)
+        finally:
+            self._kept_wear[runtime.identity] = runtime.kept_wear()
 
     def _answer(self, name: str, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._front is None:
