@@ -115,6 +115,39 @@ def test_a_file_is_fed_recorded_and_replayed_and_every_row_is_counted(
     assert len(printed) == 9 and "excitation,load,non_finite,1,2200000000,nan 0.0 0.0" in printed
 
 
+def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    date = "2026-01-01T00:00:{:06.3f}".format
+    rows = [f"{date(index * 1e-3)},1,2,3\n" for index in range(300)]
+    rows[150:150] = ["2080-01-01,1,2,3\n"]  # a stamp that does not go on
+    rows[200:200] = ["9999-12-31,1,2,3\n", "9999-12-31,1,2,3\n"]
+    path = tmp_path / "load.csv"
+    path.write_text("time,fx,fy,m\n" + "".join(rows))
+    values = _run(path, record_path=str(tmp_path / "run"))["input"][2]
+    assert (values["samples_used"], values["dropped_stray"], values["dropped_malformed"]) == ("300", "1", "2")
+    assert float(values["newest_sample_age_s"]) == 0.0
+    assert run_cli(["info", str(tmp_path / "run"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["duration_s"] < 1.0
+    assert replay(tmp_path / "run").samples == 300
+
+
+@pytest.mark.parametrize(("column", "bad"), [("x", "99"), ("speed", "fast")])
+def test_whatever_is_dropped_of_any_input_is_told_by_the_exit_code(column: str, bad: str, tmp_path: Path) -> None:
+    path = tmp_path / "all.csv"
+    rows = "".join(f"{index * 0.01},1,2,3,{bad if index % 2 else 0}\n" for index in range(20))
+    path.write_text(f"t,fx,fy,m,{column}\n{rows}")
+    role = "head_pose" if column == "x" else "travel"
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text(f"excitation: {{topic: all}}\n{role}: {{topic: all, fields: {{{column}: {column}}}}}\n")
+    assert run_cli(["live", str(path), "--map", str(mapping), "--quiet"]) == 3
+
+
+def test_a_pose_may_lack_any_component(tmp_path: Path) -> None:
+    path = _csv(tmp_path / "load.csv", 20)
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text("excitation: {topic: load}\nhead_pose: {topic: load, fields: {theta: m}, scale: 1e-9}\n")
+    assert _run(path, mapping)["input"][2]["head_pose_used"] == "20"
+
+
 def test_measured_poses_and_gaps_are_journaled_as_they_come(tmp_path: Path) -> None:
     rows = [",".join(map(repr, _row(index))) + ",,,," for index in range(100)]
     rows.insert(50, "0.0302,,,,0.001,0.002,0.003,0.004")
@@ -253,6 +286,8 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
     assert time_ns(1_767_323_045_123_456_789, "ns") == 1_767_323_045_123_456_789
     assert time_ns(0.5) == 1_500_000_000  # counts from some start: 0 would be no stamp
     assert time_ns("yesterday") is None and time_ns(float("inf")) is None and time_ns(1e300) is None
+    # what many a database writes for no date, and what no stamp can hold
+    assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
     for text, said in (
         ("unit: {x: N}", "unit: got 'N', expected one of m, cm, mm, um"),
@@ -369,6 +404,8 @@ def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_tak
     assert read() == [60.0]
     path.write_text("0,7\n0,70,7,0\n")  # cut within a line: its second half is none
     assert read() == [None, 70.0]
+    path.write_text("t,fx,fy,m\n" + "8,80,0,0\n" * 3)  # written anew, and longer than it was
+    assert read() == [80.0] * 3
     path.unlink()
     assert read() == []
     path.write_text("a,b\n1,2\n")
@@ -627,6 +664,8 @@ def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(ur
         (["load.csv", "--set", "excitation_timeout=-1"], 2, "a number from 0.01"),
         (["load.csv", "--set", "excitation_source=tool_forces"], 1, "expected 'excitation' or 'scene'"),
         (["other.csv"], 1, "expected the columns fx, fy, m"),
+        (["twice.csv"], 1, "column 'fx' stands there more than once"),
+        (["load.csv", "--map", "twice.yaml"], 1, "the key twice, in lines 1 and 2"),
         (["junk.csv"], 1, "\\x1b"),
         (["mqtt://localhost:1"], 1, "expected one that names the topics"),
     ],
@@ -642,6 +681,8 @@ def test_a_wrong_call_says_what_was_expected(
     monkeypatch.chdir(tmp_path)
     _csv(tmp_path / "load.csv", 3)
     (tmp_path / "other.csv").write_text("t,a,b\n1,2,3\n")
+    (tmp_path / "twice.csv").write_text("t,fx,fx,fy,m\n1,2,3,4,5\n")
+    (tmp_path / "twice.yaml").write_text("excitation: {topic: load}\nexcitation: {topic: other}\n")
     (tmp_path / "junk.csv").write_bytes(b"\x1b[31m" + bytes(range(256)) * 100)
     assert run_cli(["live", *arguments, "--quiet"]) == code
     assert said in " ".join(capfd.readouterr().err.split())

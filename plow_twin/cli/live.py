@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 
 _LEVELS = ("OK", "WARN", "ERROR")
 #: Counters that say that something of the input was not used.
-_LOST = ("dropped_", "samples_lost", "messages_lost")
+_LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
@@ -108,7 +109,7 @@ def _live(
         click.echo(json.dumps(facts, indent=2))
     elif not quiet and not lines:
         show_facts(output_console(), {"input": {key: facts["input"][key] for key in _shown(facts["input"])}})
-    unused = any(int(facts["input"][key]) for key in facts["input"] if key.startswith(_LOST))
+    unused = any(int(facts["input"][key]) for key in facts["input"] if _LOST.fullmatch(key))
     return leave(DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE)
 
 

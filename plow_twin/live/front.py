@@ -120,8 +120,11 @@ class BridgeFront:
         lost: list[str] = []
         try:
             bridge.start([role.topic for role in self.roles.values()])
+            first = bridge.poll(0.0) if bridge.ends else []
+            self._feeder.begin(first)
             runtime.start()
             runtime.activate()
+            self._feeder.take(first)
             self._loop(stop_asked, time.monotonic() + seconds)
         finally:
             bridge.close()

@@ -13,6 +13,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
+from plow_twin.scene_file.yaml_text import load_yaml
 
 #: What a recording can hold, and the numbers of each, with the fields where they stand by default, by type.
 ROLES: Final[dict[str, tuple[str, ...]]] = {
@@ -263,13 +264,12 @@ def read_map_file(path: Path) -> dict[Any, Any]:
     RecordingError
         It holds no mapping.
     """
-    import yaml
-
     try:
-        text = path.read_text(encoding="utf-8")
-        given = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, RecursionError, yaml.YAMLError) as error:
+        given, problems = load_yaml(path.read_text(encoding="utf-8-sig"), "file", ", ".join(ROLES))
+    except (OSError, UnicodeDecodeError, RecursionError) as error:
         raise RecordingError(f"{path}: cannot be read as YAML: {error}") from error
+    if problems:
+        raise RecordingError(f"{path}: cannot be read as YAML: {'; '.join(map(str, problems))}")
     if not isinstance(given, dict) or not given:
         raise RecordingError(f"{path}: got {type(given).__name__}, expected a mapping with {', '.join(ROLES)}")
     return given

@@ -18,6 +18,8 @@ _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 #: for a missing stamp.
 _EPOCH_S: Final = 1e9
 _ORIGIN_NS: Final = 1_000_000_000
+#: Years of the epoch's other end: 9999-12-31 stands for no date in many a database.
+_FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
 
 def time_ns(value: Any, unit: str = "s") -> int | None:
@@ -33,15 +35,17 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
         elif NUMBER.fullmatch(value):
             value = float(value)
         else:
-            return _date_ns(value)
+            return _within(_date_ns(value))
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
         return None
     scale = STAMP_UNITS[unit]
     # integers keep their nanoseconds; a float of today's date holds some 0.2 us
-    stamp_ns = value * scale if isinstance(value, int) else round(value * scale)
-    if abs(stamp_ns) > 4e18:
-        return None
-    return stamp_ns if stamp_ns >= _EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
+    stamp_ns = _within(value * scale if isinstance(value, int) else round(value * scale))
+    return stamp_ns if stamp_ns is None or stamp_ns >= _EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
+
+
+def _within(stamp_ns: int | None) -> int | None:
+    return None if stamp_ns is None or abs(stamp_ns) > _FARTHEST_NS else stamp_ns
 
 
 def _date_ns(text: str) -> int | None:

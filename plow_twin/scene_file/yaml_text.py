@@ -52,14 +52,14 @@ SceneLoader.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.va
 SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
 
 
-def load_yaml(text: str) -> tuple[Any, list[Problem]]:
-    """Return the document and its problems; it is None when it cannot be read at all."""
+def load_yaml(text: str, name: str = "scene", sections: str = "the sections of a scene") -> tuple[Any, list[Problem]]:
+    """Return the document and its problems, which call it by `name`; it is None when it cannot be read at all."""
     try:
         loader = SceneLoader(text)
         try:
             node = loader.get_single_node()
             if node is None:
-                return None, [Problem("scene", "an empty file", "the sections of a scene")]
+                return None, [Problem(name, "an empty file", sections)]
             problems = list(_repeated_keys(node, "", 0))
             if any(problem.got == "an alias to itself" for problem in problems):
                 return None, problems
@@ -68,12 +68,12 @@ def load_yaml(text: str) -> tuple[Any, list[Problem]]:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else "scene"
+        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else name
         return None, [Problem(where, str(error.problem), "YAML")]
     except yaml.YAMLError as error:
-        return None, [Problem("scene", " ".join(str(error).split()), "YAML")]
+        return None, [Problem(name, " ".join(str(error).split()), "YAML")]
     except ValueError as error:  # an integer of thousands of digits
-        return None, [Problem("scene", str(error), "numbers")]
+        return None, [Problem(name, str(error), "numbers")]
 
 
 def dump_yaml(data: Any) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import pairwise
 
 from plow_twin.live.load_model import LoadModel
 from plow_twin.live.runtime import Runtime
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.mapping import Role
+from plow_twin.record.mapping import ROLES, Role
 from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
@@ -39,8 +40,9 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: stamp of the newest sample handed over [ns]
+        #: the time of a source that brings its own [ns]: the newest stamp, unless it stands alone far ahead
         self.newest_ns = 0
+        self._far_ahead_ns: int | None = None
         self._number = 0
         #: whether the sender has told a number
         self._counts = False
@@ -55,6 +57,14 @@ class Feeder:
         inputs.senders.start([self._name])
         inputs.senders.alive([self._name])
 
+    def begin(self, messages: list[Arrived]) -> None:
+        """Begin the time of a source that brings its own: at the first message that the next one goes on from."""
+        read = [role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ())]
+        stamps = [found[0] for found in read if found is not None]
+        back_ns = round(self._runtime.settings.jump_back * 1e9)
+        goes_on = (first for first, second in pairwise(stamps) if second >= first - back_ns)
+        self.newest_ns = next(goes_on, stamps[0] if stamps else 0)
+
     def take(self, messages: list[Arrived]) -> None:
         """Take messages in order of arrival."""
         samples: list[Arrival] = []
@@ -68,8 +78,20 @@ class Feeder:
                 elif name in self._optional:
                     self._measured(name, role, arrived)
         if samples:
-            self.newest_ns = max(self.newest_ns, *(stamp_ns for stamp_ns, _ in samples))
+            for stamp_ns, _ in samples:
+                self._follow_time(stamp_ns)
             self._runtime.samples(samples)
+
+    def _follow_time(self, stamp_ns: int) -> None:
+        """Go on to the time of a sample; to one far ahead only when the next one does not go back from there."""
+        jump_ns = round(self._runtime.settings.jump_forward * 1e9)
+        far_ns, self._far_ahead_ns = self._far_ahead_ns, None
+        if far_ns is not None and stamp_ns >= far_ns - jump_ns:
+            self.newest_ns = far_ns
+        if not self.newest_ns or stamp_ns <= self.newest_ns + jump_ns:
+            self.newest_ns = max(self.newest_ns, stamp_ns)
+        else:
+            self._far_ahead_ns = stamp_ns
 
     @property
     def _name(self) -> bytes:
@@ -140,5 +162,5 @@ class Feeder:
             told = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
             inputs.take_gaps(found[0], told)
         else:
-            values = found[1]
-            inputs.take_pose(found[0], (values["x"], values.get("y", math.nan), values.get("theta", math.nan)))
+            x, y, theta = (found[1].get(name, math.nan) for name in ROLES["head_pose"])
+            inputs.take_pose(found[0], (x, y, theta))

@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.live.bridge.source import BridgeError, Lines, Rows
-from plow_twin.record.sources import Arrived, Columns, TopicType
+from plow_twin.record.sources import Arrived, TopicType
 from plow_twin.record.times import TIMES, time_ns
 
 #: Most bytes read from a source at once.
 _BLOCK: Final = 1 << 18
 #: Most messages handed over at once.
 _BATCH: Final = 256
+#: Bytes by which a file is known again.
+_REMEMBERED: Final = 256
 #: A followed file is looked at that often [s].
 _LOOK_S: Final = 0.02
 STDIN_TOPIC: Final = "stdin"
@@ -34,6 +36,8 @@ class _Tail:
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
+    #: the newest bytes read: others stand there when the file was written anew
+    _newest: bytes = b""
     #: half lines that no end came for: the file was cut or replaced
     left: int = 0
 
@@ -50,8 +54,7 @@ class _Tail:
 
     def _block(self) -> bytes:
         if self._file is None or self._is_another():
-            cut = self._file is not None and os.fstat(self._file.fileno()).st_size < self._file.tell()
-            rest = b"" if self._file is None or cut else self._file.read(_BLOCK)
+            rest = b"" if self._file is None or self._is_anew() else self._read()
             if rest:  # what the writer left in the one that was moved away
                 return bytes(rest)
             try:
@@ -59,21 +62,31 @@ class _Tail:
             except FileNotFoundError:
                 return b""
             self.close()
-            self._file = file
+            self._file, self._newest = file, b""
             self.rows = self.rows.of_another_file()
             # half a line that was left there: a number in it may have been cut
             self.left += self.lines.begun
             self.lines = Lines()
-        return bytes(self._file.read(_BLOCK))
+        return self._read()
+
+    def _read(self) -> bytes:
+        data = bytes(self._file.read(_BLOCK))
+        self._newest = (self._newest + data)[-_REMEMBERED:]
+        return data
+
+    def _is_anew(self) -> bool:
+        """Tell whether the file was cut; what was written since may be longer than what was there."""
+        begin = self._file.tell() - len(self._newest)
+        return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
     def _is_another(self) -> bool:
-        """Tell whether the file was cut, or another one stands at its path."""
+        """Tell whether the file was written anew, or another one stands at its path."""
         try:
             found = self.path.stat()
         except FileNotFoundError:
             return False  # until there is another, the one that was moved away may grow
         ours = os.fstat(self._file.fileno())
-        return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or found.st_size < self._file.tell()
+        return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
     def close(self) -> None:
         if self._file is not None:
@@ -128,7 +141,7 @@ class Files:
             with tail.path.open("rb") as stream:
                 while rows.columns is None and (line := stream.readline(_BLOCK)):
                     rows.read(line)
-            found[tail.topic] = Columns(tuple(rows.columns or ()))
+            found[tail.topic] = rows.header(str(tail.path))
         return found
 
     def start(self, topics: list[str]) -> None:
@@ -206,7 +219,7 @@ class StandardInput:
         """Wait for the first line, and return its columns."""
         while self._rows.columns is None and not self.finished:
             self._first += self._read(1.0)
-        return {STDIN_TOPIC: Columns(tuple(self._rows.columns or ()))}
+        return {STDIN_TOPIC: self._rows.header("-")}
 
     def start(self, topics: list[str]) -> None:
         """Take note of nothing: there is one topic."""
