@@ -95,3 +95,14 @@ def test_the_paper_s_statements_fit(printed: Callable[..., list[str]]) -> None:
     assert re.fullmatch(r"no +clockwise, mean force at b +82 +90\.24 kN +\+10\.1 %", lines[0])
     assert max(map(len, lines)) <= WIDTH and any(line.strip().startswith("paper: {b}, {a,d}") for line in lines)
     assert " ".join(" ".join(lines).split()).count("{b}, {a,d};") == 12
+
+
+def test_progress_has_a_rate_and_the_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    console = Console(file=text, width=WIDTH, force_terminal=True)
+    monkeypatch.setattr("plow_twin.cli.console.error_console", lambda: console)
+    with progress("compiling, replaying", quiet=False) as on_progress:
+        for share in (0.1, 0.2, 0.3):
+            on_progress(share)
+    last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text.getvalue()).replace("\r", "\n").strip().splitlines()[-1]
+    assert re.search(r" 30% [0-9.e+]+ %/s +[0-9:]+ [-0-9:]+$", last.rstrip()), last

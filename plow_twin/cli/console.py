@@ -12,8 +12,18 @@ from typing import Any, Final
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
+from rich.text import Text
 
 DONE: Final = 0
 FAILED: Final = 1
@@ -56,13 +66,22 @@ def error_console() -> Console:
     return Console(stderr=True)
 
 
+class _RateColumn(ProgressColumn):
+    """How much of the work is done in a second."""
+
+    def render(self, task: Task) -> Text:
+        """Return the text for a task."""
+        return Text("" if not task.speed else f"{100.0 * task.speed:.2g} %/s")
+
+
 @contextmanager
 def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
     """Show a progress bar on standard error while the work reports the share done."""
     columns = (
         TextColumn("{task.description}"),
-        BarColumn(),
+        BarColumn(bar_width=30),
         TaskProgressColumn(),
+        _RateColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
