@@ -667,6 +667,14 @@ def test_a_rough_load_costs_little_accuracy() -> None:
         assert value.p95 - value.p05 < 2.5e-4 and abs(value.mean - true) < 1.5e-4
 
 
+def test_ten_poses_a_second_are_fitted_to_the_end_and_no_suspect_sensor() -> None:
+    """A fit that stopped on its way left motion over, which was taken for a sensor that is noisier for a time."""
+    truth = draw(GROUPS["slow"], 33001)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert (result.sensor, result.horizontal_state) == ("ok", State.ESTIMATED), result.reasons
+    assert [result.horizontal.mean, result.vertical.mean] == pytest.approx(truth.clearance, abs=2e-4)
+
+
 def test_a_load_with_a_little_noise_is_followed_in_long_swings() -> None:
     """Swings as short as under a load of another value each sample had this right model withdrawn."""
     truth = draw(replace(GROUPS["plain"], load_step=1e-3, periods=8.0), 42004)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.bouncing import Bounced, bias_of_hard, bounces, compare
-from plow_twin.estimate.fit import Fit, Problem
+from plow_twin.estimate.fit import MOST_LEFT, Fit, Problem
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, Told, tell
 from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
@@ -59,8 +59,6 @@ MOST_PATH, MOST_OTHER_LAW = 3.0, 2.33
 BOUNCED_MOST = 2e-4
 #: Widening of a fit that had not come to its end.
 UNFINISHED = 1.3
-#: Gain in the cost that a fit may still have before it.
-MOST_LEFT = 25.0
 #: Chi^2 of the four turns of the walls from which on they are turned: of right models (seeds 42000 to 42004, 3 groups
 #: of the benchmark) it was 9 at most, of walls worn askew it was 25 from a sixth of the year of examples/a_year on.
 MOST_ASKEW = 25.0
@@ -146,7 +144,7 @@ def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess
         shared, noise, turns = np.split(numbers, [SIZE, SIZE + 3])
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, turns)
         verdict = judge(*near, period) if near else None
-        if near and verdict and not (verdict.model or verdict.sensor) and near[1].gain_left < MOST_LEFT:
+        if near and verdict and not (verdict.model or verdict.sensor) and near[1].finished:
             near, verdict = _with_turns(near, verdict, period)
             return summarise(*near, verdict, lost), _next_guess(*near)
         forward = Forward(scene, felt)
@@ -187,12 +185,12 @@ def _with_turns(found: tuple[Problem, Fit], verdict: Verdict, period: float) -> 
 
     Walls taken for straight make the clearance too small, by 0.2 mm where pads differ by 1.2 mm.
     """
-    fits = not verdict.model and found[1].gain_left < MOST_LEFT
+    fits = not verdict.model and found[1].finished
     if verdict.sensor or (fits and askew(*found) < MOST_ASKEW):
         return found, verdict
     again = turned(*found)
     other = None if again is None else judge(*again, period)
-    if again and other and not (other.model or other.sensor) and again[1].gain_left < MOST_LEFT:
+    if again and other and not (other.model or other.sensor) and again[1].finished:
         return again, other
     return found, verdict
 
@@ -346,7 +344,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
     covariance = _covariance(problem, fit, verdict)
     deviation, shared = np.sqrt(np.diag(covariance)), fit.shared
     suspect = bool(verdict.model or verdict.sensor)
-    finished = fit.gain_left < MOST_LEFT
+    finished = fit.finished
     reasons = verdict.model + verdict.sensor
     if not finished and not suspect:
         reasons = [

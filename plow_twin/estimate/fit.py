@@ -49,6 +49,8 @@ _PROBED = np.array([5e-5, 5e-5, 2e-3, 5e-3, 2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0
 _LEAST_DRIFT = 1e-8
 #: Walls by their two pads: left, right (top pad first), top, bottom (left pad first).
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
+#: Gain in the cost that a fit may still have before it.
+MOST_LEFT = 25.0
 #: Longest step of the iteration in units of the prior's standard deviation.
 _LONGEST_STEP = 1.0
 
@@ -150,6 +152,11 @@ class Fit:
     gain_left: float
     iterations: int
     converged: bool
+
+    @property
+    def finished(self) -> bool:
+        """Whether it is in an optimum: what is left over is then what the model does not tell."""
+        return self.gain_left < MOST_LEFT
 
     @property
     def loss(self) -> float:

@@ -95,7 +95,7 @@ def refine(
         return None
     whole = Problem(forward, unknowns, window, horizon=horizon, turns=turns, drift=None if hard else drift)
     states = better_states(whole, found.shared, found.point.states)
-    found = fit(whole, found.shared, states, found.noise, 8 if not hard and drift is None else 12)
+    found = fit(whole, found.shared, states, found.noise, 20 if not hard and drift is None else 12)
     return None if found is None else (whole, found)
 
 

@@ -173,6 +173,8 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _noise_change(fit: Fit, verdict: Verdict) -> None:
+    if not fit.finished:  # motion is left over, more in one part than in another
+        return
     for i, name in enumerate(COMPONENTS):
         residual, swing = fit.point.residual[:, i], fit.point.swing
         parts = [quick_noise(residual[index], swing[index]) for index in np.array_split(np.arange(len(residual)), 5)]
