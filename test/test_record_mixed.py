@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from plow_twin.live.publishing import Publishing
 from plow_twin.live.recording import Recording
 from plow_twin.live.runtime import policy
 from plow_twin.model.scene import Wear
-from plow_twin.record.alarms import alarms_of
+from plow_twin.record.alarms import ACKNOWLEDGED, alarms_of
 from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.record.replay import replay
@@ -33,6 +34,8 @@ SCENE = replace(load_scene(scene_path("paper")), wear=WEAR)
 T0 = 1_795_000_000_000_000_000
 MS = NS_PER_S // 1000
 NOTHING = (0.0, 0.0, 0.0)
+#: at such a load no advance succeeds
+ABSURD = (1e200, -1e200, 1e200)
 TOPICS = {name: f"/{name}" for name in (*PUBLICATION_TOPICS, "alarms", "quality")}
 
 
@@ -98,6 +101,11 @@ class Mixed:
     def publish_due(self) -> None:
         self.publishing.publish(self.driver.due())
 
+    def acknowledge(self) -> None:
+        self.alarms.acknowledge()
+        self.driver.parameter(ACKNOWLEDGED, True)
+        self.publishing.send_alarms(self.driver.session.stamp_ns or T0)
+
     def replayed(self) -> ReplayReport:
         self.driver.close()
         self.recording.close()
@@ -137,3 +145,138 @@ def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path)
     live.publish_due()
     report = live.replayed()
     assert _same(report) and report.compared["alarms"] == len(live.front.alarms) == 1
+
+
+@pytest.mark.parametrize("span", [2.0, 300.0])
+def test_nothing_is_published_again_when_a_late_sample_fails(span: float, tmp_path: Path) -> None:
+    live = Mixed(tmp_path, rollback_span=span, failure_limit=1000)
+    live.send(*(_swinging(2 * index) for index in range(100)))
+    live.driver.parameter("hold_limit", 31.0)
+    for index in (*range(100, 125), *range(126, 130), 125):
+        live.send(_at(2 * index, ABSURD))
+    assert [(frame.stamp_ns - T0) // MS for frame in live.front.frames[-2:]] == [196, 198]
+    live.send(*(_swinging(2 * index) for index in range(130, 150)))
+    assert _same(live.replayed())
+
+
+def test_late_samples_at_the_edge_of_the_memory_give_the_same_however_they_came(tmp_path: Path) -> None:
+    found = []
+    for grouped in (True, False):
+        live = Mixed(tmp_path / str(grouped), publish_mode="fixed_rate", rollback_span=0.5)
+        missing = [248, 249, 290]
+        live.send(*(_swinging(10 * index) for index in range(300) if index not in missing))
+        live.publish_due()
+        late = [_at(10 * index, (20e3, 0.0, 60e3)) for index in missing]
+        for group in [late] if grouped else [[one] for one in late]:
+            live.send(*group)
+        live.publish_due()
+        assert live.driver.rolled_back == 3
+        found.append(live.front.frames[-1])
+        assert _same(live.replayed())
+    assert (found[0].peak == found[1].peak).all() and (found[0].impulse == found[1].impulse).all()
+
+
+def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path) -> None:
+    """A replay keeps no states between: what is too old must not follow from those that it has."""
+    live = Mixed(tmp_path, rollback_span=0.1)
+    live.send(*map(_swinging, range(300)))
+    for ms in (50, 190, 198, 199, 201):
+        live.driver.travel(T0 + ms * MS, 1.0 + 0.01 * ms)
+        live.send(_swinging(300 + ms))
+    assert _same(live.replayed())
+
+
+def _drive(live: Mixed, random: Random, calls: int) -> None:
+    """Call a live twin with whatever there is, in any mix."""
+    index, skipped, fails = 0, [], random.random() < 0.4
+    span_ms = round(1000 * live.settings.rollback_span)
+    kinds = {
+        "samples": 40, "skip": 12, "late": 12, "silence": 6, "reset": 1, "wear": 1, "travel": 4, "snapshot": 4,
+        "ack": 1, "parameter": 5, "model": 1, "restore": 0.5, "due": 12, "fail": 6 * fails,
+    }  # fmt: skip
+    for _ in range(calls):
+        kind = random.choices(list(kinds), list(kinds.values()))[0]
+        session = live.driver.session
+        stamp_ns = T0 + index * MS
+        match kind:
+            case "samples":
+                count = random.choice([1, 1, 2, 5, 40])
+                arriving = [_swinging(index + offset) for offset in range(count)]
+                if random.random() < 0.2 and skipped:  # late ones with them, in any order
+                    arriving += [_swinging(ms) for ms in skipped[-3:]]
+                    del skipped[-3:]
+                    random.shuffle(arriving)
+                live.ms += count
+                index += count
+                for group in [arriving] if random.random() < 0.5 else [[one] for one in arriving]:
+                    live.send(*group)
+            case "skip":
+                gap = random.choice([1, 1, 3, 20])
+                skipped += range(index, index + gap)
+                index += gap
+            case "late" if skipped:
+                near = [ms for ms in skipped if abs(index - ms - span_ms) < 20]  # at the edge of what is remembered
+                chosen = near or random.sample(skipped, min(len(skipped), random.choice([1, 1, 4])))
+                skipped = [ms for ms in skipped if ms not in chosen]
+                load = ABSURD if fails and random.random() < 0.2 else None
+                live.send(*(_swinging(ms) if load is None else _at(ms, load) for ms in chosen))
+            case "silence":
+                live.silence(random.choice([20, 60, 200]))
+            case "reset":
+                live.driver.reset(stamp_ns, "asked for")
+                skipped.clear()
+            case "wear":
+                live.driver.set_wear(stamp_ns, [1e-5 * random.random()] * 8, "other pads")
+                skipped.clear()
+            case "travel":  # late, on time, early and far too late
+                live.driver.travel(stamp_ns + random.randrange(-span_ms - 50, 50) * MS, 3.0 * random.random())
+            case "snapshot":
+                live.driver.snapshot()
+            case "restore":
+                live.driver.restore(stamp_ns, session.snapshot())
+                skipped.clear()
+            case "ack":
+                live.acknowledge()
+            case "parameter":
+                live.driver.parameter("hold_limit", 1.0 + random.random())
+            case "model":
+                live.driver.set_model(stamp_ns, {"wear.coefficient_m2_n": 1e-12 * (1.0 + random.random())})
+            case "due":
+                live.publish_due()
+            case "fail":
+                live.send(*(_at(index + offset, ABSURD) for offset in range(random.choice([1, 3, 12]))))
+                index += 12
+
+
+def _mixed(folder: Path, seed: int, **more: Any) -> None:
+    random = Random(seed)
+    live = Mixed(
+        folder,
+        publish_mode=random.choice(["on_sample", "fixed_rate"]),
+        rollback_span=random.choice([0.0, 0.1, 0.5, 2.0, 30.0]),
+        excitation_timeout=random.choice([0.01, 0.05, 0.5]),
+        hold_policy=random.choice(["hold", "zero"]),
+        hold_limit=0.3,
+        failure_limit=random.choice([0, 4, 10]),
+        alarm_force=random.choice([[1e3, 1e9], [1e5, 3e5]]),
+        alarm_wear_rate=[1e-12, 1e-10],
+        **more,
+    )
+    _drive(live, random, 250)
+    report = live.replayed()
+    assert report.first_divergence is None, (seed, report.divergences, report.first_divergence)
+    assert report.exit_code == 0 and report.compared["alarms"] == len(live.front.alarms)
+    assert report.compared["contact_forces"] == len(live.front.frames)
+    assert not any(frame.force.max() > 1e12 for frame in live.front.frames)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_replay_gives_the_messages_of_any_mix(seed: int, tmp_path: Path) -> None:
+    _mixed(tmp_path, seed)
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("begin", range(1000, 5000, 100))
+def test_a_replay_gives_the_messages_of_thousands_of_mixes(begin: int, tmp_path: Path) -> None:
+    for seed in range(begin, begin + 100):
+        _mixed(tmp_path / str(seed), seed, max_evaluations=60 if seed % 10 == 0 else 0)

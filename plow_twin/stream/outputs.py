@@ -205,6 +205,8 @@ class Outputs:
         self._held = False
         #: from when on what was told before has been computed again [ns]
         self._corrected_ns: int | None = None
+        #: of before that: stamp and advance that the next publication was to show, and whether it was held
+        self._before: tuple[int, Advance, bool] | None = None
         self._marked = False
         #: what an estimate adds to the clearances and their points, as in `CLEARANCE_NAMES`; None: nothing is estimated
         self._shift: Array | None = None
@@ -249,15 +251,29 @@ class Outputs:
         self._impulse = np.add.reduce(np.concatenate((self._impulse[None], series.impulse[good])), axis=0)
         np.maximum(self._peak, series.peak[good].max(axis=0), out=self._peak)
 
-    def correct(self, stamp_ns: int) -> int:
-        """Note that all from `stamp_ns` on is computed again; return from when on it is since the last publication."""
-        self._corrected_ns = stamp_ns if self._corrected_ns is None else min(stamp_ns, self._corrected_ns)
+    def correct(self, stamp_ns: int, oldest_ns: int) -> int:
+        """Note that all from `stamp_ns` on is computed again; return from when on it is since the last publication.
+
+        That is later than `oldest_ns`: what was computed again before it stays as it is.
+        """
+        if self._corrected_ns is None or self._corrected_ns <= oldest_ns:
+            self._corrected_ns = stamp_ns
+            self._before = None if self._advance is None else (self._stamp_ns, self._advance, self._held)
+        self._corrected_ns = min(stamp_ns, self._corrected_ns)
+        if self._before is not None and self._before[0] >= self._corrected_ns:
+            self._before = None
         return self._corrected_ns
 
-    def clear_window(self) -> None:
-        """Let impulses and peaks begin here."""
+    def begin_correction(self) -> None:
+        """Let impulses and peaks begin here, at the time that `correct` returned.
+
+        What has been published up to here is not published again, even if each advance from here on should fail.
+        """
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
+        self._advance = None
+        if self._before is not None:
+            self._stamp_ns, self._advance, self._held = self._before
 
     @property
     def slow_before(self) -> tuple[int | None, Array]:
@@ -299,7 +315,7 @@ class Outputs:
         """Forget what has not been published; the makes go on counting."""
         self._advance = None
         self._slow_ns = None
-        self._corrected_ns = None
+        self._corrected_ns = self._before = None
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
 
@@ -331,7 +347,7 @@ class Outputs:
         """Return what is said of a publication beside its numbers; the next one is not corrected any more."""
         corrected = self._corrected_ns is not None
         mark, before = self._held or corrected, self._marked
-        self._corrected_ns, self._marked = None, mark
+        self._corrected_ns, self._before, self._marked = None, None, mark
         return {"held": self._held, "corrected": corrected, "marked": mark or before}
 
     def take_rows(self, stamps: NDArray[np.int64], rows: AdvanceSeries, taken: NDArray[np.int64]) -> Publications:
@@ -366,7 +382,7 @@ class Outputs:
         begin = int(taken[-1]) + 1 if len(taken) else 0
         self._advance = rows[len(stamps) - 1] if begin < len(stamps) else None
         if len(taken):
-            self._corrected_ns = None
+            self._corrected_ns = self._before = None
         return publications
 
     def _slow_rows(self, stamps: NDArray[np.int64], wear_depth: Array) -> tuple[NDArray[np.int64], Array, Array]:

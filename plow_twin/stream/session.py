@@ -279,6 +279,8 @@ class Session:
     ) -> MarkedAdvance:
         """Apply many samples at once for a replay: nothing is emitted, and `outputs` is left to the caller.
 
+        Where one of them fails, they are not remembered: go back with `restore`, or remember nothing at all.
+
         Parameters
         ----------
         stamps : ndarray of int64, shape (n,)
@@ -298,17 +300,21 @@ class Session:
         origin = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         before = self.snapshot().data
         done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows)
-        self.history.add_snapshot(int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns, before)
-        self.history.add_later(stamps, wrench)
+        if not done.status.any():
+            self.history.add_later(
+                int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns, before, stamps, wrench
+            )
         self.origin_ns, self.stamp_ns = origin, int(stamps[-1])
         self.wear_depth = done.wear_depth
         self._advances += len(stamps)
         return done
 
     def restore(self, snapshot: Snapshot, pending: tuple[int, Advance] | None, origin_ns: int | None) -> None:
-        """Go back to a snapshot, with what the next publication was to show (`Outputs.pending`); nothing is emitted."""
+        """Go back to before an `advance_marked` that failed; nothing is emitted.
+
+        `pending` is what the next publication was to show (`Outputs.pending`).
+        """
         self._restore(snapshot.data)
-        self.history.cut(self.stamp_ns)
         self.origin_ns = origin_ns
         self.outputs.set_pending(pending)
 
@@ -352,20 +358,23 @@ class Session:
 
     def _run(self, samples: list[Sample]) -> AdvanceSeries:
         """Advance to samples; a speed along the face is taken over at its stamp, on the load's straight line there."""
-        self._resume_wear()
+        resumed = self._resume_wear()
         series = None
         while samples:
             travel = self._travels[0] if self._travels else None
             if travel is not None and travel.stamp_ns < samples[0].stamp_ns:
                 self._travel_on_the_way(travel, samples[0])
                 continue
-            count = self.history.until_snapshot(samples)
+            # what was computed without a sample is behind the first one: nobody goes back into it
+            count = 1 if resumed else self.history.until_snapshot(samples)
             if travel is not None:
                 count = min(count, sum(sample.stamp_ns <= travel.stamp_ns for sample in samples))
             part, samples = samples[:count], samples[count:]
             series = self._advance(part)
-            if self.history.add(part):
-                self._remember()
+            due = self.history.add(part)
+            if due or resumed:
+                self._remember(due=not resumed)
+            resumed = False
         assert series is not None, "there is at least one sample"
         return series
 
@@ -418,14 +427,12 @@ class Session:
 
         The next publication tells of all from the first stamp worked in since the one before it.
         """
-        corrected_ns = self.outputs.correct(stamp_ns)
-        if corrected_ns <= (self.history.oldest_ns or 0):
-            corrected_ns = stamp_ns
+        corrected_ns = self.outputs.correct(stamp_ns, self.history.oldest_ns or 0)
         again = self._rewind(corrected_ns, *travels)
         known = [sample for sample in again if sample.stamp_ns < corrected_ns]
         if known:
             self._run(known)
-        self.outputs.clear_window()
+        self.outputs.begin_correction()
         return self._run(sorted([*again[len(known) :], *late], key=lambda sample: sample.stamp_ns))
 
     def _rewind(self, stamp_ns: int, *more: Travel) -> list[Sample]:
@@ -475,11 +482,12 @@ class Session:
             if self._wears:
                 self.twin.set_travel_speed(0.0)
 
-    def _resume_wear(self) -> None:
-        if self.held:
-            self.held = False
-            if self._wears:
-                self.twin.set_travel_speed(self._speed)
+    def _resume_wear(self) -> bool:
+        """Let the load wear again; tell whether it did not."""
+        held, self.held = self.held, False
+        if held and self._wears:
+            self.twin.set_travel_speed(self._speed)
+        return held
 
     def _apply_travel(self, travel: Travel) -> None:
         """Take over a speed: now, once its stamp is reached, or back at its stamp."""
@@ -508,9 +516,9 @@ class Session:
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
 
-    def _remember(self) -> None:
+    def _remember(self, *, due: bool = False) -> None:
         if self.stamp_ns is not None:
-            self.history.add_snapshot(self.stamp_ns, self.snapshot().data)
+            self.history.add_snapshot(self.stamp_ns, self.snapshot().data, due=due)
 
     def _forget(self) -> None:
         """Forget all before the present state."""
