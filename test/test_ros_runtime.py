@@ -11,13 +11,14 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import ros_processes  # noqa: F401  (imports ROS without the warnings of its own modules)
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped, WrenchStamped
 from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -31,6 +32,7 @@ from plow_twin.record.reader import EntryRecord, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
+from plow_twin.ros.messages import read_wrench
 from plow_twin.ros.node import TwinNode
 from plow_twin.ros.qos import OUTPUT, sensor_input
 from plow_twin.scene_file import load_scene
@@ -255,6 +257,32 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
             batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
             subscriptions._counted("travel", subscriptions._travel_speeds, batch)
         assert node.runtime.inputs.lost == 1
+
+
+def test_what_was_sent_before_the_subscription_is_no_loss_whenever_its_publisher_is_discovered() -> None:
+    period_ns = 5_000_000
+
+    def hear(node: TwinNode, sender: bytes, after_s: float, *numbers: int) -> int:
+        """Have samples come, the first of them so long after the subscription; return the loss."""
+        assert node._front is not None and node.runtime is not None
+        subscriptions = node._front.subscriptions
+        begun_ns = subscriptions._since_ns + round(after_s * 1e9) - numbers[0] * period_ns
+        for number in numbers:
+            # its clock is another one
+            received_ns, sent_ns = begun_ns + number * period_ns, number * period_ns
+            batch = [Taken(sender, number, received_ns, serialize_message(WrenchStamped()), sent_ns)]
+            subscriptions._counted("excitation", partial(subscriptions._samples, "excitation", read_wrench), batch)
+        return node.runtime.inputs.senders.lost
+
+    with _node() as node:
+        assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+        # 21 s of samples, discovered 0.3 s after the subscription
+        assert hear(node, b"before", 0.3, *range(4158, 4200), 4203) == 3
+        assert node.trigger_cleanup() == node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+        # a second one, an hour later: it sent 60 until it was connected, and three were lost after that
+        assert hear(node, b"after", 3600.0, 61) == 0
+        assert hear(node, b"after", 3600.0, 62) == 60
+        assert hear(node, b"after", 3600.0, *range(63, 100), 103) == 63
 
 
 def test_the_middleware_is_asked_for_no_events() -> None:

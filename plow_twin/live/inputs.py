@@ -140,6 +140,14 @@ class Inputs:
             self._intake.refuse(Verdict.MALFORMED, stamp_ns, values)
         return False
 
+    def lost_at_first(self, sender: bytes, more: int) -> bool:
+        """Count `more` samples of a sender as lost before its first one; False when it is not the one followed."""
+        if sender != self.senders.followed:
+            return False
+        self.senders.lost += more
+        self.unused.note_lost(self._source, sender, more)
+        return True
+
     def _other_heard(self, topic: str, sender: bytes, stamp_ns: int, values: Sequence[float]) -> None:
         """Take note of a message of a sender that is not followed."""
         if topic not in self.other_senders():

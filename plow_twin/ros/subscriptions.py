@@ -29,6 +29,8 @@ from plow_twin.stream.intake import Intake, Verdict
 _SLOW_DEPTH: Final = 200
 #: Publishers whose numbers are remembered; the oldest is forgotten.
 _MOST_PUBLISHERS: Final = 256
+#: By so many samples a publisher's rate is known.
+_RATE_KNOWN: Final = 20
 _PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
 
 
@@ -64,6 +66,10 @@ class Subscriptions:
         self._names: dict[tuple[str, bytes], str] = {}
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
+        self._since_ns = time.time_ns()  # when the excitation was subscribed to
+        #: publishers of it that were not known to be there then: first message, and losses counted before it
+        self._appeared: dict[bytes, tuple[Taken, int]] = {}
+        self._before: frozenset[bytes] = frozenset()
         self._inputs.unused.name_of = self._name_of
         read_sample = {"excitation": read_wrench, "tool_forces": self._read_tool_forces}
         for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
@@ -126,7 +132,8 @@ class Subscriptions:
             raw=True,
         )
         if topic == self._source:
-            self._inputs.senders.start(self._present(topic))
+            self._since_ns, self._before = time.time_ns(), frozenset(self._present(topic))
+            self._inputs.senders.start(self._before)
         self._taken_from[topic] = subscription
         self._loop.add(InputQueue(self._node, subscription, partial(self._counted, topic, take)))
 
@@ -140,8 +147,10 @@ class Subscriptions:
                 following[key] = number + 1
                 continue
             if expected is None:
-                # what was sent before the first one heard is counted where it is known who was there: `senders`
                 expected = number
+                if topic == self._source and number > 1 and message.sender not in self._before:
+                    inputs.senders.start_late(message.sender)
+                    self._appeared[message.sender] = message, 0
                 if len(following) >= _MOST_PUBLISHERS:
                     following.pop(next(iter(following)))
             if number != expected:
@@ -151,6 +160,27 @@ class Subscriptions:
                     inputs.unused.note_lost(topic, message.sender, missed)
             following[key] = max(expected, number + 1)
         take(batch)
+        if self._appeared and topic == self._source:
+            self._count_before_first(batch)
+
+    def _count_before_first(self, batch: list[Taken]) -> None:
+        """Count what publishers sent before the first sample heard, if they began after the subscription.
+
+        Discovery takes its time: one that is new to the node may have been sending for long. The rate at which it goes
+        on tells whether it began before.
+        """
+        newest = {message.sender: message for message in batch}
+        for sender, (first, counted) in list(self._appeared.items()):
+            last = newest.get(sender, first)
+            heard, missed = last.number - first.number, first.number - 1
+            if heard <= 0:
+                continue
+            sending_ns = missed * (last.sent_ns - first.sent_ns) / heard
+            lost = missed if sending_ns <= first.received_ns - self._since_ns else 0
+            if lost != counted and self._inputs.lost_at_first(sender, lost - counted):
+                self._appeared[sender] = first, lost
+            if heard >= _RATE_KNOWN:
+                del self._appeared[sender]
 
     def _samples(self, topic: str, read: Callable[[bytes], Read], batch: list[Taken]) -> None:
         """Take in what has been in the queue of the selected source."""

@@ -35,6 +35,10 @@ class Senders:
         """Take note of the senders that were there before: what they sent until now is no loss."""
         self._before = frozenset(present)
 
+    def start_late(self, sender: bytes) -> None:
+        """Take note that what a sender sent before the first sample heard may be no loss."""
+        self._before |= {sender}
+
     def hear(self, sender: bytes, number: int) -> bool:
         """Take in the arrival of sample `number` (from 1) of a sender; True when that sender is followed."""
         expected = self._next.get(sender)
