@@ -31,7 +31,7 @@ _MADE_OF: Final = {
 #: Prior deviation of a turn, and the step of its difference quotient, in m.
 _TURN, _STEP = 4e-3, 2e-4
 #: Rounds of fits with turned walls, iterations of each; longest turn of a round, and one that ends them, in m.
-_ROUNDS, _ITERATIONS, _LONGEST_TURN, _NO_TURN = 4, 6, 2e-3, 1e-4
+_ROUNDS, _ITERATIONS, _LONGEST_TURN, _NO_TURN = 4, 15, 2e-3, 1e-4
 _FEWEST_ROWS = 4
 assert list(_MADE_OF) == list(GROUPS)
 
