@@ -158,7 +158,7 @@ def test_killed_writers_lose_at_most_the_last_second(tmp_path: Path) -> None:
 @pytest.mark.stress
 @pytest.mark.timeout(3600)
 def test_killed_writers_many_times(tmp_path: Path) -> None:
-    kill_writers((tmp_path / f"run{n}" for n in range(200)), random.Random(1), flush_s=1.0, longest_s=4.0)
+    kill_writers((tmp_path / f"run{n}" for n in range(200)), random.Random(1), flush_s=0.5, longest_s=4.0)
 
 
 def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:

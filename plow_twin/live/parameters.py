@@ -201,7 +201,7 @@ class Settings:
         "only the last so many seconds are kept, in memory, and written to a folder each time at an alarm or a mark; "
         "0: everything is recorded",
     )
-    record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk each second, against a loss of power")
+    record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk each half second, against a loss of power")
     excitation_timeout: float = _number(
         0.5,
         "s",

@@ -87,7 +87,7 @@ class Recorder:
     queue_size
         Items waiting for the thread; the last quarter is kept for the journal.
     flush_period_s
-        A killed process loses at most what came in that time [s].
+        A killed process loses at most what came in that time [s], of the messages sent in twice that time.
     chunk_size
         Bytes [B] in one compressed chunk.
     min_free_bytes
@@ -118,7 +118,7 @@ class Recorder:
         header: RunHeader,
         *,
         queue_size: int = 20_000,
-        flush_period_s: float = 1.0,
+        flush_period_s: float = 0.5,
         chunk_size: int = 1024 * 1024,
         min_free_bytes: int = 64 * 1024 * 1024,
         part_bytes: int = 0,
