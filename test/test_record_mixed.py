@@ -147,6 +147,29 @@ def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path)
     assert _same(report) and report.compared["alarms"] == len(live.front.alarms) == 1
 
 
+@pytest.mark.parametrize("hold", ["hold", "zero"])
+def test_a_blow_before_a_hold_in_the_same_publication_is_an_alarm_and_one_in_the_hold_is_none(
+    hold: str, tmp_path: Path
+) -> None:
+    live = Mixed(tmp_path, publish_mode="fixed_rate", alarm_force=[6e4, 1e9], excitation_timeout=0.05, hold_policy=hold)
+    # a short push, on which the head goes on without a sample until it meets the frame
+    live.send(*(_at(index, (0.0, 40e3, 0.0)) for index in range(20)))
+    live.publish_due()
+    for _ in range(10):
+        live.silence(100)
+    live.send(*(_at(1100 + index, (0.0, 40e3, 0.0)) for index in range(50)))
+    live.publish_due()
+    quiet = live.front.frames[-1]
+    assert quiet.peak.max() > 6e4 and not quiet.held and not live.front.alarms
+    live.send(*(_at(1150 + index, (0.0, 600e3 if index < 40 else 0.0, 0.0)) for index in range(100)))
+    live.silence(300)
+    live.publish_due()
+    blow = live.front.frames[-1]
+    assert blow.held and blow.measured_peak is not None and len(live.front.alarms) == 1
+    report = live.replayed()
+    assert _same(report) and report.compared["alarms"] == 1
+
+
 @pytest.mark.parametrize("span", [2.0, 300.0])
 def test_nothing_is_published_again_when_a_late_sample_fails(span: float, tmp_path: Path) -> None:
     live = Mixed(tmp_path, rollback_span=span, failure_limit=1000)

@@ -142,9 +142,10 @@ class Alarms:
     Parameters
     ----------
     thresholds
-        By name: `force` [N], the largest of a pair since the publication before; `clearance` [m], the larger of
-        horizontal and vertical; `clearance_rate` [m/s], its growth over `RATE_SPAN_NS`; `wear_rate` [m/s], the largest
-        of a pad; `residual` [m], the distance of a measured pose from the model at its stamp.
+        By name: `force` [N], the largest of a pair since the publication before where there were samples;
+        `clearance` [m], the larger of horizontal and vertical; `clearance_rate` [m/s], its growth over `RATE_SPAN_NS`;
+        `wear_rate` [m/s], the largest of a pad; `residual` [m], the distance of a measured pose from the model at its
+        stamp.
     duration_s
         How long a level must last before there is an alarm [s].
     """
@@ -158,14 +159,15 @@ class Alarms:
         self.raised: list[str] = []
 
     def take(self, publication: Publication) -> bool:
-        """Take in a publication; True when a level has changed. One without samples says nothing of the machine."""
-        if publication.held:
+        """Take in a publication; True when a level has changed. What had no sample says nothing of the machine."""
+        if publication.held and publication.measured_peak is None:
             return False
         self.raised, stamp_ns, changed = [], publication.stamp_ns, False
-        if self._model is not None:
+        if self._model is not None and not publication.held:
             for at_ns, residual in self._model.add(stamp_ns, *publication.q[:2].tolist()):
                 changed |= self._take("residual", residual, at_ns)
-        changed |= self._take("force", max(publication.peak.tolist()), stamp_ns)
+        peak = publication.peak if publication.measured_peak is None else publication.measured_peak
+        changed |= self._take("force", max(peak.tolist()), stamp_ns)
         if publication.slow is not None:
             clearance = float(publication.slow.clearance[:2].max())
             changed |= self._take("clearance", clearance, stamp_ns)
@@ -182,7 +184,8 @@ class Alarms:
         """Take in publications, none of them held; yield the index of each that has changed a level, right after it."""
         values = {"force": publications.peak, "wear_rate": publications.wear_rate}
         values["clearance"] = publications.clearance[:, :2]
-        quiet = all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms)
+        quiet = publications.measured_peak is None
+        quiet &= all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms)
         growth = self.alarms.get("clearance_rate")
         if self._model is not None or not quiet or (growth is not None and growth.lowest < math.inf):
             yield from (index for index in range(len(publications)) if self.take(publications[index]))

@@ -51,8 +51,10 @@ class Publication:
 
     `penetration` [m], `rate` [m/s] and `force` [N] are those at the stamp, shape (8,); `makes` counts all makes so
     far, `impulse` [N s] and `peak` [N] are those since the publication before; `q` [m, m, rad] and `v` have shape (3,).
-    `held`: computed without a sample. `corrected`: late samples were worked in, and `impulse` and `peak` are those
-    since the time to which the model went back. `marked`: one of the two is so, or was so in the publication before.
+    `held`: the state at `stamp_ns` was computed without a sample; what happened before it may have had some. Where
+    only a part of what happened had samples, `measured_peak` [N] is that of this part. `corrected`: late samples were
+    worked in, and `impulse` and `peak` are those since the time to which the model went back. `marked`: one of the two
+    is so, or was so in the publication before.
     """
 
     stamp_ns: int
@@ -68,6 +70,7 @@ class Publication:
     held: bool = False
     corrected: bool = False
     marked: bool = False
+    measured_peak: Array | None = None
 
     @classmethod
     def of_row(cls, row: NDArray[np.void], **others: Any) -> Self:
@@ -124,6 +127,8 @@ class Publications:
     slow_index: NDArray[np.int64]
     clearance: Array
     wear_rate: Array
+    #: of the first one: `Publication.measured_peak`
+    measured_peak: Array | None = None
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -135,6 +140,7 @@ class Publications:
             stamp_ns=int(self.stamp_ns[index]),
             **{name: getattr(self, name)[index] for name in _ARRAYS},
             slow=Slow(self.clearance[place], self.wear_rate[place]) if slow else None,
+            measured_peak=None if index else self.measured_peak,
         )
 
     @classmethod
@@ -199,6 +205,8 @@ class Outputs:
         self._makes = np.zeros(PAIR_COUNT, np.int64)
         self._impulse = np.zeros(PAIR_COUNT)
         self._peak = np.zeros(PAIR_COUNT)
+        #: of the advances with a sample, once there was one of either kind; None: they are all of one
+        self._measured_peak: Array | None = None
         #: stamp and pad depths of the last slow part; None before the first
         self._slow_ns: int | None = None
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
@@ -233,23 +241,35 @@ class Outputs:
 
     def add(self, stamp_ns: int, advance: Advance, held: bool = False) -> None:
         """Take in one good advance that ended at `stamp_ns`; `held`: computed without a sample."""
+        self._measured_peak = self._measured(advance.peak, held)
         self._advance = advance
         self._stamp_ns, self._held = stamp_ns, held
         self._makes += advance.makes
         self._impulse += advance.impulse
         np.maximum(self._peak, advance.peak, out=self._peak)
 
-    def add_series(self, stamps_ns: Sequence[int], series: AdvanceSeries, held: bool = False) -> None:
-        """Take in many advances that ended at `stamps_ns`; those that failed count for nothing."""
+    def _measured(self, peak: Array, held: bool) -> Array | None:
+        """Return what `_measured_peak` is with further advances, which have the peak `peak`."""
+        before = self._measured_peak
+        if before is None and (self._advance is None or self._held is held):
+            return None
+        if before is None:
+            return self._peak.copy() if held else peak
+        return before if held else np.maximum(before, peak)
+
+    def add_series(self, stamps_ns: Sequence[int], series: AdvanceSeries) -> None:
+        """Take in many advances that ended at samples, at `stamps_ns`; those that failed count for nothing."""
         good = np.flatnonzero(series.status == 0)
         if good.size == 0:
             return
         last = int(good[-1])
-        self._advance, self._stamp_ns, self._held = series[last], stamps_ns[last], held
+        peak = series.peak[good].max(axis=0)
+        self._measured_peak = self._measured(peak, False)
+        self._advance, self._stamp_ns, self._held = series[last], stamps_ns[last], False
         self._makes += series.makes[good].sum(axis=0)
         # row by row, as `add` does: the sum has the same bits
         self._impulse = np.add.reduce(np.concatenate((self._impulse[None], series.impulse[good])), axis=0)
-        np.maximum(self._peak, series.peak[good].max(axis=0), out=self._peak)
+        np.maximum(self._peak, peak, out=self._peak)
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
         """Note that all from `stamp_ns` on is computed again; return from when on it is since the last publication.
@@ -271,7 +291,7 @@ class Outputs:
         """
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
-        self._advance = None
+        self._advance = self._measured_peak = None
         if self._before is not None:
             self._stamp_ns, self._advance, self._held = self._before
 
@@ -315,7 +335,7 @@ class Outputs:
         """Forget what has not been published; the makes go on counting."""
         self._advance = None
         self._slow_ns = None
-        self._corrected_ns = self._before = None
+        self._corrected_ns = self._before = self._measured_peak = None
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
 
@@ -337,8 +357,10 @@ class Outputs:
             q=advance.q,
             v=advance.v,
             slow=self._slow_part(advance.wear_depth) if self._is_slow_due() else None,
+            measured_peak=self._measured_peak,
             **self._take_marks(),
         )
+        self._measured_peak = None
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
         return publication
@@ -364,6 +386,11 @@ class Outputs:
             (rows.makes, rows.impulse, rows.peak), taken, self._makes, self._impulse, self._peak, makes, impulse, peak
         )
         slow_index, clearance, wear_rate = self._slow_rows(stamps[chosen], rows.wear_depth[chosen])
+        measured_peak = self._measured_peak
+        if measured_peak is not None:
+            end = int(taken[0]) + 1 if len(taken) else len(stamps)
+            measured_peak = np.maximum(measured_peak, rows.peak[:end].max(axis=0))
+        self._measured_peak = None if len(taken) else measured_peak
         publications = Publications(
             stamp_ns=stamps[chosen],
             penetration=rows.penetration[chosen],
@@ -377,6 +404,7 @@ class Outputs:
             slow_index=slow_index,
             clearance=clearance,
             wear_rate=wear_rate,
+            measured_peak=measured_peak if len(taken) else None,
         )
         self._stamp_ns, self._held = int(stamps[-1]), False
         begin = int(taken[-1]) + 1 if len(taken) else 0

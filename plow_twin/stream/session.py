@@ -394,7 +394,7 @@ class Session:
                 [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
             )
             self.wear_depth = series.wear_depth[-1].copy()
-            self.outputs.add_series(stamps_ns, series, self.held)
+            self.outputs.add_series(stamps_ns, series)
         self.stamp_ns = stamps_ns[-1]
         if self.twin.max_evaluations is not None:
             self._largest_error_m = max(self._largest_error_m, float(series.error_estimate_m.max()))
