@@ -25,6 +25,7 @@ from record_support import BASE_NS, STEP_NS, paper_sample
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record import ring
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import UnbufferedFile
@@ -291,6 +292,19 @@ def test_a_recording_goes_on_when_the_disk_has_room_again(
     report = replay(tmp_path / "run")
     assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.COMPLETE, 0)
     assert report.lost[JOURNAL] == loss.lost[JOURNAL] and report.compared["contact_peaks"] > 500
+
+
+def test_half_a_ring_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def half(folder: Path, *arguments: object, **options: object) -> None:
+        (folder / "metadata.yaml.partial").touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ring, "write_metadata", half)
+    recorder = Recorder(tmp_path / "new" / "ring", HEADER, ring_s=5.0)
+    marked = recorder.mark()
+    loss = recorder.close()
+    assert loss.error == f"{marked}: the last 5 s not written: [Errno 28] No space left on device" and not loss.complete
+    assert os.listdir(tmp_path / "new") == []
 
 
 def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(

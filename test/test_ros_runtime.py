@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import os
+import shutil
 import threading
 import time
 import weakref
@@ -28,7 +29,7 @@ from sensor_msgs.msg import JointState
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
 from plow_twin.record.measured import read_recording
-from plow_twin.record.reader import EntryRecord, RunReader
+from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
@@ -123,6 +124,37 @@ def test_wear_that_the_disk_did_not_take_outlives_a_cleanup(tmp_path: Path, monk
             assert node.trigger_deactivate() == node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
         assert node.start() and node.runtime is not None
         assert node.runtime.driver.session.wear_depth.tolist() == [2e-4] * 8
+
+
+def test_a_ring_that_the_disk_does_not_take_is_trouble_and_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room, usage = threading.Event(), shutil.disk_usage
+    monkeypatch.setattr(
+        shutil, "disk_usage", lambda path: usage(path) if room.is_set() else usage(path)._replace(free=9)
+    )
+    folder = tmp_path / "ring"
+    with _node(record_path=str(folder), record_ring=5.0) as node:
+        assert node.start() and node._front is not None
+        runtime = node._front.runtime
+        assert runtime.recording is not None
+
+        def mark(written: int, lost: int) -> None:
+            assert node._front is not None and node._front.answer("mark")[0]
+            give_up = time.monotonic() + 60.0
+            while (counted := runtime.recording.counters) and (counted.marks, counted.marks_lost) != (written, lost):  # type: ignore[union-attr]
+                assert time.monotonic() < give_up
+                time.sleep(0.01)
+
+        mark(0, 1)
+        level, message, values = node._health.recorder(runtime)
+        assert (level, values["marks_lost"], runtime.recorder_state) == (2, "1", "trouble")
+        assert message.startswith(f"{folder}: the last 5 s not written: ") and not folder.exists()
+        room.set()
+        mark(1, 1)
+        reader = RunReader(folder)
+        assert list(reader) and reader.status is FileStatus.COMPLETE
+        assert not runtime.recording.close().complete
 
 
 def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:

@@ -108,7 +108,8 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "queued": "items waiting for the recorder's thread",
         "lost": "items lost, by topic",
         "marks": "rings of the last seconds that were written",
-        "error": "why recording stopped; empty: it did not",
+        "marks_lost": "rings of the last seconds that could not be written",
+        "error": "why recording stopped, or a ring was not written; empty: neither",
     },
 }
 
@@ -347,6 +348,7 @@ class Health:
             "queued": str(found.queued),
             "lost": ", ".join(f"{topic}: {count}" for topic, count in sorted(found.lost.items())),
             "marks": str(found.marks),
+            "marks_lost": str(found.marks_lost),
             "error": found.error or "",
         }
         if found.error or found.lost:

@@ -50,7 +50,8 @@ _BURST: Final = 128
 class RecorderCounters:
     """How a recorder is doing. `lost` counts by topic what did not reach the file; its journal is under `journal`.
 
-    `error` says why it has stopped; it is None again when it goes on. `marks` counts the rings that were written.
+    `error` says why it has stopped, and is None again when it goes on; or why a ring was not written, from then on.
+    `marks` counts the rings that were written, `marks_lost` those that could not be.
     """
 
     written: int
@@ -59,6 +60,7 @@ class RecorderCounters:
     lost: Mapping[str, int]
     error: str | None
     marks: int = 0
+    marks_lost: int = 0
 
 
 @dataclass(frozen=True)
@@ -134,6 +136,7 @@ class Recorder:
         warm_up_writer(header)
         self._folder = Path(path)
         self._ring: RingWriter | None = None
+        self._ring_s = ring_s
         if ring_s:
             from plow_twin.record.ring import PARTS, RingWriter
 
@@ -142,7 +145,8 @@ class Recorder:
         self._writer = self._ring or RunWriter(self._folder, header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
         self._mark: Path | None = None  # where the ring is to be written
-        self._marks = 0
+        self._marks = self._marks_lost = 0
+        self._mark_error: str | None = None
         self._publication_topics = {name: header.topic(name) for name in PUBLICATION_TOPICS}
         # of a publication without and with its slow part
         each = tuple(topic for name, topic in self._publication_topics.items() if name not in SLOW_TOPICS)
@@ -184,8 +188,9 @@ class Recorder:
         """Counters as of now."""
         with self._lock:
             lost = dict(self._lost)
-            error = self._error
-        return RecorderCounters(self._written, len(self._queue), self._writer.bytes_written, lost, error, self._marks)
+            error = self._error or self._mark_error
+        marks = self._marks, self._marks_lost
+        return RecorderCounters(self._written, len(self._queue), self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
         """Have the ring written, once the next `Snapshot` is journalled or the recorder closed.
@@ -295,7 +300,7 @@ class Recorder:
         self._stopping.set()
         self._thread.join(timeout_s)
         with self._lock:
-            error = self._error
+            error = self._error or self._mark_error
             if error is None and not self._closed:
                 error = f"{self.path}: not closed within {timeout_s:g} s, {len(self._queue)} item(s) unwritten"
             return LossReport(dict(self._lost), self._closed, error)
@@ -402,8 +407,10 @@ class Recorder:
                 self._dump(self._ring, self._mark, lost)
                 self._marks += 1
             except (OSError, RecordingError) as error:  # the ring goes on
+                self._marks_lost += 1
+                self._mark_error = f"{self._mark}: the last {self._ring_s:g} s not written: {error}"
                 if self._on_error is not None:
-                    self._on_error(f"{self._mark}: not written: {error}")
+                    self._on_error(self._mark_error)
             self._mark = None
 
     def _dump(self, ring: RingWriter, folder: Path, lost: Mapping[str, int]) -> None:

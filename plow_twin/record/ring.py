@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final
 
@@ -83,6 +84,16 @@ class RingWriter(RunWriter):
             It could not be written; the ring is as it was.
         """
         make_folder(folder)
+        with ExitStack() as undone:  # half a ring is none
+            undone.callback(_remove, folder)
+            self._dump(folder, loss, undone)
+            undone.pop_all()
+        if self._sync_dumps:
+            sync_path(folder.parent)
+        self._kept = []
+
+    def _dump(self, folder: Path, loss: Mapping[str, int], undone: ExitStack) -> None:
+        """Write to a folder; what is to be removed, should that fail, is noted."""
         shortage = self._shortage(folder)
         if shortage is not None:
             raise RecordingError(shortage)
@@ -91,6 +102,7 @@ class RingWriter(RunWriter):
             name = f"{folder.name}_{part.name.rpartition('_')[2]}"
             try:
                 with (folder / name).open("xb") as stream:
+                    undone.callback((folder / name).unlink)
                     stream.write(content)
             except FileExistsError as error:
                 raise TakenError(f"{folder / name}: exists already, expected a new file for the recording") from error
@@ -98,14 +110,19 @@ class RingWriter(RunWriter):
                 sync_path(folder / name)
             facts.append(PartFacts(name, part.start_ns, part.end_ns, part.topics))
         lost = {f"plow_twin_lost {topic}": str(n) for topic, n in loss.items()}
+        for name in ("metadata.yaml", "metadata.yaml.partial"):
+            undone.callback((folder / name).unlink, missing_ok=True)
         write_metadata(folder, bag_metadata(facts, lost), sync=self._sync_dumps)
-        if self._sync_dumps:
-            sync_path(folder.parent)
-        self._kept = []
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
         """Let go what is kept."""
         self._kept = []
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, unless something is in it."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 class MemoryFile:
