@@ -36,6 +36,17 @@ def test_sampled_at_1_khz_follows_the_analytic_motion() -> None:
         assert series.makes[:, pair].sum() == row["makes"]
 
 
+@pytest.mark.parametrize("name", ["paper", "bench_hc"])
+def test_impulses_of_all_advances_are_those_of_the_run(name: str) -> None:
+    """Steps that begin at a touch count from there: with d^1.5 they advance in the root of time."""
+    exact = simulate(preset(name), 2.0, tol=1e-9)
+    expected = [row["impulse"] for row in exact.statistics.values()]
+    for times in (TIMES[:2000], TIMES[1999:2000]):
+        twin = Twin(preset(name), tol=1e-9)
+        total = sum((twin.advance(t).impulse for t in times), np.zeros(8))
+        assert total == pytest.approx(expected, rel=1e-8, abs=1e-9)
+
+
 @settings(max_examples=10)
 @given(st.lists(st.integers(1, 2999), max_size=6, unique=True))
 def test_samples_in_any_batches_give_the_same_bits(cuts: list[int]) -> None:

@@ -26,7 +26,7 @@ def sigma_at(state, used):
     """Return sigma at `used` seconds into the step."""
     if used >= state.step_size:
         return state.sigma_end
-    if state.beta == 0.0:
+    if state.beta == 0.0 or used == 0.0:  # alpha is 0 too where a step begins at a touch
         return used
     # the root of alpha sigma + beta sigma^2 / 2 = used that suffers no cancellation
     return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * state.beta * used, 0.0)))
