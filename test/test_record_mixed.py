@@ -135,6 +135,20 @@ def test_a_late_speed_does_not_reach_back_across_a_snapshot(tmp_path: Path) -> N
     assert _same(live.replayed())
 
 
+def test_a_speed_from_before_a_snapshot_is_not_lost_when_a_sample_after_it_is_late(tmp_path: Path) -> None:
+    digests = []
+    for order in ([100, 101, 102, 103], [100, 101, 103, 102]):
+        live = Mixed(tmp_path / str(order[-1]))
+        live.send(*map(_swinging, range(100)))
+        live.driver.snapshot()
+        live.driver.travel(T0 + 30 * MS, 0.5)
+        for index in order:
+            live.send(_swinging(index))
+        digests.append(live.driver.session.twin.digest())
+        assert _same(live.replayed())
+    assert digests[0] == digests[1]
+
+
 def test_after_a_hold_and_a_reset_samples_are_not_taken_for_held(tmp_path: Path) -> None:
     live = Mixed(tmp_path, publish_mode="fixed_rate", alarm_force=[1e3, 1e9], excitation_timeout=0.05)
     live.send(_at(0, NOTHING))

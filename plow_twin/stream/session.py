@@ -445,8 +445,8 @@ class Session:
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         # one that was to come at the snapshot may have been applied, or be to come still
-        known = dict.fromkeys((*self._travels, *travels, *pending, *more))
-        self._travels = sorted(known, key=lambda travel: travel.stamp_ns)
+        known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
+        self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
 
     def _apply_hold(self, entry: Hold | Unload) -> Advance:
@@ -496,11 +496,11 @@ class Session:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
+        elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
+            # too old to be worked in at its place: it acts from the newest sample on, or from the one state kept
+            self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
-        elif travel.stamp_ns <= oldest_ns:
-            # too old to be worked in at its place: it acts from the newest sample on
-            self._set_speed(Travel(newest_ns, travel.speed_m_s))
         else:
             self._work_in(travel.stamp_ns, [], travel)
 
