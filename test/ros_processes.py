@@ -67,6 +67,13 @@ class Process:
         self._process.send_signal(number)
         return self._process.wait(5.0)
 
+    def stop_again_and_again(self, number: signal.Signals) -> int:
+        """Ask for a stop until the process has ended."""
+        while self.running:
+            self._process.send_signal(number)
+            time.sleep(0.002)
+        return self._process.wait()
+
     def close(self) -> None:
         """End the process; a killed one would leave its shared memory behind."""
         if self.running:

@@ -476,10 +476,11 @@ def test_a_stop_under_load_is_clean_and_closes_the_recording(tmp_path: Path, num
         forces = running.probe.listen(JointState, "contact_forces")
         publisher = running.publisher("--seconds", "60")
         running.probe.until(lambda: len(forces) > 500, "a flow of messages", 60.0)
-        assert running.twin.stop(number) == 0
+        # as from a terminal and a launch at once
+        assert running.twin.stop_again_and_again(number) == 0
         assert "Traceback" not in running.twin.output()
         assert publisher.running
-        assert publisher.stop(number) == 0
+        assert publisher.stop_again_and_again(number) == 0
         assert "Traceback" not in publisher.output()
     reader = RunReader(tmp_path / "run")
     used = sum(1 for record in reader if type(getattr(record, "entry", None)).__name__ == "Sample")
@@ -530,7 +531,7 @@ def test_a_stop_while_the_solver_is_compiled_is_clean(tmp_path: Path, monkeypatc
         running.probe.until(lambda: len(running.probe.reports) >= count + 2, "reports while compiling")
         assert "preparing the solver" in running.probe.status[-1].message
         assert "solver ready" not in running.twin.output()
-        assert running.twin.stop(signal.SIGTERM) == 0
+        assert running.twin.stop_again_and_again(signal.SIGINT) == 0
         assert "Traceback" not in running.twin.output()
 
 

@@ -31,6 +31,15 @@ class StopSignals:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
+    def ignore(self) -> None:
+        """Let the signals do nothing more, at the end of a program.
+
+        The interpreter gives them their default back while it ends: one more, as of a terminal and a launch at once,
+        would be the end of a process that has done all it was to do.
+        """
+        for number in self._before:
+            signal.signal(number, signal.SIG_IGN)
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.stopped = True
         if self.interrupt:

@@ -278,6 +278,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stop.interrupt = False
         start_ros(given)
     except StopRequested:
+        stop.ignore()
         return 0
     except (SceneError, ArgumentError, OSError, RosArgumentsError) as error:
         print(f"excitation_publisher: {error}", file=sys.stderr)
@@ -288,6 +289,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     finally:
         node.destroy_node()
         rclpy.utilities.try_shutdown()
+        stop.ignore()
 
 
 def _publish(node: ExcitationPublisher, options: argparse.Namespace) -> int:

@@ -33,6 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run(arguments, stop)
     except StopRequested:
         return 0
+    finally:
+        stop.ignore()
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
