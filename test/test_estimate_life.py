@@ -77,7 +77,7 @@ def test_quantiles_scale_with_the_coefficient_and_the_horizon_cuts(tmp_path: Pat
     doubled = replace(scene, wear=replace(slow, prior_m2_n=(1e-14, 4e-14)))
     assert forecast(doubled, plan).quantile(0.5) == pytest.approx(0.5 * p50, rel=0.02)
     assert life.probability_before(p50) == pytest.approx(0.5, abs=0.02)
-    short = forecast(scene, replace(plan, horizon_h=0.01 * p10)).as_dict()
+    short = forecast(scene, replace(plan, horizon_h=0.01 * p10, stop_h=None)).as_dict()
     assert short["p50"]["hours"] is None and short["not_reached_in_horizon"] == 1.0
     file = tmp_path / "scene.yaml"
     file.write_text(dump_scene(scene))
@@ -228,6 +228,45 @@ def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
         coefficient(scene, History(travel, still, np.full((5, 2), 1e-6)))
     with pytest.raises(LifeError, match="not above zero"):
         History(travel, -still, np.full((5, 2), 1e-6))
+
+
+def test_a_history_that_shrinks_is_refused() -> None:
+    """By 20 of its deviations: a coefficient of nearly none was told, with a narrow interval."""
+    scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0))
+    travel, shrunk = np.array([0.0, 1e4]), np.array([[0.025, 0.030], [0.0245, 0.0295]])
+    with pytest.raises(LifeError, match=r"no wear of this scene explains.*row 2 is -0\.2\d+ mm off"):
+        coefficient(scene, History(travel, shrunk, np.full((2, 2), 5e-5)))
+    assert coefficient(scene, History(travel, shrunk, np.full((2, 2), 1e-3))).interval().mean < 1e-13
+
+
+def test_what_a_forecast_cannot_use_is_refused_and_not_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A stop beyond the horizon, an estimate beside a history, `null` for an estimate: all gave some forecast."""
+    scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
+    file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
+    file.write_text(dump_scene(scene))
+    history.write_text("km,horizontal_mm,horizontal_sd_mm,vertical_mm,vertical_sd_mm\n0,25,1,30,1\n9,25,1,30,1\n")
+    limits = ["--limit-horizontal", "28", "--limit-vertical", "34"]
+
+    def said(*more: str, scene_file: Path | str = file) -> str:
+        assert cli(["forecast", str(scene_file), *limits, *more]) == 2
+        return capsys.readouterr().err
+
+    assert "--stop: got 20 h, expected at most the horizon, --horizon 5" in said("--horizon", "5", "--stop", "20")
+    assert "scenario: got 'hard:lod=1.3'" in said("--scenario", "hard:lod=1.3")
+    assert "wear: got none" in said(scene_file="paper")
+    whole = {"mean_m": 0.026, "p05_m": 0.0259, "p95_m": 0.0261, "state": "estimated"}
+    for text, expected in (
+        ("null", "got NoneType, expected JSON of an estimate"),
+        ("[" * 200_000, "expected JSON of an estimate"),
+        (json.dumps({"horizontal": [1]}), "estimate: horizontal: got [1], expected what `plow-twin estimate"),
+        (json.dumps({"horizontal": whole, "vertical": whole | {"state": "withdrawn"}}), "a withdrawn vertical"),
+        (json.dumps({"horizontal": whole, "vertical": whole | {"p05_m": float("nan")}}), "expected finite ones"),
+    ):
+        found.write_text(text)
+        assert expected in " ".join(said("--estimate", str(found)).split())
+    assert "cannot be combined" in said("--estimate", str(found), "--history", str(history))
 
 
 def test_a_history_that_cannot_be_used_is_refused() -> None:

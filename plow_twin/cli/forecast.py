@@ -72,16 +72,23 @@ def forecast(
     from plow_twin.estimate.coefficient import coefficient
     from plow_twin.estimate.forecast import Plan, Scenario, with_clearances
     from plow_twin.estimate.forecast import forecast as run
+    from plow_twin.estimate.life import LifeError
 
+    if estimated is not None and history is not None:
+        raise click.UsageError("--estimate cannot be combined with --history: a history tells the clearances now")
+    if stop is not None and stop > horizon:
+        raise click.UsageError(f"--stop: got {stop:g} h, expected at most the horizon, --horizon {horizon:g}")
     model, facts_now = _scene(scene)
+    if model.wear is None or model.wear.travel_speed_m_s <= 0.0:
+        raise click.UsageError(f"{scene}: wear: got none or no travel speed, expected both")
     if estimated is not None:
-        try:
-            facts_now = json.loads(estimated.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise click.UsageError(f"{estimated}: {error}, expected JSON of an estimate") from error
+        facts_now = _estimate(estimated)
     limits = 1e-3 * limit_horizontal, 1e-3 * limit_vertical
-    others = tuple(Scenario.parse(text) for text in scenarios)
-    plan = Plan(*limits, horizon, stop, face_length, seed=seed, scenarios=others)
+    try:
+        others = tuple(Scenario.parse(text) for text in scenarios)
+        plan = Plan(*limits, horizon, stop, face_length, seed=seed, scenarios=others)
+    except LifeError as error:
+        raise click.UsageError(str(error)) from error
     with busy("forecasting", quiet or as_json):
         if history is None:
             model, deviation = _now(model, facts_now)
@@ -120,6 +127,17 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None]:
         for entry in batch.entries.others.values():
             newest = entry if isinstance(entry, Estimated) else newest
     return reader.header.scene(reader.path), None if newest is None else json.loads(newest.result)
+
+
+def _estimate(path: Path) -> Any:
+    """Return what the JSON of an estimate says, unchecked."""
+    try:
+        facts = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise click.UsageError(f"{path}: {error}, expected JSON of an estimate") from error
+    if not isinstance(facts, dict):
+        raise click.UsageError(f"{path}: got {type(facts).__name__}, expected JSON of an estimate")
+    return facts
 
 
 def _history(path: Path) -> History:

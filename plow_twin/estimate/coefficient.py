@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, Interval
@@ -26,6 +27,11 @@ _POINTS, _REACH = 801, 4.0
 _FURTHER, _FURTHER_M = 2.0, 5e-4
 #: Most probability at an end of the grid: with more of it the history says something that the prior does not allow.
 _MOST_AT_END = 0.02
+#: Relative standard deviation of the rate beside what a history tells: means over a few periods, a load whose share
+#: differs from pad to pad. Set on lives with seeds below 1000 (benchmark/lives.py).
+PATH_DEVIATION = 0.03
+#: A history that is less probable than that along the path that fits it best contradicts wear.
+_LEAST_PROBABLE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +98,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     Raises
     ------
     LifeError
-        Where the scene has no wear or no period, or the history cannot be used or contradicts the prior.
+        Where the scene has no wear or no period, or the history cannot be used or contradicts the prior or wear itself.
     """
     wear = scene.wear
     if wear is None:
@@ -124,9 +130,28 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
             f"history: got a growth that the prior of the coefficient does not allow, from {ends[0]:.2g} to "
             f"{ends[1]:.2g} m^2/N, expected a wider wear.prior_m2_n"
         )
+    _check_fit(history, _growth(path, math.exp(float(grid[share.argmax()])) * history.travel / wear.pad_area_m2))
     clearance = share @ means
     variance = share @ (means - clearance) ** 2 + 1.0 / weight.sum(axis=0)
     return Coefficient(np.exp(grid), share, clearance, np.sqrt(variance), share @ depths)
+
+
+def _check_fit(history: History, grown: Array) -> None:
+    """Raise LifeError where clearances are farther from a growth, shape (n, 2), than their deviations allow.
+
+    The growth itself is known to within `PATH_DEVIATION`.
+    """
+    weight = 1.0 / (history.deviation**2 + (PATH_DEVIATION * grown) ** 2)
+    apart = history.clearance - grown
+    apart -= (weight * apart).sum(axis=0) / weight.sum(axis=0)
+    square, freedom = float((weight * apart**2).sum()), 2 * (len(apart) - 1)
+    if chdtrc(freedom, square) < _LEAST_PROBABLE:
+        row, axis = np.unravel_index(int((weight * apart**2).argmax()), apart.shape)
+        raise LifeError(
+            f"history: got clearances that no wear of this scene explains (chi^2 {square:.3g} with {freedom} degrees "
+            f"of freedom, row {row + 1} is {1e3 * apart[row, axis]:+.3g} mm off {('horizontally', 'vertically')[axis]}), "
+            "expected ones that grow, with the deviations that they have"
+        )
 
 
 def _growth(path: Path, exposure: Array) -> Array:

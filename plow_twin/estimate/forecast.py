@@ -6,6 +6,7 @@ Scenarios tell the same for another load or another wear coefficient, from the s
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.coefficient import Coefficient
+from plow_twin.estimate.coefficient import PATH_DEVIATION, Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, State
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
@@ -22,9 +23,6 @@ from plow_twin.model.scene import Clearance, Scene, Table
 Array = NDArray[np.float64]
 
 HOUR_S = 3600.0
-#: Relative standard deviation of the rate beside what a history tells: means over a few periods, a load whose share
-#: differs from pad to pad. Set on lives with seeds below 1000 (benchmark/lives.py).
-PATH_DEVIATION = 0.03
 #: Share of a clearance by which it may be smaller than believed.
 _LEAST_SHARE = 0.9
 
@@ -90,6 +88,11 @@ class Plan:
         for name, value in numbers.items():
             if not 0.0 <= value < math.inf:
                 raise LifeError(f"{name}: got {value}, expected a finite number >= 0")
+        if self.stop_h is not None and self.stop_h > self.horizon_h:
+            raise LifeError(f"stop_h: got {self.stop_h:g} h, expected at most the horizon of {self.horizon_h:g} h")
+        names = [one.name for one in self.scenarios]
+        if len(set(names)) < len(names):
+            raise LifeError(f"scenarios: got the names {', '.join(names)}, expected each once")
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,11 +192,8 @@ def forecast(
     Raises
     ------
     LifeError
-        Where the scene has no wear, does not travel or has no period; for two scenarios of one name.
+        Where the scene has no wear, does not travel or has no period.
     """
-    names = [one.name for one in plan.scenarios]
-    if len(set(names)) < len(names):
-        raise LifeError(f"scenarios: got the names {', '.join(names)}, expected each once")
     others = {
         one.name: _forecast(with_load(scene, one.load), plan, deviation_m, known, one.coefficient)
         for one in plan.scenarios
@@ -291,14 +291,24 @@ def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[
     LifeError
         For a withdrawn one, or JSON of something else.
     """
-    names = ("horizontal", "vertical")
+    if not isinstance(facts, Mapping):
+        raise LifeError(f"estimate: got {type(facts).__name__}, expected what `plow-twin estimate --json` prints")
+    horizontal, vertical = (_estimated(name, facts.get(name)) for name in ("horizontal", "vertical"))
+    return with_clearances(scene, horizontal[0], vertical[0]), (horizontal[1], vertical[1])
+
+
+def _estimated(name: str, facts: Any) -> tuple[float, float]:
+    """Return mean and standard deviation of a clearance in m, from its part of an estimate's JSON."""
     try:
-        states = {name: State(facts[name]["state"]) for name in names}
-        numbers = {name: [float(facts[name][key]) for key in ("mean_m", "p05_m", "p95_m")] for name in names}
+        state = State(facts["state"])
+        mean, low, high = (float(facts[key]) for key in ("mean_m", "p05_m", "p95_m"))
     except (KeyError, TypeError, ValueError) as error:
-        raise LifeError(f"estimate: got no {error}, expected what `plow-twin estimate --json` prints") from error
-    withdrawn = [name for name in names if states[name] is State.WITHDRAWN]
-    if withdrawn:
-        raise LifeError(f"estimate: got a withdrawn {withdrawn[0]} clearance, expected one that holds")
-    low, high = ((p95 - p05) / (2.0 * NORMAL_P95) for _, p05, p95 in numbers.values())
-    return with_clearances(scene, numbers["horizontal"][0], numbers["vertical"][0]), (low, high)
+        raise LifeError(
+            f"estimate: {name}: got {reprlib.repr(facts)}, expected what `plow-twin estimate --json` prints: state, "
+            "mean_m, p05_m, p95_m"
+        ) from error
+    if state is State.WITHDRAWN:
+        raise LifeError(f"estimate: got a withdrawn {name} clearance, expected one that holds")
+    if not (0.0 < mean and -math.inf < low <= mean <= high < math.inf):
+        raise LifeError(f"estimate: {name}: got {mean} m from {low} to {high}, expected finite ones in order")
+    return mean, (high - low) / (2.0 * NORMAL_P95)

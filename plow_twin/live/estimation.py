@@ -215,6 +215,9 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
         found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))
     if any(limits) and (scene.wear is None or scene.wear.travel_speed_m_s <= 0.0):
         found.append(Problem("forecast_limits", limits, "0 where the scene has no wear or no travel speed"))
+    if any(limits) and settings.forecast_stop > settings.forecast_horizon:
+        expected = f"at most forecast_horizon, {settings.forecast_horizon:g} s"
+        found.append(Problem("forecast_stop", settings.forecast_stop, expected))
     try:
         scenarios_of(settings)
     except LifeError as error:
