@@ -254,7 +254,7 @@ def test_what_a_forecast_cannot_use_is_refused_and_not_left_out(
         return capsys.readouterr().err
 
     assert "--stop: got 20 h, expected at most the horizon, --horizon 5" in said("--horizon", "5", "--stop", "20")
-    assert "scenario: got 'hard:lod=1.3'" in said("--scenario", "hard:lod=1.3")
+    assert "scenario: got 'hard:mass=1.3'" in said("--scenario", "hard:mass=1.3")
     assert "wear: got none" in said(scene_file="paper")
     whole = {"mean_m": 0.026, "p05_m": 0.0259, "p95_m": 0.0261, "state": "estimated"}
     for text, expected in (

@@ -147,10 +147,11 @@ def _check_fit(history: History, grown: Array) -> None:
     square, freedom = float((weight * apart**2).sum()), 2 * (len(apart) - 1)
     if chdtrc(freedom, square) < _LEAST_PROBABLE:
         row, axis = np.unravel_index(int((weight * apart**2).argmax()), apart.shape)
+        name = ("horizontally", "vertically")[axis]
         raise LifeError(
             f"history: got clearances that no wear of this scene explains (chi^2 {square:.3g} with {freedom} degrees "
-            f"of freedom, row {row + 1} is {1e3 * apart[row, axis]:+.3g} mm off {('horizontally', 'vertically')[axis]}), "
-            "expected ones that grow, with the deviations that they have"
+            f"of freedom, row {row + 1} is {1e3 * apart[row, axis]:+.3g} mm off {name}), expected ones that grow, with "
+            "the deviations that they have"
         )
 
 

@@ -309,6 +309,6 @@ def _estimated(name: str, facts: Any) -> tuple[float, float]:
         ) from error
     if state is State.WITHDRAWN:
         raise LifeError(f"estimate: got a withdrawn {name} clearance, expected one that holds")
-    if not (0.0 < mean and -math.inf < low <= mean <= high < math.inf):
+    if not (mean > 0.0 and -math.inf < low <= mean <= high < math.inf):
         raise LifeError(f"estimate: {name}: got {mean} m from {low} to {high}, expected finite ones in order")
     return mean, (high - low) / (2.0 * NORMAL_P95)
