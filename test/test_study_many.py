@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ import pytest
 from record_support import paper_sample, record_run
 
 from plow_twin.errors import RecordingError
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry
 from plow_twin.study.analysis.many import analyse_many
 from plow_twin.study.analysis.task import Task, analyse_task, names_apart
@@ -113,7 +116,11 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     kept: dict[str, Any] = {"flush_period_s": 0.05}
     writer = threading.Thread(target=record_run, args=(tmp_path / "run", entries()), kwargs=kept)
     writer.start()
+    (out := tmp_path / "out").mkdir()  # of an analysis before, of something else
+    for name in ("asked.json", "predicted_1.parquet"):
+        (out / name).write_text("{}")
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "run"), "--watch", "0.1", "--json"]
+    command += ["--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         first = json.loads(process.stdout.readline())
@@ -121,6 +128,12 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
         last = json.loads(process.stdout.read().splitlines()[-1])
     writer.join()
     assert process.returncode == 0 and last["lost"] == {}
+    assert {path.name for path in out.iterdir()} == {
+        "analysis.json",
+        "report.html",
+        "predicted.parquet",
+        "clearance.parquet",
+    }
     assert 0 < first["input"]["samples_used"] <= 2000 and last["input"]["samples_used"] == 4000
 
 
@@ -150,3 +163,47 @@ def test_an_interrupted_analysis_goes_on_and_a_run_that_a_twin_recorded_stays(ru
     with pytest.raises(RecordingError, match="exists already"):
         Task(runs / "r0", PAPER, None, (), tmp_path / "mine").run()
     assert recorded.exists()
+
+
+def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_side(runs: Path, tmp_path: Path) -> None:
+    out, narrow = tmp_path / "out", tmp_path / "narrow.yaml"
+    scene = load_scene(scene_path("paper"))
+    narrow.write_text(dump_scene(replace(scene, clearance=replace(scene.clearance, horizontal_m=0.02))))
+    Task(runs / "r0", PAPER, None, (narrow,), out).run()
+    assert (out / "predicted_1.parquet").exists()
+    for path in (out / "run", out / "run" / "run_0.mcap"):  # its own input, and that of another task
+        with pytest.raises(RecordingError, match="lies in what --out"):
+            Task(path, None, None, (), out).run()
+        with pytest.raises(RecordingError, match="lies in what --out"):
+            Task(runs / "r1", PAPER, None, (), out).check([path])
+    assert (out / "run" / "run_0.mcap").exists() and (out / "report.html").exists()
+    (broken := tmp_path / "broken").mkdir()
+    (broken / "load.csv").write_text("t,fx,fy,m\n0.0,nan,0,0\n")
+    with pytest.raises(RecordingError):
+        Task(broken, PAPER, None, (), out).run()
+    assert not [path.name for path in out.iterdir() if path.is_file()]
+    # a scene beside it is another question than a scene to predict with, and so is one that says something else
+    Task(runs / "r0", PAPER, None, (narrow,), out).run()
+    assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is not None
+    assert Task(runs / "r0", PAPER, narrow, (), out).stored() is None
+    assert Task(runs / "r0", narrow, None, (PAPER,), out).stored() is None
+    narrow.write_text(dump_scene(scene))
+    assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is None
+
+
+def test_what_lies_beside_the_data_is_part_of_the_question(runs: Path, tmp_path: Path) -> None:
+    (data := tmp_path / "data").mkdir()
+    load = data / "load.csv"
+    load.write_text((runs / "r0" / "load.csv").read_text())
+    paper = load_scene(scene_path("paper"))
+    scene, other = dump_scene(paper), dump_scene(replace(paper, clearance=replace(paper.clearance, vertical_m=0.02)))
+    (data / "scene.yaml").write_text(scene)
+    task = Task(load, None, None, (), data / "out")
+    task.run()
+    assert task.stored() is not None
+    (data / "scene.yaml").write_text(other)
+    assert task.stored() is None
+    (data / "scene.yaml").write_text(scene)
+    assert task.stored() is not None
+    (data / "more.mcap").write_bytes(b"")
+    assert task.stored() is None

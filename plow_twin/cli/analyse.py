@@ -76,6 +76,8 @@ def analyse(
     scene_file = Path(scene) if scene else None
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
     tasks = [Task(path, scene_file, mapping, extra, folder) for path, folder in zip(found, folders, strict=True)]
+    for task in tasks:  # before the first of them removes anything
+        task.check(found)
     results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
@@ -131,6 +133,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 
     with interruptible() as stopped:
         path = find_run(task.path, max(every, 10.0), stopped)
+        task.clear([path])
         found = run(
             path,
             scene=task.scene,

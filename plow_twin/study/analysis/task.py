@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shutil
@@ -13,13 +14,19 @@ from typing import Any, Final
 
 from plow_twin.build import package_version
 from plow_twin.errors import PlowTwinError, RecordingError
+from plow_twin.record.bag import beside_folders
 from plow_twin.record.reader import read_header
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
 from plow_twin.study.store import write_atomically
 
 #: Written last: what the other files of an analysis were made of.
 _ASKED: Final = "asked.json"
+_FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
+#: Tables, one for each scene that predicts.
+_TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parquet")
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
@@ -59,13 +66,45 @@ class Task:
             return None
         return {**facts, "lossy": bool(facts["lost"])} if asked == self._asked() else None
 
-    def clear(self) -> None:
-        """Remove the run that an analysis before has left; a run that a twin has recorded stays."""
-        if self.out is None:
-            return
-        (self.out / _ASKED).unlink(missing_ok=True)
-        if (self.out / "run").is_dir() and all(map(_is_ours, (self.out / "run").iterdir())):
-            shutil.rmtree(self.out / "run")
+    def clear(self, inputs: Sequence[Path] = ()) -> None:
+        """Remove what an analysis before has left, all of it; a run that a twin has recorded stays.
+
+        Raises
+        ------
+        RecordingError
+            What this analysis, or one of those beside it, reads from (`inputs`) is among it.
+        """
+        old = self._old()
+        self._keep(old, (*self._inputs(), *inputs))
+        for path in old:
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+
+    def check(self, inputs: Sequence[Path]) -> None:
+        """Raise a `RecordingError` when one of these would be replaced."""
+        self._keep(self._old(), inputs)
+
+    def _old(self) -> list[Path]:
+        """Return what an analysis before has left, first what says that it is whole."""
+        if self.out is None or not self.out.is_dir():
+            return []
+        found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
+        run = self.out / "run"
+        if run.is_dir() and all(map(_is_ours, run.iterdir())):
+            found.append(run)
+        return sorted(found, key=lambda path: path.name != _ASKED)
+
+    def _keep(self, old: Sequence[Path], inputs: Sequence[Path]) -> None:
+        for path in inputs:
+            real = path.resolve()
+            for one in old:
+                if real.is_relative_to(one.resolve()):
+                    raise RecordingError(f"{path}: lies in what --out {self.out} replaces, expected another folder")
+
+    def _inputs(self) -> list[Path]:
+        return [self.path, *(path for path in (self.scene, self.mapping, *self.others) if path is not None)]
 
     def run(self, on_progress: Callable[[float], object] | None = None) -> dict[str, Any]:
         """Return the facts of the analysis and write its files.
@@ -76,6 +115,7 @@ class Task:
             It cannot be made.
         """
         self.clear()
+        asked = self._asked()  # of what is read from now on, not of what it has become by the end
         found = analyse(
             self.path,
             scene=self.scene,
@@ -86,18 +126,23 @@ class Task:
         )
         if self.out is not None:
             write_report(found, self.out)
-            self.store()
+            write_atomically(self.out / _ASKED, json.dumps(asked, indent=1).encode())
         return {**found.facts(), "lossy": found.lossy}
 
-    def store(self) -> None:
-        """Note what the files in `out` are, once all are written."""
-        if self.out is not None:
-            write_atomically(self.out / _ASKED, json.dumps(self._asked(), indent=1).encode())
-
     def _asked(self) -> dict[str, Any]:
-        """Return what the result depends on: the recording and the files that say how to read it."""
-        inputs = [self.path, *(path for path in (self.scene, self.mapping, *self.others) if path is not None)]
-        return {"inputs": [_state(path) for path in inputs], "version": package_version()}
+        """Return what the result depends on: the recording, what lies beside it, and what says how to read it."""
+        folder = self.path if self.path.is_dir() else self.path.parent
+        beside = folder / "scene.yaml" if self.scene is None else None
+        return {
+            "run": _state(self.path, self.out),
+            # what was measured beside a part, in other parts too
+            "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in _measured_near(folder)],
+            "scene": _scene_state(self.scene),
+            "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,
+            "map": None if self.mapping is None else _state(self.mapping, None),
+            "with": [_scene_state(other) for other in self.others],
+            "version": package_version(),
+        }
 
 
 def _is_ours(file: Path) -> bool:
@@ -115,10 +160,35 @@ def _is_ours(file: Path) -> bool:
     return header is not None and MAPPED_LOAD in header.parameters
 
 
-def _state(path: Path) -> list[Any]:
-    """Return name, sizes and times of a file, or of those in a folder."""
+def _state(path: Path, out: Path | None) -> list[Any]:
+    """Return name, sizes and times of a file, or of those in a folder but for the results in `out`."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    if out is not None and out.resolve().is_relative_to(path.resolve()):
+        results = out.resolve()
+        files = [file for file in files if not _is_result(file.resolve(), results)]
     return [str(path), *([file.name, file.stat().st_size, file.stat().st_mtime_ns] for file in files if file.is_file())]
+
+
+def _is_result(file: Path, out: Path) -> bool:
+    if file.is_relative_to(out / "run"):
+        return True
+    return file.parent == out and (file.name in _FILES or _TABLE.fullmatch(file.name) is not None)
+
+
+def _measured_near(folder: Path) -> list[Path]:
+    """Return the files and folders in which measurements beside a single part are looked for."""
+    return [*sorted(folder.glob("*.mcap")), *beside_folders(folder)]
+
+
+def _scene_state(scene: Path | None) -> list[str] | None:
+    """Return the name of a scene and the digest of all that it says, its tables too."""
+    if scene is None:
+        return None
+    try:
+        text = dump_scene(load_scene(scene_path(str(scene))))
+    except (PlowTwinError, OSError, ValueError):  # named by the analysis
+        text = ""
+    return [str(scene), hashlib.blake2b(text.encode(), digest_size=16).hexdigest()]
 
 
 def analyse_task(task: Task) -> dict[str, Any]:
