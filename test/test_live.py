@@ -450,7 +450,7 @@ class Endless:
     def topics(self) -> dict[str, Columns]:
         return {"load": Columns(("t", "fx", "fy", "m", "x", "y", "theta", "speed"))}
 
-    def start(self, topics: list[str]) -> None:
+    def start(self, topics: list[str], stamp_ns: object = None) -> None:
         pass
 
     def poll(self, timeout_s: float) -> list[Arrived]:

@@ -205,6 +205,58 @@ def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_pat
     assert table.num_rows == len(loads.slide_wear)
 
 
+@pytest.mark.parametrize("rotation", ["paper", "consistent"])
+def test_what_contacts_take_under_gravity_alone_is_the_height_lost(rotation: str, tmp_path: Path) -> None:
+    """In flight that is nothing; once the head lies still it is m g times the drop of its centre of mass."""
+    scene = load_scene(PAPER)
+    arm, height = scene.gravity.arm_m, 0.1
+    assert arm > 0.1
+    if rotation == "consistent":
+        head = replace(scene.head, rotation="consistent", com_offset_m=(arm, height))
+        scene = replace(scene, head=head, gravity=replace(scene.gravity, arm_m=0.0))
+    (tmp_path / "scene.yaml").write_text(dump_scene(scene))
+    weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
+    for end in (0.03, 20.0):
+        times = np.arange(0.0, end, 2e-3)
+        q = Twin(scene, excitation="sampled").advance_samples(times, np.zeros((len(times), 3))).q
+        (tmp_path / "load.csv").write_text("t,fx,fy,m\n" + "".join(f"{t:.3f},0,0,0\n" for t in times))
+        loads = analyse(tmp_path).predictions[0].loads
+        theta = q[:, 2]
+        if rotation == "consistent":
+            level = q[:, 1] + np.sin(theta) * arm + np.cos(theta) * height
+        else:
+            level = q[:, 1] + theta * arm
+        lost = weight * (level[0] - level[-1])
+        assert lost > (1.0 if end < 1.0 else 400.0)
+        assert loads.contact_loss_j == pytest.approx(0.0 if end < 1.0 else lost, abs=0.05)
+        assert loads.impulse.any() == (end > 1.0)
+
+
+@pytest.mark.parametrize(
+    ("header", "first", "scale", "clock", "stamp"),
+    [
+        ("t,speed", None, 1000.0, 0.0, "stamp_unit: ms"),
+        ("n,zeit,speed", "7", 1.0, 0.0, "stamp: zeit"),
+        ("t,speed", None, 1.0, 100.0, "clock_offset: -100"),
+    ],
+)
+def test_speeds_act_at_the_stamps_that_the_mapping_reads(
+    header: str, first: str | None, scale: float, clock: float, stamp: str, tmp_path: Path
+) -> None:
+    times = np.arange(0.0, 8.0, 0.01)
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n" + "".join(f"{t},0,0,0\n" for t in times))
+    speeds = ((0.0, 1.0), (3.0, -1.0), (5.0, 2.0))
+    rows = [f"{first + ',' if first else ''}{(t + clock) * scale},{speed}\n" for t, speed in speeds]
+    (tmp_path / "travel.csv").write_text(header + "\n" + "".join(rows))
+    (tmp_path / "map.yaml").write_text(f"excitation: {{topic: load}}\ntravel: {{topic: travel, {stamp}}}\n")
+    found = analyse(tmp_path, scene=PAPER, mapping=tmp_path / "map.yaml")
+    passes = [(item.start_s, item.end_s, item.start_m, item.end_m) for item in found.predictions[0].loads.passes]
+    expected = [(0.0, 3.0, 0.0, 3.0), (3.0, 5.0, 3.0, 1.0), (5.0, 8.0, 1.0, 7.0)]
+    assert len(passes) == 3
+    for one, known in zip(passes, expected, strict=True):
+        assert one == pytest.approx(known, abs=0.05)
+
+
 def test_late_repeated_and_non_finite_samples_are_counted_as_live(
     motion: tuple[np.ndarray, ...], tmp_path: Path
 ) -> None:

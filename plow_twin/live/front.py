@@ -17,7 +17,7 @@ from plow_twin.live.publishing import QUALITY
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
-from plow_twin.record.mapping import Role, read_map
+from plow_twin.record.mapping import Role, read_map, stamps_by
 from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.stream.outputs import Publication
@@ -119,7 +119,7 @@ class BridgeFront:
         runtime, bridge = self.runtime, self._bridge
         lost: list[str] = []
         try:
-            bridge.start([role.topic for role in self.roles.values()])
+            bridge.start([role.topic for role in self.roles.values()], stamps_by(self.roles.values()))
             first = bridge.poll(0.0) if bridge.ends else []
             self._feeder.begin(first)
             runtime.start()

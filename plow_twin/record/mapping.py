@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
 from plow_twin.scene_file.yaml_text import load_yaml
@@ -118,8 +119,13 @@ class Role:
                 return None
             value = value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)
             values[name] = value * self.factor.get(name, 1.0)
-        stamp_ns = self._stamp_ns(arrived)
-        return None if stamp_ns is None else (stamp_ns + self.clock_offset_ns, values)
+        stamp_ns = self.stamp_ns(arrived)
+        return None if stamp_ns is None else (stamp_ns, values)
+
+    def stamp_ns(self, arrived: Arrived) -> int | None:
+        """Return the stamp of a message [ns], or None when it has none."""
+        stamp_ns = self._sent_ns(arrived)
+        return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
     def plausible(self, values: Mapping[str, float]) -> bool:
         """Tell whether no number is outside its limits; one that is not there is none."""
@@ -137,7 +143,7 @@ class Role:
         value = _follow(arrived.content, self.sequence)
         return int(value) if value is not None and math.isfinite(value) and value == int(value) >= 0 else None
 
-    def _stamp_ns(self, arrived: Arrived) -> int | None:
+    def _sent_ns(self, arrived: Arrived) -> int | None:
         content = arrived.content
         received_ns = None if arrived.log_time_ns == NO_TIME else arrived.log_time_ns
         if self.stamp == "log":
@@ -221,6 +227,25 @@ def readings(
         for name, role in shared:
             if len(shared) == 1 or not role.empty(arrived):
                 yield name, arrived, role.read(arrived)
+
+
+def stamps_by(roles: Iterable[Role]) -> StampOf:
+    """Return what reads the stamp of a message as its role does; of several the first that finds one."""
+    by_topic: dict[str, list[Role]] = {}
+    for role in roles:
+        by_topic.setdefault(role.topic, []).append(role)
+
+    def stamp_ns(arrived: Arrived) -> int | None:
+        found = (role.stamp_ns(arrived) for role in by_topic.get(arrived.topic, ()))
+        return next((stamp for stamp in found if stamp is not None), None)
+
+    return stamp_ns
+
+
+def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
+    """Return the messages of a recording that have a role; files of their own are put in order by the roles' stamps."""
+    topics = {role.topic for role in roles.values()}
+    return source.messages(topics.__contains__, stamps_by(roles.values()))
 
 
 def roles_by_source(

@@ -21,7 +21,7 @@ from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.estimated import stated
-from plow_twin.record.mapping import ROLES, readings, roles_by_source
+from plow_twin.record.mapping import ROLES, messages_of, readings, roles_by_source
 from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source
 from plow_twin.scene_file import load_scene
@@ -164,7 +164,7 @@ def _collect(
     unfit = 0
     for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/" if node else ""):
         roles = {name: role for name, role in roles.items() if name in wanted}
-        for name, _, found in readings(source.messages({role.topic for role in roles.values()}.__contains__), roles):
+        for name, _, found in readings(messages_of(source, roles), roles):
             if found is None:
                 unfit += 1
             else:

@@ -18,6 +18,7 @@ from urllib.parse import quote
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun
+from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.reader import run_parts
 from plow_twin.record.times import NO_TIME, STAMP_UNITS, TIMES, time_ns
 
@@ -67,14 +68,17 @@ class Losses:
 
 
 class Source(Protocol):
-    """A recording: `wanted` is asked for each topic whether its messages shall be decoded."""
+    """A recording: `wanted` is asked for each topic whether its messages shall be decoded.
+
+    Where topics are files of their own, their messages are put in order by `stamp_ns`.
+    """
 
     losses: Losses
 
     def topics(self) -> Mapping[str, TopicType]:
         """Return types by topic."""
 
-    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
 
 
@@ -167,7 +171,7 @@ class McapSource:
             found |= {channel.topic: channel.message_type for channel in reader.channels.values()}
         return found
 
-    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
         decoder = Decoder(self.losses)
         for part in self.parts:
@@ -235,7 +239,7 @@ class SqliteSource:
                 raise RecordingError(f"{part}: not a recording of rosbag2: {error}") from error
         return found
 
-    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
         decoder = Decoder(self.losses)
         for part in self.parts:
@@ -297,13 +301,12 @@ class CsvSource:
             found[part.stem] = Columns(tuple(names))
         return found
 
-    def messages(self, wanted: Callable[[str], bool]) -> Iterator[Arrived]:
-        """Yield the rows of all files in order of the time in `t`, `time` or the first column."""
-        import heapq
-
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
+        """Yield the rows of all files in order of their stamps, by default those in `t`, `time` or the first column."""
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
-        # each file in its own order: a row that is out of order stays so
-        yield from heapq.merge(*streams, key=lambda arrived: arrived.log_time_ns)
+        if len(streams) == 1:
+            return streams[0]
+        return merged(streams, stamp_ns or _log_time_ns)
 
     def _rows(self, part: Path) -> Iterator[Arrived]:
         try:
@@ -337,6 +340,10 @@ def _delimiter(stream: IO[str]) -> str:
 def delimiter_of(header: str) -> str:
     """Return what parts the columns of a header line: comma, semicolon or tab, the most frequent outside quotes."""
     return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
+
+
+def _log_time_ns(arrived: Arrived) -> int | None:
+    return None if arrived.log_time_ns == NO_TIME else arrived.log_time_ns
 
 
 def _row_time_ns(cell: str) -> int:

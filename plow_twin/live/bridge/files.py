@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 import os
 import select
 import sys
@@ -14,8 +13,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.live.bridge.source import BridgeError, Lines, Rows
+from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType
-from plow_twin.record.times import TIMES, time_ns
+from plow_twin.record.times import NO_TIME
 
 #: Most bytes read from a source at once.
 _BLOCK: Final = 1 << 18
@@ -144,12 +144,12 @@ class Files:
             found[tail.topic] = rows.header(str(tail.path))
         return found
 
-    def start(self, topics: list[str]) -> None:
+    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
         """Begin to read the files of these topics."""
         self._tails = [tail for tail in self._tails if tail.topic in topics]
         if self.ends:
             streams = [_all(tail) for tail in self._tails]
-            self._merged = streams[0] if len(streams) == 1 else heapq.merge(*streams, key=_InOrder())
+            self._merged = streams[0] if len(streams) == 1 else merged(streams, lambda row: _sent_ns(row, stamp_ns))
 
     def poll(self, timeout_s: float) -> list[Arrived]:
         """Return the next messages."""
@@ -180,18 +180,9 @@ def _all(tail: _Tail) -> Iterator[Arrived]:
             return
 
 
-class _InOrder:
-    """Key of a message by the time in it; one without a time stays where it is in its file."""
-
-    def __init__(self) -> None:
-        self._before: dict[str, int] = {}
-
-    def __call__(self, arrived: Arrived) -> int:
-        content = arrived.content or {}
-        name = next((name for name in TIMES if name in content), None)
-        stamp_ns = None if name is None else time_ns(content[name])
-        self._before[arrived.topic] = max(self._before.get(arrived.topic, 0), stamp_ns or 0)
-        return self._before[arrived.topic]
+def _sent_ns(row: Arrived, stamp_ns: StampOf | None) -> int | None:
+    """Return the stamp in a row; when it was read says nothing of its place."""
+    return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
 class StandardInput:
@@ -221,7 +212,7 @@ class StandardInput:
             self._first += self._read(1.0)
         return {STDIN_TOPIC: self._rows.header("-")}
 
-    def start(self, topics: list[str]) -> None:
+    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
         """Take note of nothing: there is one topic."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:

@@ -13,6 +13,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 
 from plow_twin.live.bridge.source import BridgeError, read_json
+from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
 #: Messages that wait to be read; what comes when so many wait is counted as lost.
@@ -76,7 +77,7 @@ class Mqtt:
         """Return None: any topic of the broker can be named."""
         return
 
-    def start(self, topics: list[str]) -> None:
+    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
         """Connect and subscribe."""
         for topic in topics:
             if any(sign in topic for sign in "+#") or not topic:

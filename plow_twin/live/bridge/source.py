@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any, Final, Protocol
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, TopicType, delimiter_of
 
 #: A longer line or payload is none of a sensor's [B].
@@ -44,8 +45,8 @@ class Bridge(Protocol):
     def topics(self) -> Mapping[str, TopicType] | None:
         """Return types by topic; None: any topic that the mapping names."""
 
-    def start(self, topics: list[str]) -> None:
-        """Begin to receive these topics."""
+    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
+        """Begin to receive these topics; files that are read once are put in order by `stamp_ns`."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:
         """Return what has arrived; wait at most so long for the first message. Unreadable content is None."""

@@ -18,7 +18,7 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed, JournalWalk, Walked, Walker
-from plow_twin.record.mapping import Role, read_map, readings, roles_by_source
+from plow_twin.record.mapping import Role, messages_of, read_map, readings, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import Source, open_source
 from plow_twin.run.twin import Twin
@@ -300,8 +300,7 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
 
 
 def _collect(source: Source, roles: Mapping[str, Role], measured: Measured) -> None:
-    topics = {role.topic for role in roles.values()}
-    for name, _, found in readings(source.messages(topics.__contains__) if topics else (), roles):
+    for name, _, found in readings(messages_of(source, roles) if roles else (), roles):
         if found is not None:
             measured.add(name, *found)
 
@@ -324,7 +323,7 @@ def _walk_other(
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
     feed = Feed(walkers, roles, measured.add, Intake())
-    feed.run(source.messages({role.topic for role in roles.values()}.__contains__))
+    feed.run(messages_of(source, roles))
     intake = feed.intake
     dropped = {
         f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count

@@ -123,7 +123,7 @@ class LoadTotals:
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
         """Return the energy that the contacts took between two rows [J]: work of load and gravity less kinetic gain.
 
-        The work is the mean load times the way; what is stored in contacts is counted as taken until it comes back.
+        The load's work is its mean times the way; what is stored in contacts is counted as taken until it comes back.
         """
         q, v, wrench = walked.rows.q, walked.rows.v, walked.wrench
         if self._last is not None:
@@ -132,12 +132,21 @@ class LoadTotals:
             wrench_0, q_0, v_0 = wrench[0], q[0], v[0]
         q_before, v_before = np.concatenate((q_0[None], q[:-1])), np.concatenate((v_0[None], v[:-1]))
         wrench_before = np.concatenate((wrench_0[None], wrench[:-1]))
-        head, gravity = self.scene.head, self.scene.gravity
-        moment = -head.mass_kg * gravity.acceleration_m_s2 * gravity.arm_m
-        work = (0.5 * (wrench + wrench_before) * (q - q_before)).sum(axis=1) + moment * (q - q_before)[:, 2]
-        inertia = np.array([head.mass_kg, head.mass_kg, head.inertia_kg_m2])
-        gain: Array = 0.5 * ((v**2 - v_before**2) * inertia).sum(axis=1)
+        work: Array = (0.5 * (wrench + wrench_before) * (q - q_before)).sum(axis=1)
+        gain = self._energy(q, v) - self._energy(q_before, v_before)
         return np.where(steps > 0.0, work - gain, 0.0)
+
+    def _energy(self, q: Array, v: Array) -> Array:
+        """Return the kinetic energy of the head and the potential one of its centre of mass in gravity [J]."""
+        head, gravity = self.scene.head, self.scene.gravity
+        theta, omega = q[:, 2], v[:, 2]
+        # from the cavity's centre to that of mass, in world axes
+        along = np.cos(theta) * head.com_offset_m[0] - np.sin(theta) * head.com_offset_m[1]
+        up = np.sin(theta) * head.com_offset_m[0] + np.cos(theta) * head.com_offset_m[1]
+        speed_2 = (v[:, 0] - omega * up) ** 2 + (v[:, 1] + omega * along) ** 2
+        height = q[:, 1] + up + gravity.arm_m * theta
+        kinetic = 0.5 * (head.mass_kg * speed_2 + head.inertia_kg_m2 * omega**2)
+        return np.asarray(kinetic + head.mass_kg * gravity.acceleration_m_s2 * height)
 
     def _face(self, walked: Walked, steps: Array, loss: Array) -> None:
         """Assign impacts, energy and forces to the pass and the piece of the face."""

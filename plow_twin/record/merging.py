@@ -1,0 +1,52 @@
+"""Messages of several files that were not written together, put in one order by their stamps."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator
+from itertools import chain, pairwise
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from plow_twin.record.sources import Arrived
+
+#: Returns the stamp of a message [ns], None: it has none.
+StampOf = Callable[["Arrived"], int | None]
+
+#: A stamp older than the newest one by more than this [ns] is a step of the clock; less is a late row.
+_STEP_NS: Final = 1_000_000_000
+#: One newer by more than this [ns] may be wrong.
+_JUMP_NS: Final = 10_000_000_000
+
+
+def merged(streams: Iterable[Iterator[Arrived]], stamp_ns: StampOf) -> Iterator[Arrived]:
+    """Yield the messages of all streams by their stamps, each stream in its own order.
+
+    A message without a stamp stays where it is in its stream, and so does a single wrong stamp. After a step of the
+    clock back a stream waits until all others have come to theirs.
+    """
+    for _, _, arrived in heapq.merge(*(_placed(stream, stamp_ns) for stream in streams), key=lambda item: item[:2]):
+        yield arrived
+
+
+def _placed(stream: Iterator[Arrived], stamp_ns: StampOf) -> Iterator[tuple[int, int, Arrived]]:
+    """Yield each message with the number of steps of the clock before it and the newest stamp until then."""
+    steps, newest = 0, None
+    stamped = ((arrived, stamp_ns(arrived)) for arrived in stream)
+    for (arrived, stamp), (_, following) in pairwise(chain(stamped, [(None, None)])):
+        assert arrived is not None
+        if stamp is not None and newest is None:
+            newest = stamp
+        elif stamp is not None and newest is not None and not _is_stray(stamp, newest, following):
+            back = newest - stamp > _STEP_NS
+            steps, newest = steps + back, stamp if back else max(newest, stamp)
+        yield steps, 0 if newest is None else newest, arrived
+
+
+def _is_stray(stamp: int, newest: int, following: int | None) -> bool:
+    """Tell whether the next stamp goes on from before and not from this one."""
+    if following is None:
+        return False
+    back = newest - stamp > _STEP_NS
+    goes_on = newest - following <= _STEP_NS
+    return goes_on if back else goes_on and stamp - newest > _JUMP_NS and stamp - following > following - newest
