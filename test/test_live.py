@@ -67,6 +67,10 @@ def _csv(path: Path, count: int, more: str = "") -> Path:
     return path
 
 
+#: What a damaged number may read.
+STRAY = ("5000000", "1e30", "0", "-7", "nan")
+
+
 def _run(path: Path, mapping: Path | None = None, reports: list[Part] | None = None, **values: Any) -> dict[str, Part]:
     """Feed a twin from a file and return its diagnostics; those of its state on the way go to `reports`."""
     settings = parameters.settings(values)
@@ -263,6 +267,25 @@ def test_the_senders_own_numbers_tell_loss_repetition_and_a_new_start(tmp_path: 
     # 10 between 99 and 110, 2 between 49 and 52
     assert (values["samples_lost"], values["dropped_duplicate"], values["dropped_malformed"]) == ("12", "1", "3")
     assert int(values["samples_used"]) == len(numbers) - 1
+
+
+@pytest.mark.parametrize(
+    ("numbers", "lost"),
+    [
+        *((["1", "2", *map(str, range(3, 150)), stray, *map(str, range(151, 301))], 0) for stray in STRAY),
+        # a jump that the next one goes on from: back to the second of a new beginning, ahead, beyond all that can be
+        ([*map(str, range(2000, 2150)), *map(str, range(2, 150))], 1),
+        ([*map(str, range(1, 150)), *map(str, range(5000, 5150))], 4850),
+        ([*map(str, range(1, 150)), *map(str, range(10**15, 10**15 + 150))], 0),
+    ],
+)
+def test_a_single_stray_number_moves_nothing(tmp_path: Path, numbers: list[str], lost: int) -> None:
+    path, mapping = tmp_path / "load.csv", tmp_path / "map.yaml"
+    rows = [f"{1e9 + 1e-3 * index!r},1,2,3,{number}" for index, number in enumerate(numbers)]
+    path.write_text("\n".join(["t,fx,fy,m,n", *rows]) + "\n")
+    mapping.write_text("excitation: {topic: load, fields: {fx: fx, fy: fy, m: m}, sequence: n}\n")
+    values = _run(path, mapping)["input"][2]
+    assert (values["samples_lost"], values["samples_used"]) == (str(lost), str(len(numbers)))
 
 
 def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: Path) -> None:

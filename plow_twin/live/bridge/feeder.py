@@ -14,8 +14,13 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A number that falls by more than this is that of a sender that has begun anew.
+#: A number that falls by more than this is that of a sender that has begun anew, if the next one goes on from it; one
+#: that rises by more is believed then too.
 _RESTART = 1000
+#: More samples than that are not lost between two messages: a day at 10 kHz.
+_MOST_LOST = 10**9
+#: A 0 or 1 after this many is a new beginning, before it one that came late.
+_FIRST = 10
 #: A deviation of the load that changes by a smaller share is not journaled anew.
 _NOTABLE = 0.02
 
@@ -44,6 +49,8 @@ class Feeder:
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         self._number = 0
+        #: a number that does not go on from those before, of the newest message
+        self._odd: int | None = None
         #: whether the sender has told a number
         self._counts = False
         self._sender = 0
@@ -138,14 +145,34 @@ class Feeder:
         elif not self._counts:
             self._counts = True
             if self._number:  # those before had no numbers: they tell nothing of this one's
-                self._sender += 1
-                self._runtime.inputs.senders.start([self._name])
-                self._runtime.inputs.senders.alive([self._name])
-        elif number < self._number - _RESTART or (number <= 1 < self._number):
-            self._sender += 1
-            self._runtime.inputs.senders.alive([self._name])
+                self._begin_anew()
+        elif number == self._odd:
+            return self._name, number, True
+        elif self._goes_on(number):
+            self._odd = None
+        else:  # it is taken for the one that follows, until the next one tells
+            self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number, again
+
+    def _goes_on(self, number: int) -> bool:
+        """Tell whether a number can be counted: it goes on from those before, or from an odd one just before it."""
+        odd, before = self._odd, self._number
+        if odd is not None and abs(number - odd) < abs(number - before):
+            if not before < odd <= before + _MOST_LOST:
+                self._begin_anew()
+                senders = self._runtime.inputs.senders
+                senders.hear(self._name, odd)
+                if odd <= _RESTART:
+                    self._runtime.inputs.lost_at_first(self._name, max(odd - 1, 0))
+            return True
+        return abs(number - before) <= _RESTART and not number <= 1 < before - _FIRST
+
+    def _begin_anew(self) -> None:
+        """Take what follows for another sender's."""
+        self._sender += 1
+        self._runtime.inputs.senders.start([self._name])
+        self._runtime.inputs.senders.alive([self._name])
 
     def _measured(self, name: str, role: Role, arrived: Arrived) -> None:
         found, intake, inputs = role.read(arrived), self._optional[name], self._runtime.inputs
