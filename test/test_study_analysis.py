@@ -33,6 +33,7 @@ from plow_twin.study.analysis import loads, thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
 from plow_twin.study.analysis.loads import reversals
 from plow_twin.study.analysis.report import _write_tables
+from plow_twin.study.analysis.signals import compare
 
 COUNT = 8000
 LAG_S = 0.037
@@ -203,6 +204,21 @@ def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_pat
     _write_tables(prediction, tmp_path, "")
     table = parquet.read_table(tmp_path / "slide_wear.parquet")
     assert table.num_rows == len(loads.slide_wear)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, 0.0203, -0.4])
+@pytest.mark.parametrize(("rate_hz", "times_each"), [(1000, 1), (1000, 2), (200, 1), (37, 1)])
+def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: int, lag_s: float) -> None:
+    """Also of a signal that is slow against the time recorded, and where rows stand twice."""
+    t = np.arange(0.0, 3.0, 1e-3)
+
+    def signal(at: np.ndarray) -> np.ndarray:
+        return np.asarray(np.sin(2.0 * at) + 0.2 * np.abs(np.sin(7.0 * at)) + 0.3 * at)
+
+    at = np.repeat(np.arange(0.0, 3.0, 1.0 / rate_hz), times_each)
+    found = compare(t, signal(t), at, signal(at - lag_s))
+    assert found is not None and found.lag_s == pytest.approx(lag_s, abs=2e-4)
+    assert found.rms_aligned == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("rotation", ["paper", "consistent"])

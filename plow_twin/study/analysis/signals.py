@@ -82,30 +82,64 @@ def _correlation(one: Array, other: Array) -> float | None:
 
 def _shifted(t: Array, predicted: Array, times: Array, lag_s: float) -> Array:
     """Return the prediction as a measurement that is late by `lag_s` shows it; NaN outside its time."""
-    return np.interp(times - lag_s, t, predicted, left=math.nan, right=math.nan)
+    return _at(times - lag_s, t, predicted)
+
+
+def _at(times: Array, t: Array, predicted: Array) -> Array:
+    return np.interp(times, t, predicted, left=math.nan, right=math.nan)
+
+
+def _step(times: Array, span: float) -> float:
+    """Return the usual distance of two stamps [s], not below what gives too many points; equal stamps count once."""
+    return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
+
+
+def _correlations(longer: Array, shorter: Array) -> Array:
+    """Return Pearson's correlation of a series with each piece of a longer one, over what is known of the piece.
+
+    What is known of the longer one, that is not NaN, is one piece itself. -1 where there is too little.
+    """
+    from scipy.signal import correlate
+
+    known = np.flatnonzero(np.isfinite(longer))
+    n, begin = len(shorter), np.arange(len(longer) - len(shorter) + 1)
+    if not known.size:
+        return np.full(len(begin), -1.0)
+    one, other = longer - longer[known].mean(), shorter - shorter.mean()
+    one[: known[0]] = one[known[-1] + 1 :] = 0.0
+    low = np.clip(known[0] - begin, 0, n)
+    high = np.clip(known[-1] + 1 - begin, low, n)
+    count = np.maximum(high - low, 1)
+
+    def sums(series: Array, first: Any, last: Any) -> Array:
+        total = np.concatenate(([0.0], np.cumsum(series)))
+        return np.asarray(total[last] - total[first])
+
+    mean_one, mean_other = sums(one, low + begin, high + begin) / count, sums(other, low, high) / count
+    square_one = sums(one**2, low + begin, high + begin) - count * mean_one**2
+    square_other = sums(other**2, low, high) - count * mean_other**2
+    product = correlate(one, other, mode="valid", method="fft") - count * mean_one * mean_other
+    # a piece without any change has no correlation: what is left of it is rounding
+    enough = (high - low >= _FEWEST) & (square_one > 1e-12 * (one @ one)) & (square_other > 1e-12 * (other @ other))
+    size = np.sqrt(np.where(enough, square_one * square_other, 1.0))
+    return np.where(enough, product / size, -1.0)
 
 
 def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | None:
     """Return the lag with the largest correlation: first on a grid, then between its points."""
     from scipy.optimize import minimize_scalar
-    from scipy.signal import correlate
 
     span = float(times[-1] - times[0])
     if span <= 0.0:
         return None
-    step = max(float(np.median(np.diff(times))), span / _MOST_POINTS, 1e-6)
+    step = _step(times, span)
     grid = np.arange(times[0], times[-1], step)
     reach = int(min(LARGEST_LAG_S, span / 4.0) / step)
     if len(grid) < _FEWEST or reach < 1:
         return 0.0
-    one, other = np.interp(grid, t, predicted), np.interp(grid, times, values)
-    one, other = one - one.mean(), other - other.mean()
-    products = correlate(other, one, mode="full", method="fft")
-    middle = len(grid) - 1
-    shifts = np.arange(-reach, reach + 1)
-    # the sum over an overlap, per point of it
-    scores = products[middle - reach : middle + reach + 1] / (len(grid) - np.abs(shifts))
-    best = float(shifts[int(np.argmax(scores))]) * step
+    at = grid[0] + step * np.arange(-reach, len(grid) + reach)
+    scores = _correlations(_at(at, t, predicted), np.interp(grid, times, values))
+    best = (reach - int(np.argmax(scores))) * step
     thin = max(1, len(times) // 50_000)
 
     def badness(lag_s: float) -> float:
@@ -119,11 +153,10 @@ def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | Non
 def _coherence(times: Array, predicted: Array, measured: Array) -> float | None:
     from scipy.signal import coherence, periodogram
 
-    if len(times) < 64:
+    span = float(times[-1] - times[0])
+    if len(times) < 64 or span <= 0.0:
         return None
-    step = max(float(np.median(np.diff(times))), float(times[-1] - times[0]) / _MOST_POINTS)
-    if step <= 0.0:
-        return None
+    step = _step(times, span)
     grid = np.arange(times[0], times[-1], step)
     one, other = np.interp(grid, times, predicted), np.interp(grid, times, measured)
     if len(grid) < 64 or not np.ptp(one) or not np.ptp(other):
