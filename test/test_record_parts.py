@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import yaml
 from record_support import chunk_spans, paper_sample, record_run
 from rosbags.highlevel import AnyReader
 
+from plow_twin import Wear
+from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.doctor import examine, repair
@@ -151,6 +154,26 @@ def test_a_part_that_stands_there_twice_is_named_and_read_once(tmp_path: Path) -
         assert f"{name}: repeats run_1.mcap (part 1): it is not read" in examine(run.folder).problems
         assert repair(run.folder) == [copy] and examine(run.folder).problems == []
         copy.with_name(f"{name}.repeated").unlink()
+
+
+def test_a_part_of_another_run_is_named_and_not_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It was mixed into the journal, and the replay blamed a step."""
+    parts: dict[str, Any] = {"part_bytes": 200_000, "flush_period_s": 0.01, "chunk_size": 50_000}
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **parts)
+    other = record_run(tmp_path / "other", map(paper_sample, range(COUNT)), wear=Wear(1e-14, 0.015, 2.0), **parts)
+    second = run.folder / "run_1.mcap"
+    shutil.copy(other.folder / second.name, second)
+    after, found = replay(run.folder), examine(run.folder)
+    assert (after.exit_code, after.divergences, after.repeated) == (3, 0, 0) and after.foreign_parts == {
+        second.name: ["scene_yaml"]
+    }
+    assert f"{second.name}: of another run (its scene_yaml differ): it is not read" in found.problems
+    assert found.repeated == 0 < found.gaps
+    capsys.readouterr()
+    assert cli(["replay", str(run.folder), "-q"]) == 3
+    assert f"{second.name} is of another run" in capsys.readouterr().err
+    assert repair(run.folder) == [second] and not RunReader(run.folder).foreign
+    assert second.with_name(f"{second.name}.foreign").is_file()
 
 
 def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Path) -> None:

@@ -42,6 +42,9 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
         click.echo(f"plow-twin: warning: recorded by another build, which may round differently: {other}", err=True)
     for file, read in report.repeated_parts.items():
         click.echo(f"plow-twin: warning: {file} repeats {read}: it is not read", err=True)
+    for file, keys in report.foreign_parts.items():
+        differ = ", ".join(keys)
+        click.echo(f"plow-twin: warning: {file} is of another run (its {differ} differ): it is not read", err=True)
     if report.repeated:
         click.echo(f"plow-twin: warning: {report.repeated} entries stand there more than once", err=True)
     if report.first_divergence is not None:
@@ -71,6 +74,7 @@ def _facts(report: ReplayReport) -> dict[str, Any]:
         "lost": report.lost,
         "damaged_chunks": report.damaged_chunks,
         "repeated_parts": report.repeated_parts,
+        "foreign_parts": report.foreign_parts,
         "build_differences": {key: list(pair) for key, pair in report.build_differences.items()},
         "span_s": report.span_s,
         "wall_s": report.wall_s,

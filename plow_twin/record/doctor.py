@@ -187,6 +187,8 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
             report.problems.append(f"{part.path.name}: {part.trailing_bytes} B behind its end")
     for file, read in reader.repeated.items():
         report.problems.append(f"{file.name}: repeats {read.name} (part {reader.number(file)}): it is not read")
+    for file, keys in reader.foreign.items():
+        report.problems.append(f"{file.name}: of another run (its {', '.join(keys)} differ): it is not read")
     report.problems += _metadata_problems(reader)
     if report.repeated:
         report.problems.append(f"{report.repeated} journal entries stand there more than once: the first ones are used")
@@ -221,7 +223,7 @@ def repair(path: Path) -> list[Path]:
     -------
     list of Path
         The parts that were rewritten; the old ones stay beside them as `<name>.damaged`, those that hold nothing too,
-        and those that repeat another part as `<name>.repeated`.
+        those that repeat another part as `<name>.repeated`, those of another run as `<name>.foreign`.
 
     Raises
     ------
@@ -233,9 +235,10 @@ def repair(path: Path) -> list[Path]:
         if is_claimed(stream.fileno()):
             raise RecordingError(f"{path}: is being written, expected a recording that has ended")
     rewritten, facts = [], []
-    for file in reader.repeated:
-        file.replace(file.with_name(f"{file.name}.repeated"))
-        rewritten.append(file)
+    for files, ending in ((reader.repeated, "repeated"), (reader.foreign, "foreign")):
+        for file in files:
+            file.replace(file.with_name(f"{file.name}.{ending}"))
+            rewritten.append(file)
     for part in reader.parts:
         report = _part(part)
         if not (is_begun(part) and is_mcap(part)):

@@ -213,7 +213,8 @@ class RunReader:
     `status`, `damaged_chunks`, `lost` (by topic, as the recorder counted), `stop_reason` (why it stopped early, if it
     did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
     has been read, 0..1. `path` is the first file, `parts` are all but those `repeated`: files that hold a part once
-    more, with the file that is read for it. A part that is no MCAP file counts as a damaged chunk.
+    more, with the file that is read for it, and those `foreign`: of another run, by what differs in their headers from
+    most. A part that is no MCAP file, or is foreign, counts as a damaged chunk.
 
     With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
     follows each time that all there is has been read.
@@ -229,6 +230,7 @@ class RunReader:
     header: RunHeader = field(init=False)
     parts: list[Path] = field(init=False)
     repeated: dict[Path, Path] = field(default_factory=dict, init=False)
+    foreign: dict[Path, tuple[str, ...]] = field(default_factory=dict, init=False)
     status: FileStatus = field(default=FileStatus.UNREAD, init=False)
     damaged_chunks: int = field(default=0, init=False)
     lost: Mapping[str, int] = field(default_factory=dict, init=False)
@@ -255,13 +257,28 @@ class RunReader:
                 header = read_header(file)
                 if header is not None:
                     self._headers[file] = header
-        self.parts, self.repeated = [], {}
+        self.parts, self.repeated, self.foreign = [], {}, self._of_other_runs()
         read: dict[int, Path] = {}
-        for file in sorted(files, key=self._place_of):
+        for file in sorted(set(files) - set(self.foreign), key=self._place_of):
             if file not in self._headers or read.setdefault(self._headers[file].part, file) is file:
                 self.parts.append(file)
             else:
                 self.repeated[file] = read[self._headers[file].part]
+
+    def _of_other_runs(self) -> dict[Path, tuple[str, ...]]:
+        """Return the files whose headers are not those of the run, with what differs: the parts of a run have one."""
+        records = {file: header.to_record() for file, header in self._headers.items()}
+        for record in records.values():
+            del record["part"]
+        whose = Counter(tuple(sorted(record.items())) for record in records.values())
+        if len(whose) < 2:
+            return {}
+        own = dict(max(whose, key=whose.__getitem__))
+        return {
+            file: tuple(sorted(key for key in own if own[key] != record.get(key)))
+            for file, record in records.items()
+            if record != own
+        }
 
     def number(self, file: Path) -> int:
         """Return the number of a part, by its header where that can be read."""
@@ -314,6 +331,7 @@ class RunReader:
         yield from merger.finish()
         if self.tail is not None and self.tail.stopped:
             return
+        self.damaged_chunks += len(self.foreign)
         if not finished:
             self.status = FileStatus.TRUNCATED
         elif self.damaged_chunks:

@@ -491,6 +491,7 @@ class _Replay:
         report.compared += Counter({ALARMS: self.alarms.compared})
         report.not_compared += Counter({ALARMS: self.alarms.not_compared})
         report.repeated_parts = {file.name: read.name for file, read in reader.repeated.items()}
+        report.foreign_parts = {file.name: list(keys) for file, keys in reader.foreign.items()}
         report.stop_reason, report.inputs = reader.stop_reason, self.inputs.facts()
         report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
         if self.gaps > self.noted["journal"]:

@@ -32,7 +32,8 @@ class ReplayReport:
     """What a replay found. `compared` and `not_compared` count messages by base name of their topic.
 
     `inputs` counts what came, by input, used and not used. `repeated` counts entries that stand there more than once;
-    `repeated_parts` names files that hold a part once more, which are not read, each with the file that is.
+    `repeated_parts` names files that hold a part once more, which are not read, each with the file that is;
+    `foreign_parts` those of another run, which are not read either, each with what differs in its header.
     """
 
     path: Path
@@ -51,6 +52,7 @@ class ReplayReport:
     stop_reason: str | None = None
     damaged_chunks: int = 0
     repeated_parts: dict[str, str] = field(default_factory=dict)
+    foreign_parts: dict[str, list[str]] = field(default_factory=dict)
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
     build_differences: dict[str, tuple[str, str]] = field(default_factory=dict)
