@@ -162,7 +162,7 @@ def test_a_part_of_another_run_is_named_and_not_read(tmp_path: Path, capsys: pyt
     run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **parts)
     other = record_run(tmp_path / "other", map(paper_sample, range(COUNT)), wear=Wear(1e-14, 0.015, 2.0), **parts)
     second = run.folder / "run_1.mcap"
-    shutil.copy(other.folder / second.name, second)
+    shutil.copy(other.file, second)
     after, found = replay(run.folder), examine(run.folder)
     assert (after.exit_code, after.divergences, after.repeated) == (3, 0, 0) and after.foreign_parts == {
         second.name: ["scene_yaml"]

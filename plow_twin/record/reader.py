@@ -273,7 +273,7 @@ class RunReader:
         whose = Counter(tuple(sorted(record.items())) for record in records.values())
         if len(whose) < 2:
             return {}
-        own = dict(max(whose, key=whose.__getitem__))
+        own = dict(whose.most_common(1)[0][0])
         return {
             file: tuple(sorted(key for key in own if own[key] != record.get(key)))
             for file, record in records.items()
