@@ -221,6 +221,27 @@ def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: in
     assert found.rms_aligned == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("clock_s", [2.0, 3600.0])
+def test_measured_values_are_compared_with_the_stretch_they_belong_to(
+    clock_s: float, motion: tuple[np.ndarray, ...], tmp_path: Path
+) -> None:
+    """The clock steps back into what was, or an hour ahead: either stretch is predicted as it was measured."""
+    times, wrench, q = motion
+    short = 3000
+    weak = 0.3 * wrench[:short]
+    after = Twin(load_scene(PAPER), excitation="sampled").advance_samples(times[:short], weak).q
+    stretches = ((times, wrench, q), (times[:short] + clock_s, weak, after))
+    load = np.concatenate([np.column_stack([t, w]) for t, w, _ in stretches])
+    pose = np.concatenate([np.column_stack([t, w])[::10] for t, _, w in stretches])
+    np.savetxt(tmp_path / "load.csv", load, delimiter=",", header="t,fx,fy,m", comments="")
+    np.savetxt(tmp_path / "pose.csv", pose, delimiter=",", header="t,x,y,theta", comments="")
+    facts = analyse(tmp_path, scene=PAPER).facts()
+    assert facts["stretches"] == 2 and facts["not_compared"] == dict.fromkeys(("x", "y", "theta"), short // 10)
+    for signal in facts["signals"].values():
+        assert signal["n"] == COUNT // 10
+        assert signal["rms"] == pytest.approx(0.0, abs=2e-5) and signal["correlation"] == pytest.approx(1.0, abs=1e-4)
+
+
 @pytest.mark.parametrize("rotation", ["paper", "consistent"])
 def test_what_contacts_take_under_gravity_alone_is_the_height_lost(rotation: str, tmp_path: Path) -> None:
     """In flight that is nothing; once the head lies still it is m g times the drop of its centre of mass."""

@@ -170,3 +170,6 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool)
             numbers = (signal[key] for key in ("bias", "rms", "correlation", "lag_s"))
             shown.add_row(name, str(signal["n"]), *("" if value is None else f"{value:.4g}" for value in numbers))
         console.print(shown)
+        if "stretches" in facts:
+            left = ", ".join(f"{name} {count}" for name, count in facts["not_compared"].items()) or "none"
+            console.print(f"{facts['stretches']} stretches between resets; of the longest. Not compared: {left}.")

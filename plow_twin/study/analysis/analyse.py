@@ -25,7 +25,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake
-from plow_twin.stream.journal import Pose
+from plow_twin.stream.journal import Loss, Pose, Reset, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis.loads import LoadTotals
@@ -42,6 +42,8 @@ _COLUMNS: Final = (
 )
 #: Tolerance of a run that is made of another recording.
 _TOLERANCE: Final = 1e-9
+#: A measured stamp older than the newest one by more than this [ns] is a step of its clock.
+_STEP_NS: Final = 1_000_000_000
 _MAP: Final = "map_"
 #: Among the parameters of each run that an analysis has made.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
@@ -58,6 +60,11 @@ class Prediction:
     loads: LoadTotals
     longest: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
     present: Thinned = field(default_factory=lambda: Thinned(len(_COLUMNS)))
+    #: resets of the motion so far: the number of the present stretch
+    resets: int = 0
+    #: first and last stamp [ns] of each stretch that has rows, by its number
+    spans: dict[int, tuple[int, int]] = field(default_factory=dict)
+    _longest_number: int = 0
     #: clearance under `CLEARANCE_NAMES`, of all stretches without a reset
     clearance: Thinned = field(default_factory=lambda: Thinned(len(CLEARANCE_NAMES)))
 
@@ -65,13 +72,39 @@ class Prediction:
         """Take in a batch."""
         self.loads.add(part)
         rows, published = part.rows, part.publications
+        first, _ = self.spans.get(self.resets, (int(part.stamp_ns[0]), 0))
+        self.spans[self.resets] = first, int(part.stamp_ns[-1])
         self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, rows.penetration)))
         self.clearance.add(published.stamp_ns[published.slow_index], published.clearance)
 
     def restart(self) -> None:
         """Begin a new stretch: the stamps may go back."""
         self.loads.restart()
+        self._longest_number = self.longest_number
         self.longest, self.present = self._longer(), Thinned(len(_COLUMNS))
+        self.resets += 1
+
+    @property
+    def longest_number(self) -> int:
+        """Number of the longest stretch."""
+        return self.resets if self._longer() is self.present else self._longest_number
+
+    def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
+        """Tell of each measured value whether it belongs to the longest stretch.
+
+        That is the one whose stamps hold it; of several, as after a step of the clock back, the one in which it came.
+        """
+        at, _ = signal.series()
+        if len(self.spans) < 2:
+            return np.ones(len(at), np.bool_)
+        came, number = signal.stretches(), self.longest_number
+
+        def away(stretch: int) -> Array:
+            first, last = self.spans[stretch]
+            return np.where((at >= first) & (at <= last), np.abs(came - stretch), np.inf)
+
+        others = np.min([away(stretch) for stretch in self.spans if stretch != number], axis=0)
+        return np.asarray(np.isfinite(away(number)) & (away(number) <= others))
 
     def _longer(self) -> Thinned:
         return self.present if self.present.rows > self.longest.rows else self.longest
@@ -92,13 +125,20 @@ class Measured:
     """Measured values by signal, as they came; of very many every second, fourth, ... is kept."""
 
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
+    #: the latest of each role: its stretch and its stamp [ns]
+    _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
 
-    def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float]) -> None:
-        """Take in the numbers of one message; what is not finite was not measured."""
+    def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
+        """Take in the numbers of one message that came in that stretch; what is not finite was not measured."""
+        before, newest = self._latest.get(role, (0, stamp_ns))
+        back = newest - stamp_ns > _STEP_NS
+        # its clock has stepped before that of the load
+        stretch = max(stretch, before + back)
+        self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
         for name, value in numbers.items():
             if math.isfinite(value) and stamp_ns > 0:
-                self.signals.setdefault(prefix + name, ThinnedSignal()).add(stamp_ns, value)
+                self.signals.setdefault(prefix + name, ThinnedSignal()).add(stamp_ns, value, stretch)
 
 
 @dataclass
@@ -130,8 +170,9 @@ class Analysis:
         for name, column in columns.items():
             if name not in self.measured.signals:
                 continue
-            at, values = self.measured.signals[name].series()
-            one = compare(times[rising], column[rising], (at - stamps[0]) * 1e-9, values)
+            signal = self.measured.signals[name]
+            (at, values), ours = signal.series(), prediction.is_of_longest(signal)
+            one = compare(times[rising], column[rising], (at[ours] - stamps[0]) * 1e-9, values[ours])
             if one is not None:
                 found[name] = one
         return found
@@ -154,6 +195,12 @@ class Analysis:
     def _prediction(self, prediction: Prediction) -> dict[str, Any]:
         signals = {name: found.facts() for name, found in self.comparisons(prediction).items()}
         facts: dict[str, Any] = {"signals": signals, "loads": prediction.loads.facts()}
+        if len(prediction.spans) > 1:
+            facts["stretches"] = len(prediction.spans)
+            left = {
+                name: int((~prediction.is_of_longest(signal)).sum()) for name, signal in self.measured.signals.items()
+            }
+            facts["not_compared"] = {name: count for name, count in left.items() if count}
         if prediction.stride > 1:
             facts["signals_of_one_row_in"] = prediction.stride
         confusion = self._confusion(prediction)
@@ -167,8 +214,9 @@ class Analysis:
             key = f"force_{name}"
             if key not in self.measured.signals or not len(stamps):
                 continue
-            at, values = self.measured.signals[key].series()
-            inside = (at >= stamps[0]) & (at <= stamps[-1])
+            signal = self.measured.signals[key]
+            at, values = signal.series()
+            inside = (at >= stamps[0]) & (at <= stamps[-1]) & prediction.is_of_longest(signal)
             place = np.minimum(np.searchsorted(stamps, at[inside]), len(stamps) - 1)
             predicted = columns[key][place] > 0.0
             measured = values[inside] > 0.01 * max(1.0, float(np.max(np.abs(values))))
@@ -277,10 +325,13 @@ def _walk_own(
         return Analysis(reader.path, "run", predictions, measured, {"samples_used": walk.used}, losses, unknown)
 
     for batch in reader.batches(outputs=False):
+        stretch = predictions[0].resets
         walk.add(batch.entries)
         for _, entry in sorted(batch.entries.others.items()):
+            stretch += isinstance(entry, Reset | Loss | SetWear)
             if isinstance(entry, Pose):
-                journalled.add("head_pose", entry.stamp_ns, dict(zip(("x", "y", "theta"), entry.pose, strict=True)))
+                pose = dict(zip(("x", "y", "theta"), entry.pose, strict=True))
+                journalled.add("head_pose", entry.stamp_ns, pose, stretch)
         if not len(batch.entries) and reader.tail is not None:
             on_caught_up(so_far())
         if on_progress is not None:
@@ -322,7 +373,11 @@ def _walk_other(
     ]
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
-    feed = Feed(walkers, roles, measured.add, Intake())
+
+    def add(role: str, stamp_ns: int, numbers: dict[str, float]) -> None:
+        measured.add(role, stamp_ns, numbers, predictions[0].resets)
+
+    feed = Feed(walkers, roles, add, Intake())
     feed.run(messages_of(source, roles))
     intake = feed.intake
     dropped = {

@@ -35,6 +35,8 @@ th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style><
 <td>{{ number(s.correlation) }}</td><td>{{ number(s.lag_s) }}</td><td>{{ number(s.rms_aligned) }}</td>
 <td>{{ number(s.coherence) }}</td></tr>{% endfor %}</table>
 {% else %}<p>Nothing was measured.</p>{% endif %}
+{% if part.stretches %}<p>Resets part the run into {{ part.stretches }} stretches: signals are of the longest one;
+measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
 <h3>Contacts</h3>
 <table><tr><th>pair</th><th>impacts</th><th>largest force [kN]</th><th>impulse [kN s]</th><th>duty [%]</th></tr>
 {% for name in pairs %}<tr><td>{{ name }}</td><td>{{ part.loads.impacts[name] }}</td>

@@ -42,21 +42,27 @@ class Thinned:
 
 
 class ThinnedSignal:
-    """Values with their stamps, one at a time."""
+    """Values with their stamps and the number of the stretch in which each came, one at a time."""
 
     def __init__(self) -> None:
-        self._stamps, self._values = array("q"), array("d")
+        self._stamps, self._values, self._stretches = array("q"), array("d"), array("I")
         self._came, self._stride = 0, 1
 
-    def add(self, stamp_ns: int, value: float) -> None:
+    def add(self, stamp_ns: int, value: float, stretch: int = 0) -> None:
         """Take in a value."""
         if self._came % self._stride == 0:
             self._stamps.append(stamp_ns)
             self._values.append(value)
+            self._stretches.append(stretch)
         self._came += 1
         if len(self._stamps) > MOST_ROWS:
             self._stamps, self._values, self._stride = self._stamps[::2], self._values[::2], 2 * self._stride
+            self._stretches = self._stretches[::2]
 
     def series(self) -> tuple[NDArray[np.int64], Array]:
         """Return the stamps [ns] and the values that are kept, shape (m,) each."""
         return np.array(self._stamps, np.int64), np.array(self._values)
+
+    def stretches(self) -> NDArray[np.int64]:
+        """Return in which stretch each value came, shape (m,)."""
+        return np.array(self._stretches, np.int64)
