@@ -246,8 +246,11 @@ def test_what_a_forecast_cannot_use_is_refused_and_not_left_out(
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))
-    history.write_text("km,horizontal_mm,horizontal_sd_mm,vertical_mm,vertical_sd_mm\n0,25,1,30,1\n9,25,1,30,1\n")
+    # as a spreadsheet writes it
+    sheet = "\ufeffkm;horizontal_mm;horizontal_sd_mm;vertical_mm;vertical_sd_mm\n0,0;25;1;30;1\n9;25;1;30;1\n"
+    history.write_text(sheet)
     limits = ["--limit-horizontal", "28", "--limit-vertical", "34"]
+    assert cli(["forecast", str(file), "-q", *limits, "--history", str(history)]) == 0
 
     def said(*more: str, scene_file: Path | str = file) -> str:
         assert cli(["forecast", str(scene_file), *limits, *more]) == 2

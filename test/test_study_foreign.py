@@ -17,6 +17,7 @@ from test_study_analysis import MAP, PAPER, STORE, wrench_message
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.doctor import examine, repair
+from plow_twin.record.measured import read_measured, read_recording
 from plow_twin.record.reader import FileStatus
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import open_source
@@ -143,6 +144,56 @@ def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> No
     (tmp_path / "map.yaml").write_text("excitation: {topic: load, fields: {fx: fx, fy: fy, m: fy}, stamp: when}")
     with pytest.raises(RecordingError, match="stamp: got 'when', expected one of the columns t, fx, fy"):
         analyse(short, scene=PAPER, mapping=tmp_path / "map.yaml")
+
+
+def test_a_mapping_of_a_bag_that_names_no_field_or_stamp_is_told_by_name(tmp_path: Path) -> None:
+    """A typo of `header` was taken for it; of a field `malformed 300` was all that was said."""
+    schema = STORE.generate_msgdef(TYPE, ros_version=2)[0].encode()
+    times = [BASE_NS + i * STEP_NS for i in range(COUNT)]
+    messages = [(time_ns, wrench_message(time_ns, paper_sample(i).wrench)) for i, time_ns in enumerate(times)]
+    file, chosen = mcap(tmp_path / "load.mcap", "cdr", (TYPE, "ros2msg", schema), messages), tmp_path / "map.yaml"
+    topic = next(iter(open_source(file).topics()))
+    chosen.write_text(f"excitation: {{topic: {topic}, stamp: headr}}")
+    with pytest.raises(RecordingError, match=f"excitation: stamp: got 'headr', expected header or log for {TYPE}"):
+        analyse(file, scene=PAPER, mapping=chosen)
+    wrong = "{fx: wrench.force.x, fy: wrench.forc.y, m: wrench.torque.z}"
+    chosen.write_text(f"excitation: {{topic: {topic}, fields: {wrong}}}")
+    told = f"{topic} has no number at 'wrench.forc.y' for fy"
+    with pytest.raises(RecordingError, match=f"malformed {COUNT}; excitation: {told}"):
+        analyse(file, scene=PAPER, mapping=chosen)
+    chosen.write_text(f"excitation: {{topic: {topic}}}\nhead_pose: {{topic: {topic}, fields: {{x: pose.x}}}}")
+    found = analyse(file, scene=PAPER, mapping=chosen)
+    assert found.losses == {f"unfit, head_pose: {topic} has no number at 'pose.x' for x": COUNT}
+    with pytest.raises(RecordingError, match=f"got no measured pose, expected some; head_pose: {topic} has no number"):
+        read_recording(file, Path(PAPER), chosen)
+
+
+def test_the_estimate_reads_csv_as_the_analysis_does(tmp_path: Path) -> None:
+    """A mark of the byte order was an invisible part of `t`, semicolons were no columns and dates no times."""
+    scene, names = Path(PAPER), ("t", "x", "y", "theta")
+    sheet(tmp_path / "load.csv", ",", comma=False, mark=False)
+    sheet(tmp_path / "pose.csv", ",", comma=False, mark=False, header=names)
+    plain = read_measured(tmp_path, scene)
+    assert len(plain.load) == len(plain.poses) == COUNT
+    for delimiter, comma, mark in ((",", False, True), (";", True, True), ("\t", True, False)):
+        sheet(tmp_path / "load.csv", delimiter, comma, mark)
+        sheet(tmp_path / "pose.csv", delimiter, comma, mark, header=("time", *names[1:]))
+        found = read_measured(tmp_path, scene)
+        assert found.unreadable == 0
+        np.testing.assert_array_equal(found.load, plain.load)
+        np.testing.assert_array_equal(found.poses, plain.poses)
+    for name in ("load", "pose"):
+        header, *rows = (tmp_path / f"{name}.csv").read_text().replace(",", ".").splitlines()
+        dated = [
+            f"2026-01-02T03:04:{5 + float(row.split(chr(9))[0]):09.6f}Z\t{row.partition(chr(9))[2]}" for row in rows
+        ]
+        (tmp_path / f"{name}.csv").write_text("\n".join([header, *dated]))
+    found = read_measured(tmp_path, scene)
+    np.testing.assert_allclose(found.load, plain.load, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(found.poses, plain.poses, rtol=0.0, atol=1e-6)
+    (tmp_path / "gaps.csv").write_text("t,left,right\n0,1,2\n")
+    with pytest.raises(RecordingError, match="got the columns t, left, right, expected t and some of top_left_top"):
+        read_measured(tmp_path, scene)
 
 
 def test_columns_of_any_name_dates_and_rows_of_several_signals_are_read(tmp_path: Path) -> None:

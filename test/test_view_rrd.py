@@ -25,6 +25,7 @@ from plow_twin.stream.journal import Entry, Pose, Travel
 from plow_twin.view import ViewSummary, layout, to_rrd
 from plow_twin.view.columns import extremes
 from plow_twin.view.contact_sets import masks_of, set_color
+from plow_twin.view.picture import to_png
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, Section
 
 COUNT = 1500
@@ -270,6 +271,13 @@ def test_a_picture_needs_no_viewer(run: Run, tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG" and (tmp_path / "run.png").stat().st_size > 50_000
+
+
+def test_a_run_without_a_row_has_no_picture(tmp_path: Path) -> None:
+    empty = record_run(tmp_path / "run", ())
+    with pytest.raises(RecordingError, match=r"run_0\.mcap: got no row to draw"):
+        to_png(empty.folder, tmp_path / "run.png")
+    assert not (tmp_path / "run.png").exists()
 
 
 def test_progress_runs_from_the_first_record_to_the_whole(run: Run, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ In a replay time is that of the stamps: nothing is held for want of samples, a l
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -225,7 +226,8 @@ class Feed:
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    unfit: int = 0
+    #: messages that could not be used, by what was wrong first; those of the load are in the intake too
+    unfit: Counter[str] = field(default_factory=Counter)
     _stamps: list[int] = field(default_factory=list)
     _wrench: list[tuple[float, float, float]] = field(default_factory=list)
     _log_times: list[int] = field(default_factory=list)
@@ -245,17 +247,19 @@ class Feed:
         for name, arrived, found in readings(messages, self.roles):
             if found is not None:
                 self._take(name, *found, arrived.log_time_ns)
-            elif name == "excitation":
-                self.intake.refuse(Verdict.MALFORMED)
             else:
-                self.unfit += 1
+                self.unfit[f"{name}: {self.roles[name].why_unfit(arrived)}"] += 1
+                if name == "excitation":
+                    self.intake.refuse(Verdict.MALFORMED)
         self._steps.end()
         self.flush()
         if not self.intake.used:
             topic = self.roles["excitation"].topic if "excitation" in self.roles else "none"
             refused = ", ".join(f"{verdict.value} {count}" for verdict, count in self.intake.counts.items() if count)
+            why = "".join(f"; {why}" for why in self.unfit if why.startswith("excitation: "))
             raise RecordingError(
-                f"excitation: got no sample that can be used (topic {topic}: {refused or 'no message'}), expected some"
+                f"excitation: got no sample that can be used (topic {topic}: {refused or 'no message'}{why}), "
+                "expected some"
             )
         for walker in self.walkers:
             walker.close()
@@ -276,7 +280,7 @@ class Feed:
         elif stamp_ns > 0:
             self.measured(name, stamp_ns, values)
         else:
-            self.unfit += 1
+            self.unfit[f"{name}: {self.roles[name].topic} has stamps of 0"] += 1
 
     def _sample(self, stamp_ns: int, wrench: tuple[float, float, float], log_time_ns: int) -> None:
         verdict = self.intake.judge(stamp_ns, wrench, self._reached_ns)

@@ -127,6 +127,13 @@ class Role:
         stamp_ns = self._sent_ns(arrived)
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
+    def why_unfit(self, arrived: Arrived) -> str:
+        """Return why `read` cannot use a message: the topic, and the field or the stamp that is no number."""
+        for name, path in self.fields.items():
+            if _follow(arrived.content, path) is None:
+                return f"{self.topic} has no number at {path!r} for {name}"
+        return f"{self.topic} has no time at {self.stamp!r}"
+
     def plausible(self, values: Mapping[str, float]) -> bool:
         """Tell whether no number is outside its limits; one that is not there is none."""
         return not any(
@@ -329,6 +336,8 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, TopicType] | N
         sequence,
     )
     _check_columns(path, role, found)
+    if not isinstance(kind, Columns) and kind != "json" and stamp not in ("header", "log"):
+        raise RecordingError(f"{path}: {role}: stamp: got {stamp!r}, expected header or log for {kind}")
     return found
 
 

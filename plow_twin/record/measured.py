@@ -6,7 +6,6 @@ and columns named after pairs); with it pose.csv may be missing.
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +22,8 @@ from plow_twin.record.bag import beside_folders
 from plow_twin.record.estimated import stated
 from plow_twin.record.mapping import ROLES, messages_of, readings, roles_by_source
 from plow_twin.record.reader import RunReader, own_run
-from plow_twin.record.sources import open_source
+from plow_twin.record.sources import open_source, read_table
+from plow_twin.record.times import EPOCH_S, time_ns
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Gaps, PartOfPose, Pose, Reset, SetWear, Spread, whole_pose
@@ -72,6 +72,10 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     if not len(gaps) or (folder / POSE_FILE).is_file():
         poses, bad_poses = _read(folder / POSE_FILE, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
+    if len(load) and load[0, 0] >= EPOCH_S:
+        # as in a recording: times of today's date count from the first sample of the load
+        for table in (poses, gaps, load):
+            table[:, 0] -= load[0, 0]
     return Measured(model, load, poses, bad_load + bad_poses + bad_gaps, gaps=gaps)
 
 
@@ -94,7 +98,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         if scene is None and not file.is_file():
             raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
         model = load_scene(scene_path(str(file)))
-        rows, unfit = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
+        rows, unfit, why = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
         loads, gaps, gaps_deviation = rows["excitation"], rows["gaps"], 0.0
     else:
         given = scene is not None
@@ -104,15 +108,15 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         of_poses, of_load = stated(own.header.parameters)
         journalled[:, 1:], of_poses = believed(of_poses, journalled[:, 1:], brought)
         deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
-        rows, unfit = {"head_pose": journalled}, 0
+        rows, unfit, why = {"head_pose": journalled}, 0, ""
         if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
-            rows, unfit = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
+            rows, unfit, why = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
         unfit += sum(own.lost.values())
     poses = rows["head_pose"]
     for name, found in (("load", len(loads)), ("measured pose", len(poses) + len(gaps))):
         if not found:
-            raise RecordingError(f"{path}: got no {name}, expected some")
+            raise RecordingError(f"{path}: got no {name}, expected some{why}")
     origin = loads[0, 0]
     for table in (loads, poses, gaps):
         table[:, 0] = (table[:, 0] - origin) * 1e-9
@@ -158,20 +162,22 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
 
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
-) -> tuple[dict[str, Array], int]:
-    """Return the rows of each role that is wanted, stamps in ns, and how many messages did not fit."""
+) -> tuple[dict[str, Array], int, str]:
+    """Return the rows of each role that is wanted, stamps in ns, how many messages did not fit, and why."""
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
-    unfit = 0
+    unfit, reasons = 0, dict[str, None]()
     for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/" if node else ""):
         roles = {name: role for name, role in roles.items() if name in wanted}
-        for name, _, found in readings(messages_of(source, roles), roles):
+        for name, arrived, found in readings(messages_of(source, roles), roles):
             if found is None:
                 unfit += 1
+                reasons[f"; {name}: {roles[name].why_unfit(arrived)}"] = None
             else:
                 stamp_ns, values = found
                 rows[name].append([float(stamp_ns), *(values.get(key, math.nan) for key in ROLES[name])])
         unfit += sum(source.losses.counts.values())
-    return {name: np.array(found, dtype=float).reshape(-1, 1 + len(ROLES[name])) for name, found in rows.items()}, unfit
+    tables = {name: np.array(found, dtype=float).reshape(-1, 1 + len(ROLES[name])) for name, found in rows.items()}
+    return tables, unfit, "".join(reasons)
 
 
 def _read(path: Path, columns: tuple[str, ...], some: tuple[str, ...] = ()) -> tuple[Array, int]:
@@ -179,25 +185,32 @@ def _read(path: Path, columns: tuple[str, ...], some: tuple[str, ...] = ()) -> t
 
     `columns` must be there; of `some` those that are not are NaN.
     """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [row for row in csv.reader(file) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise RecordingError(f"{path}: {reason}") from None
-    header = [name.strip() for name in rows[0]] if rows else []
-    missing = [name for name in columns if name not in header]
+    header, rows = read_table(path)
+    names = list(header.names)
+    if "t" not in names and "time" in names:
+        names[names.index("time")] = "t"
+    missing = [name for name in columns if name not in names]
     if missing:
-        raise RecordingError(f"{path}: got the columns {', '.join(header)}, expected {', '.join(columns)}")
-    places = [header.index(name) if name in header else len(header) for name in (*columns, *some)]
+        raise RecordingError(f"{path}: got the {header}, expected {', '.join(columns)}")
+    if some and not set(some) & set(names):
+        raise RecordingError(f"{path}: got the {header}, expected t and some of {', '.join(some)}")
+    places = [names.index(name) if name in names else len(names) for name in (*columns, *some)]
     found, bad = [], 0
-    for row in rows[1:]:
+    for row in rows:
         numbers = [_number(row[place]) if place < len(row) else math.nan for place in places]
+        if numbers[0] is None:
+            numbers[0] = _date(row[places[0]])
         if None in numbers:
             bad += 1
         else:
             found.append(numbers)
     return np.array(found, dtype=float).reshape(-1, len(places)), bad
+
+
+def _date(cell: str) -> float | None:
+    """Return the time of a date after ISO 8601 since the epoch in s."""
+    stamp_ns = time_ns(cell)
+    return None if stamp_ns is None else 1e-9 * stamp_ns
 
 
 def _number(cell: str) -> float | None:

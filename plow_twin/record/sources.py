@@ -10,8 +10,9 @@ import csv
 import re
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any, Final, Protocol, TypeAlias
 from urllib.parse import quote
@@ -295,9 +296,7 @@ class CsvSource:
         for part in self.parts:
             with _open_csv(part) as stream:
                 names = [name.strip() for name in next(csv.reader(stream, delimiter=_delimiter(stream)), [])]
-            twice = [name for name, count in Counter(names).items() if name and count > 1]
-            if twice:
-                raise RecordingError(f"{part}: column {twice[0]!r} stands there more than once, expected one of a name")
+            _check_names(part, names)
             found[part.stem] = Columns(tuple(names))
         return found
 
@@ -323,6 +322,37 @@ class CsvSource:
                     yield Arrived(part.stem, time, dict(zip(names, cells, strict=False)))
         except csv.Error:
             self.losses.counts["truncated_files"] += 1
+
+
+def read_table(path: Path) -> tuple[Columns, list[list[str]]]:
+    """Return the columns of a CSV file and its rows, as `CsvSource` takes them; lines that begin with `#` are none.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, or a column's name stands twice.
+    """
+    try:
+        with _open_csv(path) as stream:
+            lines = (line for line in stream if not line.startswith("#"))
+            header = next(lines, "")
+            delimiter = delimiter_of(header)
+            rows = [cells for cells in csv.reader(chain([header], lines), delimiter=delimiter) if any(cells)]
+    except (OSError, csv.Error) as error:
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise RecordingError(f"{path}: {reason}") from None
+    names = tuple(name.strip() for name in rows[0]) if rows else ()
+    _check_names(path, names)
+    if delimiter != ",":
+        rows = [[cell.replace(",", ".") for cell in cells] for cells in rows]
+    return Columns(names), rows[1:]
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    """Raise a `RecordingError` where a column's name stands twice."""
+    twice = [name for name, count in Counter(names).items() if name and count > 1]
+    if twice:
+        raise RecordingError(f"{path}: column {twice[0]!r} stands there more than once, expected one of a name")
 
 
 def _open_csv(path: Path) -> IO[str]:

@@ -16,7 +16,7 @@ NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", r
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 #: Times below this are no times of the epoch, but count from some start [s]: they are moved away from 0, which stands
 #: for a missing stamp.
-_EPOCH_S: Final = 1e9
+EPOCH_S: Final = 1e9
 _ORIGIN_NS: Final = 1_000_000_000
 #: Years of the epoch's other end: 9999-12-31 stands for no date in many a database.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
@@ -41,7 +41,7 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     scale = STAMP_UNITS[unit]
     # integers keep their nanoseconds; a float of today's date holds some 0.2 us
     stamp_ns = _within(value * scale if isinstance(value, int) else round(value * scale))
-    return stamp_ns if stamp_ns is None or stamp_ns >= _EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
+    return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
 
 
 def _within(stamp_ns: int | None) -> int | None:

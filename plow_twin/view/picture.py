@@ -77,6 +77,8 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> FileSta
                 force.add(time_s, message.effort / 1e3)
             else:
                 clearance.add(time_s, _clearance_row(message))
+    if not (force.rows or load.rows or clearance.rows):
+        raise RecordingError(f"{reader.path}: got no row to draw ({reader.status.value}), expected some")
     figure = Figure(figsize=(15, 8.5), layout="constrained")
     grid = figure.add_gridspec(3, 3)
     factor = exaggerate or section.exaggeration()
@@ -143,7 +145,7 @@ def _draw_wide(axis: Any, section: Section, penetration: NDArray[np.float64], fa
 
 
 def _curves(axis: Any, rows: _Largest, names: Sequence[str], label: str, colors: Sequence[Any] | None) -> None:
-    values = np.array(rows.rows).reshape(len(rows.rows), -1)
+    values = np.array(rows.rows).reshape(-1, len(names))
     for index, name in enumerate(names):
         if len(values):
             axis.plot(rows.times, values[:, index], lw=0.7, label=name, color=colors[index] if colors else None)

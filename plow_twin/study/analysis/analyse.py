@@ -384,8 +384,7 @@ def _walk_other(
         f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count
     }
     losses = {**source.losses.counts, **dropped}
-    if feed.unfit:
-        losses["unfit_messages"] = feed.unfit
+    losses |= {f"unfit, {why}": count for why, count in feed.unfit.items()}
     if walkers[0].failures:
         losses["solver_failures"] = walkers[0].failures
     if writer is not None:
