@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from rosbags.highlevel import AnyReader
 
 from plow_twin import Wear
 from plow_twin.cli.app import run as cli
+from plow_twin.cli.recording_facts import read_recording
 from plow_twin.errors import RecordingError
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.doctor import examine, repair
@@ -21,11 +23,13 @@ from plow_twin.record.header import RunHeader
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.recorder import Recorder
 from plow_twin.record.replay import replay
+from plow_twin.record.sources import open_source
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Sample, Snapshot
 from plow_twin.stream.session import Session
+from plow_twin.study.analysis.analyse import analyse
 
 COUNT = 3000
 
@@ -230,3 +234,34 @@ def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:
     assert (report.exit_code, report.compared["contact_forces"]) == (0, len(kept))
     assert report.not_compared["contact_peaks"] == len(kept)
     assert Decimation("none", 20.0).take(sent[0]) is None and Decimation("all", 20.0).take(sent[0]) is sent[0]
+
+
+@pytest.mark.parametrize("which", [0, 1, -1])
+def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(which: int, tmp_path: Path) -> None:
+    run = record_run(
+        tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
+    )
+    whole = analyse(run.folder)
+    assert not whole.lossy and not read_recording(run.folder)[1]
+    RunReader(run.folder).parts[which].unlink()
+    for listing in (True, False):  # the numbers of the parts tell of one in the middle
+        report, found, (facts, lossy) = replay(run.folder), analyse(run.folder), read_recording(run.folder)
+        problems = examine(run.folder).problems
+        if listing or which == 1:
+            assert report.lost["missing_parts"] == found.losses["missing_parts"] == facts["lost"]["missing_parts"] == 1
+            assert report.exit_code == 3 and found.lossy and lossy
+            assert sum("is missing: meta" in problem or "by their numbers" in problem for problem in problems) == 1
+        (run.folder / "metadata.yaml").unlink(missing_ok=True)
+    assert found.input["samples_used"] == report.samples < COUNT
+    times = np.diff(found.predictions[0].series()[0])
+    assert times.max() == 1_000_000  # of one stretch
+    assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s - 0.1
+
+
+def test_a_part_of_a_foreign_recording_that_is_not_there_is_counted(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(10)))
+    listing = run.folder / "metadata.yaml"
+    text = listing.read_text()
+    assert open_source(run.folder).losses.counts == {}
+    listing.write_text(re.sub(r"( *)- run_0.mcap\n", r"\1- run_0.mcap\n\1- run_1.mcap\n", text))
+    assert open_source(run.folder).losses.counts == {"missing_parts": 1}

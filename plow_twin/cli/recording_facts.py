@@ -33,6 +33,8 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
             lost[where] = lost.get(where, 0) + record.entry.count
     # the recorder's closing count is the complete one; without it the notes in place are all there is
     lost = {topic: count for topic, count in (reader.lost or lost).items() if count}
+    if reader.missing_parts:
+        lost["missing_parts"] = reader.missing_parts
     header = reader.header
     facts: dict[str, Any] = {
         "file": str(reader.path),

@@ -189,7 +189,11 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
         report.problems.append(f"{file.name}: repeats {read.name} (part {reader.number(file)}): it is not read")
     for file, keys in reader.foreign.items():
         report.problems.append(f"{file.name}: of another run (its {', '.join(keys)} differ): it is not read")
-    report.problems += _metadata_problems(reader)
+    problems = _metadata_problems(reader)
+    report.problems += problems
+    unnamed = reader.missing_parts - sum("is missing: metadata" in problem for problem in problems)
+    if unnamed > 0:
+        report.problems.append(f"{unnamed} part(s) are missing by their numbers")
     if report.repeated:
         report.problems.append(f"{report.repeated} journal entries stand there more than once: the first ones are used")
     if report.gaps:

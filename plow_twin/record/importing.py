@@ -159,6 +159,7 @@ class JournalWalk:
     """The journal of a run through walkers of the run's scene and of others; nothing is held.
 
     `used` and `late` count samples; a late one stands where its stamp puts it, if the walkers have not passed that.
+    `missing` counts entries that are not there: after them a new stretch begins.
 
     Parameters
     ----------
@@ -174,10 +175,30 @@ class JournalWalk:
         self._own, self._all = own, (*own, *others)
         self._lost = not whole
         self._reached_ns = -1
-        self.used = self.late = 0
+        self.used = self.late = self.missing = 0
+        self._next: int | None = None  # number of the next entry
 
     def add(self, entries: Entries) -> None:
         """Take in entries."""
+        if not len(entries):
+            return
+        reached = np.maximum.accumulate(entries.sequence) + 1
+        start = int(entries.sequence[0]) if self._next is None else self._next
+        expected = np.maximum(np.concatenate(([start], reached[:-1])), start)
+        self._next = max(start, int(reached[-1]))
+        begin = 0
+        for end in (*np.flatnonzero(entries.sequence > expected).tolist(), len(entries)):
+            self._whole(entries[begin:end])
+            if end < len(entries):
+                self._hole(int(entries.sequence[end] - expected[end]))
+            begin = end
+
+    def _hole(self, count: int) -> None:
+        """Begin a new stretch: a load is not drawn over what is not there."""
+        self.missing += count
+        self._entry(Loss(count))
+
+    def _whole(self, entries: Entries) -> None:
         begin = 0
         for place in (*sorted(entries.others), len(entries)):
             if place > begin:

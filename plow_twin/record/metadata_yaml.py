@@ -145,6 +145,16 @@ def listed_parts(folder: Path) -> list[str]:
     return [str(name) for name in found]
 
 
+def missing_files(folder: Path) -> list[str]:
+    """Return the files that `metadata.yaml` names and that are not there; none where it cannot be read."""
+    try:
+        listed = listed_parts(folder)
+    except RecordingError:
+        return []
+    # old versions write the folder's name before that of the file
+    return [name for name in listed if not (folder / name).is_file() and not (folder / Path(name).name).is_file()]
+
+
 def write_metadata(folder: Path, metadata: Mapping[str, Any], *, sync: bool = False) -> None:
     """Write `metadata.yaml` in one step, so that no reader meets half of it; with `sync` wait for the disk."""
     partial = folder / "metadata.yaml.partial"

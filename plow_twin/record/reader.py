@@ -25,6 +25,7 @@ from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests
 from plow_twin.record.messages import MESSAGE_TYPES, Message, WrenchStamped
+from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.template import Indexes, Template, compiled, read_numbers
 from plow_twin.stream.journal import Digest, Entry, Sample
 
@@ -214,7 +215,8 @@ class RunReader:
     did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
     has been read, 0..1. `path` is the first file, `parts` are all but those `repeated`: files that hold a part once
     more, with the file that is read for it, and those `foreign`: of another run, by what differs in their headers from
-    most. A part that is no MCAP file, or is foreign, counts as a damaged chunk.
+    most. A part that is no MCAP file, or is foreign, counts as a damaged chunk. `missing_parts` counts parts of a folder
+    that are named by `metadata.yaml`, or by those around them, and not there.
 
     With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
     follows each time that all there is has been read.
@@ -279,6 +281,17 @@ class RunReader:
             for file, record in records.items()
             if record != own
         }
+
+    @property
+    def missing_parts(self) -> int:
+        """Number of parts of a folder that are named by `metadata.yaml`, or by those around them, and not there."""
+        if not self._place.is_dir():
+            return 0
+        there = {self.number(file) for file in self.parts}
+        known = sorted(self._headers[file].part for file in self.parts if file in self._headers)
+        between = known[-1] - known[0] + 1 - len({number for number in there if known[0] <= number <= known[-1]})
+        named = {_part_number(Path(name))[0] for name in missing_files(self._place)} - there
+        return between + sum(number >= 0 and not known[0] < number < known[-1] for number in named)
 
     def number(self, file: Path) -> int:
         """Return the number of a part, by its header where that can be read."""

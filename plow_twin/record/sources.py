@@ -20,6 +20,7 @@ from urllib.parse import quote
 from plow_twin.errors import RecordingError
 from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun
 from plow_twin.record.merging import StampOf, merged
+from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.reader import run_parts
 from plow_twin.record.times import NO_TIME, STAMP_UNITS, TIMES, time_ns
 
@@ -95,7 +96,10 @@ def open_source(path: Path) -> Source:
         for pattern, kind in (("*.mcap", McapSource), ("*.db3", SqliteSource), ("*.csv", CsvSource)):
             files = sorted(path.glob(pattern))
             if files:
-                return kind(run_parts(path) if kind is McapSource else files)
+                source = kind(run_parts(path) if kind is McapSource else files)
+                if missing := missing_files(path):
+                    source.losses.counts["missing_parts"] = len(missing)
+                return source
         raise RecordingError(f"{path}: got a folder without .mcap, .db3 or .csv, expected a recording")
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording")

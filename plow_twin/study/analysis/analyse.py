@@ -316,6 +316,10 @@ def _walk_own(
 
     def so_far() -> Analysis:
         losses = {topic: count for topic, count in reader.lost.items() if count}
+        if reader.missing_parts and reader.tail is None:  # a tail may outlive the oldest ones
+            losses["missing_parts"] = reader.missing_parts
+        if walk.missing:
+            losses["journal"] = max(walk.missing, losses.get("journal", 0))
         if walk.late:
             losses["samples_too_late"] = walk.late
         if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
