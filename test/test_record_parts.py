@@ -265,3 +265,9 @@ def test_a_part_of_a_foreign_recording_that_is_not_there_is_counted(tmp_path: Pa
     assert open_source(run.folder).losses.counts == {}
     listing.write_text(re.sub(r"( *)- run_0.mcap\n", r"\1- run_0.mcap\n\1- run_1.mcap\n", text))
     assert open_source(run.folder).losses.counts == {"missing_parts": 1}
+
+
+def test_a_recording_with_nothing_to_compare_is_not_called_the_same(tmp_path: Path) -> None:
+    Recorder(tmp_path / "run", RunHeader(dump_scene(load_scene(scene_path("paper"))))).close()
+    report = replay(tmp_path / "run")
+    assert (report.entries, report.nothing, report.exit_code) == (0, True, 3)

@@ -141,6 +141,24 @@ def test_csv_files_are_read_by_their_columns(motion: tuple[np.ndarray, ...], tmp
     assert signals["x"].lag_s == pytest.approx(LAG_S, abs=0.004)
 
 
+def test_values_of_another_clock_and_impossible_ones_are_counted(
+    motion: tuple[np.ndarray, ...], tmp_path: Path
+) -> None:
+    load, pose = tmp_path / "load.csv", tmp_path / "pose.csv"
+    rows = [f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion[0][:500], motion[1], strict=False)]
+    load.write_text("t,fx,fy,m\n" + "".join(rows))
+    poses = [(0.01 + 0.01 * n, [n * 1e-5, 0.0, 0.0]) for n in range(40)]
+    poses[7][1][0] = 1e200
+    pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, (x, y, theta) in poses))
+    found = analyse(tmp_path, scene=PAPER)
+    assert found.lost == {"measured_implausible": 1} and found.lossy
+    facts = json.loads(json.dumps(found.facts(), allow_nan=False))
+    assert facts["signals"]["x"]["n"] == 39 and facts["lost"] == found.lost
+    pose.write_text("t,x,y,theta\n" + "".join(f"{t + 1e6},{0},{y},{theta}\n" for t, (_, y, theta) in poses))
+    found = analyse(tmp_path, scene=PAPER)
+    assert found.lost == {"measured_outside_the_load": 120} and found.lossy and found.facts()["signals"] == {}
+
+
 def test_other_scenes_are_predicted_beside_it_in_one_pass(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "bag", motion, StoragePlugin.MCAP)
     command = [sys.executable, "-m", "plow_twin", "analyse", str(bag), "--scene", "paper", "--with", str(BEST_FIT)]

@@ -137,6 +137,13 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     assert 0 < first["input"]["samples_used"] <= 2000 and last["input"]["samples_used"] == 4000
 
 
+def test_whatever_one_of_many_fails_by_is_its_row(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(10)))
+    (tmp_path / "taken").write_text("no folder")
+    found = analyse_task(Task(run.folder, None, None, (), tmp_path / "taken"))
+    assert found["run"] == str(run.folder) and "FileExistsError" in found["error"]
+
+
 def test_recordings_of_one_name_have_results_of_their_own(tmp_path: Path) -> None:
     files = [tmp_path / "a" / "load.csv", tmp_path / "a" / "load.mcap", tmp_path / "a" / "pose.csv"]
     folders = [tmp_path / "jan" / "1" / "run", tmp_path / "feb" / "1" / "run", tmp_path / "run.1", tmp_path / "run.2"]

@@ -33,6 +33,8 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
     with progress("replaying", quiet) as on_progress:
         report = run(recording, on_progress, digests_only=digests_only, write=write)
     facts = _facts(report)
+    if report.nothing:
+        click.echo("plow-twin: nothing could be compared", err=True)
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:

@@ -67,8 +67,12 @@ class ReplayReport:
     @property
     def loss(self) -> bool:
         """Something of the run is missing in the file, or nothing in it could be compared."""
-        nothing = self.steps > 0 and self.messages_compared + self.digests_compared == 0
-        return bool(self.lost) or self.status is not FileStatus.COMPLETE or nothing
+        return bool(self.lost) or self.status is not FileStatus.COMPLETE or self.nothing
+
+    @property
+    def nothing(self) -> bool:
+        """Nothing in the file could be compared."""
+        return self.messages_compared + self.digests_compared == 0
 
     @property
     def exit_code(self) -> int:

@@ -44,6 +44,8 @@ _COLUMNS: Final = (
 _TOLERANCE: Final = 1e-9
 #: A measured stamp older than the newest one by more than this [ns] is a step of its clock.
 _STEP_NS: Final = 1_000_000_000
+#: Largest measured value, in any unit; the squares of larger ones leave the numbers there are.
+_LARGEST: Final = 1e15
 _MAP: Final = "map_"
 #: Among the parameters of each run that an analysis has made.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
@@ -76,6 +78,12 @@ class Prediction:
         self.spans[self.resets] = first, int(part.stamp_ns[-1])
         self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, rows.penetration)))
         self.clearance.add(published.stamp_ns[published.slow_index], published.clearance)
+
+    def meets(self, signal: ThinnedSignal) -> bool:
+        """Tell whether a value of a measured signal lies in the time of the load."""
+        stamps = signal.series()[0]
+        spans = self.spans.values()
+        return not spans or any(bool(((stamps >= first) & (stamps <= last)).any()) for first, last in spans)
 
     def restart(self) -> None:
         """Begin a new stretch: the stamps may go back."""
@@ -127,6 +135,8 @@ class Measured:
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
     #: the latest of each role: its stretch and its stamp [ns]
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
+    #: values that are none, however large the units
+    implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
         """Take in the numbers of one message that came in that stretch; what is not finite was not measured."""
@@ -137,7 +147,9 @@ class Measured:
         self._latest[role] = stretch, stamp_ns if back else max(newest, stamp_ns)
         prefix = {"forces": "force_", "gaps": "gap_"}.get(role, "")
         for name, value in numbers.items():
-            if math.isfinite(value) and stamp_ns > 0:
+            if math.isfinite(value) and abs(value) > _LARGEST:
+                self.implausible += 1
+            elif math.isfinite(value) and stamp_ns > 0:
                 self.signals.setdefault(prefix + name, ThinnedSignal()).add(stamp_ns, value, stretch)
 
 
@@ -157,7 +169,14 @@ class Analysis:
     @property
     def lossy(self) -> bool:
         """Whether something could not be read or used."""
-        return bool(self.losses)
+        return bool(self.lost)
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """What could not be read or used, and measured signals no value of which lies in the time of the load."""
+        outside = sum(signal.came for signal in self.measured.signals.values() if not self.predictions[0].meets(signal))
+        found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
+        return self.losses | {name: count for name, count in found.items() if count}
 
     def comparisons(self, prediction: Prediction) -> dict[str, Comparison]:
         """Return the signals that were measured, compared with what one scene predicts."""
@@ -187,7 +206,7 @@ class Analysis:
             **self._prediction(first),
             "with": [{"scene": other.name, **self._prediction(other)} for other in others],
             "input": self.input,
-            "lost": self.losses,
+            "lost": self.lost,
             "skipped_topics": self.unknown_types,
             "wall_s": self.wall_s,
         }

@@ -197,3 +197,5 @@ def analyse_task(task: Task) -> dict[str, Any]:
         return task.run()
     except PlowTwinError as error:
         return {"run": str(task.path), "error": str(error)}
+    except Exception as error:  # of one recording among many, whatever it is: the others go on
+        return {"run": str(task.path), "error": f"{task.path}: {error!r}"}

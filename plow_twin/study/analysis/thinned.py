@@ -59,6 +59,11 @@ class ThinnedSignal:
             self._stamps, self._values, self._stride = self._stamps[::2], self._values[::2], 2 * self._stride
             self._stretches = self._stretches[::2]
 
+    @property
+    def came(self) -> int:
+        """Number of values, kept or not."""
+        return self._came
+
     def series(self) -> tuple[NDArray[np.int64], Array]:
         """Return the stamps [ns] and the values that are kept, shape (m,) each."""
         return np.array(self._stamps, np.int64), np.array(self._values)
