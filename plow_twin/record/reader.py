@@ -215,8 +215,8 @@ class RunReader:
     did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
     has been read, 0..1. `path` is the first file, `parts` are all but those `repeated`: files that hold a part once
     more, with the file that is read for it, and those `foreign`: of another run, by what differs in their headers from
-    most. A part that is no MCAP file, or is foreign, counts as a damaged chunk. `missing_parts` counts parts of a folder
-    that are named by `metadata.yaml`, or by those around them, and not there.
+    most. A part that is no MCAP file, or is foreign, counts as a damaged chunk. `missing_parts` counts parts of a
+    folder that are named by `metadata.yaml`, or by those around them, and not there.
 
     With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
     follows each time that all there is has been read.
