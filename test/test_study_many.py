@@ -15,13 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pyarrow import parquet
 from record_support import paper_sample, record_run
 
 from plow_twin.errors import RecordingError
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry
+from plow_twin.study.analysis.analyse import expand, left_out
 from plow_twin.study.analysis.many import analyse_many
+from plow_twin.study.analysis.report import write_table_of_runs
 from plow_twin.study.analysis.task import Task, analyse_task, names_apart
 
 RUNS = 4
@@ -142,6 +145,30 @@ def test_whatever_one_of_many_fails_by_is_its_row(tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("no folder")
     found = analyse_task(Task(run.folder, None, None, (), tmp_path / "taken"))
     assert found["run"] == str(run.folder) and "FileExistsError" in found["error"]
+
+
+def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path) -> None:
+    for name in ("good", "gone"):
+        record_run(tmp_path / name, map(paper_sample, range(10)))
+    for part in (tmp_path / "gone").glob("*.mcap"):
+        part.unlink()
+    (tmp_path / "empty").mkdir()
+    assert expand([tmp_path]) == [tmp_path / "gone", tmp_path / "good"] and left_out(tmp_path) == [tmp_path / "empty"]
+    rows = [analyse_task(Task(path, None, None, (), None)) for path in expand([tmp_path])]
+    assert ["error" in row for row in rows] == [True, False]
+    write_table_of_runs(rows, tmp_path / "empty")
+    assert parquet.read_table(tmp_path / "empty" / "runs.parquet").column("lost").to_pylist() == [None, 0]
+    (tmp_path / "stray.mcap").touch()
+    assert left_out(tmp_path) == [tmp_path / "good"]
+
+
+def test_a_run_that_was_killed_before_its_header_is_made_anew(runs: Path, tmp_path: Path) -> None:
+    task = Task(runs / "r0", PAPER, None, (), tmp_path)
+    task.run()
+    part = tmp_path / "run" / "run_0.mcap"
+    part.write_bytes(part.read_bytes()[:44])
+    task.clear()
+    assert not part.exists()
 
 
 def test_recordings_of_one_name_have_results_of_their_own(tmp_path: Path) -> None:

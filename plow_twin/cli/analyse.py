@@ -54,7 +54,7 @@ def analyse(
     quiet: bool,
 ) -> int:
     """Analyse recordings: runs of ours, MCAP, rosbag2's sqlite3, CSV, or folders of them."""
-    from plow_twin.study.analysis.analyse import expand
+    from plow_twin.study.analysis.analyse import expand, left_out
     from plow_twin.study.analysis.task import Task, names_apart
 
     if watch is not None:
@@ -71,6 +71,11 @@ def analyse(
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
     found = list(dict.fromkeys(expand(recordings)))
+    for path in recordings:
+        for item in left_out(path):
+            # the results of an analysis before are no recording that was forgotten
+            if out is None or item.resolve() not in (out.resolve(), (out / "run").resolve()):
+                click.echo(f"plow-twin: {item}: left out: no recording of {path}", err=True)
     many = len(found) > 1 or found != list(recordings)
     extra = tuple(Path(name) for name in others)
     scene_file = Path(scene) if scene else None

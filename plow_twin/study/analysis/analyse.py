@@ -425,6 +425,20 @@ def _writer(out: Path, scene: Scene, roles: Mapping[str, Role]) -> Any:
     return RunWriter(out / "run", header, chunk_size=2**20, min_free_bytes=64 * 1024 * 1024)
 
 
+def _holds_recording(folder: Path) -> bool:
+    return folder.is_dir() and any(any(folder.glob(pattern)) for pattern in ("*.mcap", "*.db3", "*.csv"))
+
+
+def left_out(path: Path) -> list[Path]:
+    """Return what is in a folder and no part of what `expand` makes of it: empty folders, runs beside a file."""
+    if not path.is_dir():
+        return []
+    folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
+    if _holds_recording(path):
+        return [item for item in folders if _holds_recording(item) and item not in beside_folders(path)]
+    return [item for item in folders if not any(item.iterdir())]
+
+
 def expand(paths: Sequence[Path]) -> list[Path]:
     """Return the recordings in some places: a folder that is none itself stands for those in it.
 
@@ -441,8 +455,8 @@ def expand(paths: Sequence[Path]) -> list[Path]:
         inside = [
             item
             for item in sorted(path.iterdir())
-            if item.suffix in (".mcap", ".db3")
-            or (item.is_dir() and any(any(item.glob(pattern)) for pattern in ("*.mcap", "*.db3", "*.csv")))
+            # one whose parts have gone is a recording all the same: its analysis says so
+            if item.suffix in (".mcap", ".db3") or _holds_recording(item) or (item / "metadata.yaml").is_file()
         ]
         if not inside:
             raise RecordingError(f"{path}: got a folder without recordings, expected some")

@@ -169,7 +169,8 @@ def write_table_of_runs(rows: list[dict[str, Any]], out: Path) -> None:
 
     flat = []
     for facts in rows:
-        row: dict[str, Any] = {"run": facts["run"], "error": facts.get("error")}
+        lost = sum(facts["lost"].values()) if "lost" in facts else None
+        row: dict[str, Any] = {"run": facts["run"], "error": facts.get("error"), "lost": lost}
         for name, signal in facts.get("signals", {}).items():
             row |= {f"{name}_{key}": value for key, value in signal.items()}
         loads = facts.get("loads", {})

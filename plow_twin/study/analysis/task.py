@@ -15,6 +15,7 @@ from typing import Any, Final
 from plow_twin.build import package_version
 from plow_twin.errors import PlowTwinError, RecordingError
 from plow_twin.record.bag import beside_folders
+from plow_twin.record.chunks import ChunkReader
 from plow_twin.record.reader import read_header
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -155,6 +156,8 @@ def _is_ours(file: Path) -> bool:
         return True
     try:
         header = read_header(file)
+        if header is None and next(iter(ChunkReader(file)), None) is None:
+            return True  # killed before its header: there is nothing in it
     except RecordingError:
         return False
     return header is not None and MAPPED_LOAD in header.parameters
