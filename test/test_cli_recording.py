@@ -21,7 +21,26 @@ import pytest
 from PIL import Image
 from record_support import Run, paper_sample, record_run, rewrite
 
+from plow_twin.cli.app import run as cli
+
 SAMPLES = 600
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (["view", "RUN", "--png", "x.png", "--web"], "--png cannot be combined with --out, --web or --follow"),
+        (["view", "RUN", "--png", "x.png", "--follow"], "--png cannot be combined with --out, --web or --follow"),
+        (["view", "RUN", "--follow", "--web", "--out", "x.rrd"], "--follow goes into --out or to --web, not both"),
+        (["analyse", "RUN", "--watch", "1", "--workers", "2"], "--watch cannot be combined with --dask or --workers"),
+        (["analyse", "RUN", "--dask", "tcp://127.0.0.1:1"], "--dask: got one recording, expected many"),
+    ],
+)
+def test_options_that_would_be_left_out_are_refused(
+    given: list[str], expected: str, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli([str(run.folder) if word == "RUN" else word for word in given]) == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.fixture(scope="module")

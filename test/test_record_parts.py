@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import resource
 import shutil
 from pathlib import Path
 from typing import Any
@@ -191,6 +192,20 @@ def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Pa
     assert after.divergences == 0 and after.samples == before.samples and after.repeated == found.repeated > 0
     assert after.inputs == before.inputs and before.inputs
     assert found.gaps == 0 and any("more than once" in problem for problem in found.problems)
+
+
+def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)))
+    run.file.write_bytes(run.file.read_bytes()[:-1000])
+    there = sorted(run.folder.iterdir())
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))  # a write beyond it fails as on a full disk
+    try:
+        with pytest.raises(OSError, match="too large") as error:
+            repair(run.folder)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert error.value.filename == f"{run.file}.partial" and sorted(run.folder.iterdir()) == there
 
 
 def test_a_part_that_is_no_mcap_file_is_named_and_the_rest_is_read(tmp_path: Path) -> None:

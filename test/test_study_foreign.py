@@ -22,6 +22,7 @@ from plow_twin.record.reader import FileStatus
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import open_source
 from plow_twin.study.analysis.analyse import Analysis, analyse
+from plow_twin.study.analysis.report import write_report
 
 COUNT = 300
 TYPE = "geometry_msgs/msg/WrenchStamped"
@@ -194,6 +195,16 @@ def test_the_estimate_reads_csv_as_the_analysis_does(tmp_path: Path) -> None:
     (tmp_path / "gaps.csv").write_text("t,left,right\n0,1,2\n")
     with pytest.raises(RecordingError, match="got the columns t, left, right, expected t and some of top_left_top"):
         read_measured(tmp_path, scene)
+
+
+def test_a_full_disk_is_named_by_what_was_written(tmp_path: Path) -> None:
+    found = analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "analysis.json").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left on device") as error:
+        write_report(found, out)
+    assert error.value.filename == str(out)
 
 
 def test_columns_of_any_name_dates_and_rows_of_several_signals_are_read(tmp_path: Path) -> None:

@@ -58,6 +58,8 @@ def analyse(
     from plow_twin.study.analysis.task import Task, names_apart
 
     if watch is not None:
+        if dask is not None or workers is not None:
+            raise click.UsageError("--watch cannot be combined with --dask or --workers: it follows one run")
         if len(recordings) != 1:
             raise click.UsageError(f"--watch: got {len(recordings)} recordings, expected one")
         task = Task(recordings[0], Path(scene) if scene else None, mapping, tuple(map(Path, others)), out)
@@ -77,6 +79,8 @@ def analyse(
             if out is None or item.resolve() not in (out.resolve(), (out / "run").resolve()):
                 click.echo(f"plow-twin: {item}: left out: no recording of {path}", err=True)
     many = len(found) > 1 or found != list(recordings)
+    if dask is not None and not many:
+        raise click.UsageError("--dask: got one recording, expected many, or a folder of them")
     extra = tuple(Path(name) for name in others)
     scene_file = Path(scene) if scene else None
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)

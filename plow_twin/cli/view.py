@@ -71,6 +71,10 @@ def view(
         raise click.BadParameter(
             f"got {exaggerate:g}, expected at most {_MOST_EXAGGERATED:g}", param_hint="--exaggerate"
         )
+    if png is not None and (out is not None or web or follow):
+        raise click.UsageError("--png cannot be combined with --out, --web or --follow: it is a picture of a whole run")
+    if follow and out is not None and web:
+        raise click.UsageError("--follow goes into --out or to --web, not both")
     if png is not None and others:
         raise click.UsageError("--with cannot be combined with --png: a picture shows the run alone")
     if follow:

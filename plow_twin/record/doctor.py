@@ -294,6 +294,9 @@ def _rewrite(part: Path, *, last: bool) -> None:
         note_damage(reader.damaged + (not reader.finished and not last))
         file.metadata(LOSS_RECORD, loss)
         file.finish()
+    except BaseException:
+        target.unlink(missing_ok=True)
+        raise
     finally:
         file.close()
     part.replace(part.with_name(f"{part.name}.damaged"))

@@ -1,9 +1,22 @@
-"""What a loss of power leaves: a file or folder of which the disk has been waited for."""
+"""What a disk does not take: it is waited for after a write, and its errors name the file."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Give errors of a disk, which is full at a write long after a file was opened, the name of the file or folder."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or error.errno is None:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def sync_path(*paths: Path) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 
 from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.chunks import MAGIC, MESSAGE_HEAD, crc32
+from plow_twin.record.durable import naming
 from plow_twin.record.follow import claim
 from plow_twin.record.template import Bytes, Indexes, Template, compiled, fill
 from plow_twin.record.words import set_word
@@ -378,7 +379,8 @@ class UnbufferedFile:
         """Write all of it."""
         view = memoryview(data)
         while view:
-            count = os.write(self._descriptor, view)
+            with naming(self._path):
+                count = os.write(self._descriptor, view)
             self._offset += count
             view = view[count:]
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.durable import naming
 
 if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
@@ -63,7 +64,12 @@ measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
 
 
 def write_report(found: Analysis, out: Path) -> None:
-    """Write all files of an analysis into the folder `out`."""
+    """Write all files of an analysis into the folder `out`; an error of the disk names it."""
+    with naming(out):
+        _write_report(found, out)
+
+
+def _write_report(found: Analysis, out: Path) -> None:
     from jinja2 import Environment
 
     out.mkdir(parents=True, exist_ok=True)
