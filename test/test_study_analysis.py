@@ -239,6 +239,30 @@ def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: in
     assert found.rms_aligned == pytest.approx(0.0, abs=1e-3)
 
 
+def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: Path) -> None:
+    """The same load, linear between four knots, by its knots alone and by many samples on the lines between them."""
+    knots, count = np.array([0.0, 0.7, 1.5, 2.0]), 2001
+    wrench = np.array([[0, 0, 0], [32e3, -11e3, -45e3], [-32e3, 11e3, 45e3], [0, 0, 0]])
+    found = {}
+    for name, times in (("coarse", knots), ("fine", np.unique(np.append(np.linspace(0.0, 2.0, count), knots)))):
+        values = np.column_stack([np.interp(times, knots, column) for column in wrench.T])
+        (tmp_path / name).mkdir()
+        np.savetxt(
+            tmp_path / name / "load.csv", np.column_stack([times, values]), delimiter=",",
+            header="t,fx,fy,m", comments="", fmt="%.12g",
+        )  # fmt: skip
+        found[name] = analyse(tmp_path / name, scene=PAPER).predictions[0].loads
+    coarse, fine = (np.array(list(found[name].facts()["duty"].values())) for name in ("coarse", "fine"))
+    assert 0.05 < fine.max() < 1.0
+    assert coarse == pytest.approx(fine, abs=2e-3)
+    # a share of time, not of the samples between which there was an impulse
+    twin = Twin(load_scene(PAPER), excitation="sampled", tol=1e-9)
+    force = twin.advance_samples(
+        grid := np.arange(0.0, 2.0, 2e-5), np.column_stack([np.interp(grid, knots, column) for column in wrench.T])
+    ).force
+    assert fine == pytest.approx((force > 0.0).mean(axis=0), abs=1e-3)
+
+
 @pytest.mark.parametrize("clock_s", [2.0, 3600.0])
 def test_measured_values_are_compared_with_the_stretch_they_belong_to(
     clock_s: float, motion: tuple[np.ndarray, ...], tmp_path: Path

@@ -27,6 +27,8 @@ class Advance:
         Signed penetration [m], its rate [m/s] and normal force [N] of each pair at `t`.
     peak, impulse : ndarray, shape (8,)
         Largest force [N] and impulse [N s] since the advance before.
+    time_in_contact : ndarray, shape (8,)
+        Time in contact since the advance before [s].
     makes : ndarray of int64, shape (8,)
         Touches since the advance before.
     wear_depth : ndarray, shape (8,)
@@ -47,6 +49,7 @@ class Advance:
     force: NDArray[np.float64]
     peak: NDArray[np.float64]
     impulse: NDArray[np.float64]
+    time_in_contact: NDArray[np.float64]
     makes: NDArray[np.int64]
     wear_depth: NDArray[np.float64]
     steps: int
@@ -64,6 +67,7 @@ class _Rows:
     force: NDArray[np.float64]
     peak: NDArray[np.float64]
     impulse: NDArray[np.float64]
+    time_in_contact: NDArray[np.float64]
     makes: NDArray[np.int64]
     wear_depth: NDArray[np.float64]
     steps: NDArray[np.int64]

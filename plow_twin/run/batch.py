@@ -291,7 +291,7 @@ class TwinBatch:
         wait(begun)
         for worker in self._workers:
             worker.pace.stopped = False
-            for name in ("peak", "impulse", "makes"):
+            for name in ("peak", "impulse", "time_in_contact", "makes"):
                 worker.totals[name] = 0
 
 

@@ -525,7 +525,7 @@ class Twin:
         self._states[0] = self._pace.saved[0]
         if self._state.step_size >= 0.0:
             loop.lay_out_again(self._compiled.params, self._parts, self._state, self._work)
-        for name in ("peak", "impulse", "makes"):
+        for name in ("peak", "impulse", "time_in_contact", "makes"):
             self._all_totals[name] = 0
 
     def _end_step(self) -> None:

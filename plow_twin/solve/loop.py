@@ -111,6 +111,7 @@ def _clear(totals) -> None:
     if totals is not None:
         set_row(totals.peak, 0, splat(0.0))
         set_row(totals.impulse, 0, splat(0.0))
+        set_row(totals.time_in_contact, 0, splat(0.0))
         for pair in range(PAIR_COUNT):
             totals.makes[pair] = 0
 
@@ -173,6 +174,7 @@ def _read_row(p, parts, state, w, totals, out) -> None:
     for pair in range(PAIR_COUNT):
         out.peak[pair] = max(totals.peak[pair], out.force[pair])
         out.impulse[pair], out.makes[pair] = totals.impulse[pair], totals.makes[pair]
+        out.time_in_contact[pair] = totals.time_in_contact[pair]
     _clear(totals)
 
 

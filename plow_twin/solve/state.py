@@ -274,6 +274,7 @@ ROW: Final = np.dtype(
         ("q", "f8", (3,)),
         ("v", "f8", (3,)),
         *((name, "f8", (PAIR_COUNT,)) for name in ("penetration", "rate", "force", "peak", "impulse")),
+        ("time_in_contact", "f8", (PAIR_COUNT,)),
         ("makes", "i8", (PAIR_COUNT,)),
         ("wear_depth", "f8", (PAIR_COUNT,)),
         ("steps", "i8"),

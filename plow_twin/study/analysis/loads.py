@@ -107,7 +107,7 @@ class LoadTotals:
         self.impacts += rows.makes.sum(axis=0)
         self.impulse += rows.impulse.sum(axis=0)
         np.maximum(self.largest, rows.peak.max(axis=0), out=self.largest)
-        self.contact_s += ((rows.impulse > 0.0) * steps[:, None]).sum(axis=0)
+        self.contact_s += rows.time_in_contact[steps > 0.0].sum(axis=0)
         masks = ((rows.force > 0.0) << np.arange(PAIR_COUNT)).sum(axis=1)
         for mask, count in zip(*np.unique(masks, return_counts=True), strict=True):
             self.sets[int(mask)] += int(count)
