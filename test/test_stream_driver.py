@@ -286,22 +286,22 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
 
 
 @pytest.mark.parametrize("max_steps", [DEFAULT_BUDGET, 3])
-def test_the_short_way_of_a_sample_gives_what_the_long_one_gives(
+def test_a_sample_applied_directly_gives_what_the_general_path_gives(
     max_steps: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bytes, journal, counters and all that a later sample depends on; with 3 steps an advance fails now and then."""
-    short = Session.go_straight_on
+    direct = Session.apply_directly
     taken = [0]
 
     def counted(session: Session, sample: Sample) -> tuple[int, Publication | None]:
         taken[0] += 1
-        return short(session, sample)
+        return direct(session, sample)
 
-    monkeypatch.setattr(Session, "go_straight_on", counted)
+    monkeypatch.setattr(Session, "apply_directly", counted)
     calls, found = _troubled(3, 3000), []
-    for always_long in (False, True):
-        if always_long:
-            monkeypatch.setattr(Session, "goes_straight_on", lambda *_: False)
+    for always_general in (False, True):
+        if always_general:
+            monkeypatch.setattr(Session, "can_apply_directly", lambda *_: False)
         journal: list[Entry] = []
         twin = Twin(SCENE, excitation="sampled", max_steps=max_steps)
         session = Session(twin, on_entry=journal.append, rollback_span_s=1.0)
@@ -319,12 +319,12 @@ def test_the_short_way_of_a_sample_gives_what_the_long_one_gives(
                 sent.append((one.stamp_ns, one.held, one.corrected, one.marked, messages.write(one)))
             states.append((session.snapshot(), tuple(session.wear_depth), session.history._snapshots[-1:]))
         found.append((sent, states, list(map(repr, journal)), counters(driver), driver.state, driver.real_time.model_s))
-        if not always_long:
+        if not always_general:
             assert 0.6 * len(calls) < taken[0] < 0.97 * len(calls)
-    short_way, long_way = found
-    for one, other in zip(short_way, long_way, strict=True):
+    direct_path, general_path = found
+    for one, other in zip(direct_path, general_path, strict=True):
         assert one == other
-    counted_as = short_way[3]
+    counted_as = direct_path[3]
     wanted = (
         "rolled_back",
         "holds",

@@ -135,17 +135,17 @@ class Driver:
             reached_ns = self.session.stamp_ns
             if (
                 reached_ns is not None
-                and self.session.goes_straight_on(sample.stamp_ns)
+                and self.session.can_apply_directly(sample.stamp_ns)
                 and self.intake.goes_on(sample.stamp_ns, sample.wrench, reached_ns)
             ):
-                return self._go_straight_on(sample, now_ns)
+                return self._apply_directly(sample, now_ns)
         return self._samples(self._settled(arrived, now_ns), now_ns)
 
-    def _go_straight_on(self, sample: Sample, now_ns: int) -> Iterable[Publication]:
+    def _apply_directly(self, sample: Sample, now_ns: int) -> Iterable[Publication]:
         """Advance to a sample that nothing speaks against, which is what `_samples` would do in more steps."""
         self.intake.accept(sample.stamp_ns, sample.wrench)
         self._newest_ns, self._received_ns, self._zeroed = sample.stamp_ns, now_ns, False
-        status, publication = self.session.go_straight_on(sample)
+        status, publication = self.session.apply_directly(sample)
         self._advanced(now_ns)
         self._judge_advance(status, StreamState.RUNNING)
         if publication is not None:

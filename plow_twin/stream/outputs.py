@@ -314,11 +314,11 @@ class Outputs:
         self._stamp_ns, self._advance = (self._stamp_ns, None) if pending is None else pending
 
     @property
-    def told_all(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether there was no advance since the last publication."""
         return self._advance is None
 
-    def pass_on(self, stamp_ns: int, row: NDArray[np.void]) -> Publication | None:
+    def publish_row(self, stamp_ns: int, row: NDArray[np.void]) -> Publication | None:
         """Take in an advance that ended at a sample, as `add` and `take` do together; None when it failed.
 
         `row` is a `ROW`, shape (1, 1), that becomes the publication's.

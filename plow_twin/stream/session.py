@@ -231,7 +231,7 @@ class Session:
     def wear_depth(self, wear_depth: NDArray[np.float64]) -> None:
         self._wear_depth, self._row = wear_depth, None
 
-    def goes_straight_on(self, stamp_ns: int) -> bool:
+    def can_apply_directly(self, stamp_ns: int) -> bool:
         """Tell whether a sample only moves the motion on and its publication tells of it alone: most are so."""
         reached_ns = self.stamp_ns
         return (
@@ -240,12 +240,12 @@ class Session:
             and not self.held
             and not self._travels
             and self.twin.max_evaluations is None
-            and self.outputs.told_all
+            and self.outputs.is_empty
             and self.history.follows(stamp_ns)
         )
 
-    def go_straight_on(self, sample: Sample) -> tuple[int, Publication | None]:
-        """Apply a sample that `goes_straight_on`, and take what is to be published; the same bits as `apply_sample`.
+    def apply_directly(self, sample: Sample) -> tuple[int, Publication | None]:
+        """Apply a sample that `can_apply_directly`, and take what is to be published; the same bits as `apply_sample`.
 
         Returns the status of the advance, and the publication or None when it failed.
 
@@ -259,7 +259,7 @@ class Session:
         self._on_entry(sample)
         row = self.twin.advance_row((stamp_ns - origin_ns) * 1e-9, sample.wrench)
         self.stamp_ns, self._row = stamp_ns, row
-        publication = self.outputs.pass_on(stamp_ns, row)
+        publication = self.outputs.publish_row(stamp_ns, row)
         self.history.add_one(sample)
         self._count(1)
         return (0 if publication is not None else int(row["status"][0, 0])), publication
