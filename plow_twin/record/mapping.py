@@ -236,7 +236,7 @@ def readings(
                 yield name, arrived, role.read(arrived)
 
 
-def stamps_by(roles: Iterable[Role]) -> StampOf:
+def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
     """Return what reads the stamp of a message as its role does; of several the first that finds one."""
     by_topic: dict[str, list[Role]] = {}
     for role in roles:

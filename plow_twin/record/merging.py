@@ -5,13 +5,12 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Final
+from typing import Final, TypeAlias, TypeVar
 
-if TYPE_CHECKING:
-    from plow_twin.record.sources import Arrived
+T = TypeVar("T")
 
 #: Returns the stamp of a message [ns], None: it has none.
-StampOf = Callable[["Arrived"], int | None]
+StampOf: TypeAlias = Callable[[T], int | None]
 
 #: A stamp older than the newest one by more than this [ns] is a step of the clock; less is a late row.
 _STEP_NS: Final = 1_000_000_000
@@ -19,7 +18,7 @@ _STEP_NS: Final = 1_000_000_000
 _JUMP_NS: Final = 10_000_000_000
 
 
-def merged(streams: Iterable[Iterator[Arrived]], stamp_ns: StampOf) -> Iterator[Arrived]:
+def merged(streams: Iterable[Iterator[T]], stamp_ns: StampOf[T]) -> Iterator[T]:
     """Yield the messages of all streams by their stamps, each stream in its own order.
 
     A message without a stamp stays where it is in its stream, and so does a single wrong stamp. After a step of the
@@ -29,7 +28,7 @@ def merged(streams: Iterable[Iterator[Arrived]], stamp_ns: StampOf) -> Iterator[
         yield arrived
 
 
-def _placed(stream: Iterator[Arrived], stamp_ns: StampOf) -> Iterator[tuple[int, int, Arrived]]:
+def _placed(stream: Iterator[T], stamp_ns: StampOf[T]) -> Iterator[tuple[int, int, T]]:
     """Yield each message with the number of steps of the clock before it and the newest stamp until then."""
     steps, newest = 0, None
     stamped = ((arrived, stamp_ns(arrived)) for arrived in stream)

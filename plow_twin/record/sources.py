@@ -80,7 +80,7 @@ class Source(Protocol):
     def topics(self) -> Mapping[str, TopicType]:
         """Return types by topic."""
 
-    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
 
 
@@ -176,7 +176,7 @@ class McapSource:
             found |= {channel.topic: channel.message_type for channel in reader.channels.values()}
         return found
 
-    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
         decoder = Decoder(self.losses)
         for part in self.parts:
@@ -244,7 +244,7 @@ class SqliteSource:
                 raise RecordingError(f"{part}: not a recording of rosbag2: {error}") from error
         return found
 
-    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
         decoder = Decoder(self.losses)
         for part in self.parts:
@@ -304,7 +304,7 @@ class CsvSource:
             found[part.stem] = Columns(tuple(names))
         return found
 
-    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf | None = None) -> Iterator[Arrived]:
+    def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the rows of all files in order of their stamps, by default those in `t`, `time` or the first column."""
         streams = [self._rows(part) for part in self.parts if wanted(part.stem)]
         if len(streams) == 1:

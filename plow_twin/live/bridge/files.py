@@ -144,7 +144,7 @@ class Files:
             found[tail.topic] = rows.header(str(tail.path))
         return found
 
-    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
+    def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Begin to read the files of these topics."""
         self._tails = [tail for tail in self._tails if tail.topic in topics]
         if self.ends:
@@ -180,7 +180,7 @@ def _all(tail: _Tail) -> Iterator[Arrived]:
             return
 
 
-def _sent_ns(row: Arrived, stamp_ns: StampOf | None) -> int | None:
+def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
     """Return the stamp in a row; when it was read says nothing of its place."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
@@ -212,7 +212,7 @@ class StandardInput:
             self._first += self._read(1.0)
         return {STDIN_TOPIC: self._rows.header("-")}
 
-    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
+    def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Take note of nothing: there is one topic."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:

@@ -77,7 +77,7 @@ class Mqtt:
         """Return None: any topic of the broker can be named."""
         return
 
-    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
+    def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Connect and subscribe."""
         for topic in topics:
             if any(sign in topic for sign in "+#") or not topic:

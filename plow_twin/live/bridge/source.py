@@ -45,7 +45,7 @@ class Bridge(Protocol):
     def topics(self) -> Mapping[str, TopicType] | None:
         """Return types by topic; None: any topic that the mapping names."""
 
-    def start(self, topics: list[str], stamp_ns: StampOf | None = None) -> None:
+    def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Begin to receive these topics; files that are read once are put in order by `stamp_ns`."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:
