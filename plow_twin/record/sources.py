@@ -300,8 +300,7 @@ class CsvSource:
         for part in self.parts:
             with _open_csv(part) as stream:
                 names = [name.strip() for name in next(csv.reader(stream, delimiter=_delimiter(stream)), [])]
-            _check_names(part, names)
-            found[part.stem] = Columns(tuple(names))
+            found[part.stem] = columns_of(part, names)
         return found
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
@@ -346,17 +345,24 @@ def read_table(path: Path) -> tuple[Columns, list[list[str]]]:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise RecordingError(f"{path}: {reason}") from None
     names = tuple(name.strip() for name in rows[0]) if rows else ()
-    _check_names(path, names)
+    columns = columns_of(path, names)
     if delimiter != ",":
         rows = [[cell.replace(",", ".") for cell in cells] for cells in rows]
-    return Columns(names), rows[1:]
+    return columns, rows[1:]
 
 
-def _check_names(path: Path, names: Sequence[str]) -> None:
-    """Raise a `RecordingError` where a column's name stands twice."""
+def columns_of(source: Path | str, names: Sequence[str]) -> Columns:
+    """Return the columns of a source.
+
+    Raises
+    ------
+    RecordingError
+        A column's name stands twice.
+    """
     twice = [name for name, count in Counter(names).items() if name and count > 1]
     if twice:
-        raise RecordingError(f"{path}: column {twice[0]!r} stands there more than once, expected one of a name")
+        raise RecordingError(f"{source}: column {twice[0]!r} stands there more than once, expected one of a name")
+    return Columns(tuple(names))
 
 
 def _open_csv(path: Path) -> IO[str]:

@@ -56,7 +56,7 @@ class _Tail:
         if self._file is None or self._is_another():
             rest = b"" if self._file is None or self._is_anew() else self._read()
             if rest:  # what the writer left in the one that was moved away
-                return bytes(rest)
+                return rest
             try:
                 file = self.path.open("rb")
             except FileNotFoundError:

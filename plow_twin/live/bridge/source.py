@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final, Protocol
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.record.merging import StampOf
-from plow_twin.record.sources import Arrived, Columns, TopicType, delimiter_of
+from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of, delimiter_of
 
 #: A longer line or payload is none of a sensor's [B].
 LONGEST: Final = 65536
@@ -107,18 +106,8 @@ class Rows:
         self._before: list[str] | None = None
 
     def header(self, source: str) -> Columns:
-        """Return the columns of `source`.
-
-        Raises
-        ------
-        BridgeError
-            A column's name stands twice.
-        """
-        columns = self.columns or []
-        twice = [name for name, count in Counter(columns).items() if name and count > 1]
-        if twice:
-            raise BridgeError(f"{source}: column {twice[0]!r} stands there more than once, expected one of a name")
-        return Columns(tuple(columns))
+        """Return the columns of `source`; raises as `columns_of`."""
+        return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
         """Return what reads a file that takes this one's place: under its own header, without one under this one's."""
