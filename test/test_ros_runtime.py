@@ -24,6 +24,7 @@ from rclpy.context import Context
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 
 from plow_twin.live.tool_forces import ToolForces
@@ -31,6 +32,7 @@ from plow_twin.model.scene import Constant, Table
 from plow_twin.record.measured import read_recording
 from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
 from plow_twin.record.replay import replay
+from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.messages import read_wrench
@@ -107,6 +109,26 @@ def test_no_runtime_outlives_its_cycle() -> None:
         gc.collect()
         assert seen[-1]() is None
     assert gc.get_freeze_count() == 0
+
+
+def test_who_cannot_connect_is_named_though_its_topics_are_discovered_before_it(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    names = iter(["_NODE_NAME_UNKNOWN_", "sender", "sender", "_NODE_NAME_UNKNOWN_", "_NODE_NAME_UNKNOWN_"])
+    with _node() as node:
+        taken = node.create_subscription(WrenchStamped, "excitation", lambda message: None, 10)
+        identity = [1]
+
+        def discovered(topic: str) -> list[TopicEndpointInfo]:
+            return [TopicEndpointInfo(node_name=next(names), topic_type="std_msgs/msg/String", endpoint_gid=identity)]
+
+        monkeypatch.setattr(node, "get_publishers_info_by_topic", discovered)
+        connections = Connections(node)
+        assert [connections.publishers(taken) for _ in range(3)] == [([], 0), ([], 1), ([], 0)]
+        identity = [2]  # one whose name never comes is said all the same
+        assert [connections.publishers(taken) for _ in range(2)] == [([], 0), ([], 1)]
+    said = [line for line in capfd.readouterr().err.splitlines() if "nothing is received" in line]
+    assert ["publisher sender: type" in line for line in said] == [True, False]
 
 
 def test_wear_that_the_disk_did_not_take_outlives_a_cleanup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,6 +21,8 @@ from rosgraph_msgs.msg import Clock
 
 #: Looked up so often [s].
 LOOK_S: Final = 0.2
+#: Name of a node whose topics are discovered before the node itself (rmw_dds_common: they come by two messages).
+_UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
 #: A wrong time on `/clock` is said so often [s].
 _SAY_AGAIN_S: Final = 5.0
 
@@ -67,6 +69,7 @@ class Connections:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._said: set[tuple[str, bytes]] = set()
+        self._unnamed: set[tuple[str, bytes]] = set()
 
     def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
         """Return who publishes what a subscription can take, and how many that cannot connect are new."""
@@ -92,6 +95,9 @@ class Connections:
     def _say(self, topic: str, other: Any, text: str) -> bool:
         key = (topic, bytes(other.endpoint_gid))
         if key in self._said:
+            return False
+        if other.node_name == _UNNAMED and key not in self._unnamed:
+            self._unnamed.add(key)  # the next look knows the name, if there is one
             return False
         self._said.add(key)
         self._node.get_logger().warning(f"{topic}: {text}")
