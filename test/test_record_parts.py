@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from record_support import chunk_spans, paper_sample, record_run
+from record_support import chunk_spans, paper_sample, record_run, rewrite
 from rosbags.highlevel import AnyReader
 
-from plow_twin import Wear
 from plow_twin.cli.app import run as cli
 from plow_twin.cli.recording_facts import read_recording
 from plow_twin.errors import RecordingError
@@ -33,6 +32,8 @@ from plow_twin.stream.session import Session
 from plow_twin.study.analysis.analyse import analyse
 
 COUNT = 3000
+#: What makes several parts of such a run.
+SMALL: dict[str, Any] = {"part_bytes": 200_000, "flush_period_s": 0.01, "chunk_size": 50_000}
 
 
 def test_parts_are_whole_alone_and_nothing_is_lost_between_them(tmp_path: Path) -> None:
@@ -162,23 +163,42 @@ def test_a_part_that_stands_there_twice_is_named_and_read_once(tmp_path: Path) -
 
 
 def test_a_part_of_another_run_is_named_and_not_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """It was mixed into the journal, and the replay blamed a step."""
-    parts: dict[str, Any] = {"part_bytes": 200_000, "flush_period_s": 0.01, "chunk_size": 50_000}
-    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **parts)
-    other = record_run(tmp_path / "other", map(paper_sample, range(COUNT)), wear=Wear(1e-14, 0.015, 2.0), **parts)
-    second = run.folder / "run_1.mcap"
-    shutil.copy(other.file, second)
-    after, found = replay(run.folder), examine(run.folder)
-    assert (after.exit_code, after.divergences, after.repeated) == (3, 0, 0) and after.foreign_parts == {
-        second.name: ["scene_yaml"]
-    }
-    assert f"{second.name}: of another run (its scene_yaml differ): it is not read" in found.problems
-    assert found.repeated == 0 < found.gaps
+    """Runs of one scene and node differ by their identity alone."""
+    run, other = (record_run(tmp_path / name, map(paper_sample, range(COUNT)), **SMALL) for name in ("run", "other"))
+    parts = RunReader(run.folder).parts
+    assert {RunReader(part).header.run_id for part in parts} == {RunReader(run.folder).header.run_id}
+    for part in (parts[1], parts[-1]):
+        shutil.copy(other.file, part)
+        after, found, (facts, lossy) = replay(run.folder), examine(run.folder), read_recording(run.folder)
+        assert (after.exit_code, after.divergences, after.repeated) == (3, 0, 0) and lossy
+        assert after.foreign_parts[part.name] == facts["foreign_parts"][part.name] == ["run_id"]
+        assert f"{part.name}: of another run (its run_id differ): it is not read" in found.problems
+        count = len(after.foreign_parts)
+        counted = {"missing_parts": count, "foreign_parts": count}
+        assert facts["lost"] == counted and facts["damaged_chunks"] == 0
+        assert counted.items() <= after.lost.items() and counted.items() <= analyse(run.folder).lost.items()
     capsys.readouterr()
     assert cli(["replay", str(run.folder), "-q"]) == 3
-    assert f"{second.name} is of another run" in capsys.readouterr().err
-    assert repair(run.folder) == [second] and not RunReader(run.folder).foreign
-    assert second.with_name(f"{second.name}.foreign").is_file()
+    assert f"{part.name} is of another run" in capsys.readouterr().err
+    assert repair(run.folder) == [parts[1], parts[-1]] and not RunReader(run.folder).foreign
+    assert part.with_name(f"{part.name}.foreign").is_file()
+
+
+def test_recordings_from_before_the_identity_go_on_as_before(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
+    (old := tmp_path / "old").mkdir()
+
+    def as_of_version_2(record: dict[str, str]) -> dict[str, str]:
+        if "layout_version" in record:
+            assert record.pop("run_id") and record.pop("layout_version") == "3"
+            record["layout_version"] = "2"
+        return record
+
+    for part in RunReader(run.folder).parts:
+        rewrite(part, old / part.name, metadata=as_of_version_2)
+    report = replay(old)
+    assert (report.exit_code, report.foreign_parts, report.samples) == (0, {}, COUNT)
+    assert RunReader(old).header.run_id == "" and examine(old).layout_version == "2"
 
 
 def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Path) -> None:

@@ -33,8 +33,7 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
             lost[where] = lost.get(where, 0) + record.entry.count
     # the recorder's closing count is the complete one; without it the notes in place are all there is
     lost = {topic: count for topic, count in (reader.lost or lost).items() if count}
-    if reader.missing_parts:
-        lost["missing_parts"] = reader.missing_parts
+    lost |= reader.lost_parts
     header = reader.header
     facts: dict[str, Any] = {
         "file": str(reader.path),
@@ -45,6 +44,8 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
         "inputs": inputs.facts(),
         "lost": lost,
         "damaged_chunks": reader.damaged_chunks,
+        "foreign_parts": {file.name: list(keys) for file, keys in reader.foreign.items()},
+        "run_id": header.run_id,
         "package_version": header.package_version,
         "node": header.node,
         "excitation_source": header.excitation_source,

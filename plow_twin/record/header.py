@@ -20,12 +20,12 @@ LOSS_RECORD: Final = "plow_twin_loss"
 #: Key in it of the reason why recording ended before the run; all other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
-LAYOUT_VERSION: Final = 2
-#: Versions that can be read; in version 1 there is one file, and its keys are fewer.
-READABLE_VERSIONS: Final = ("1", "2")
+LAYOUT_VERSION: Final = 3
+#: Versions that can be read; in version 1 there is one file, and its keys are fewer; version 2 lacks `run_id`.
+READABLE_VERSIONS: Final = ("1", "2", "3")
 
-#: Keys that version 1 lacks; their defaults say what was so then.
-_SINCE_VERSION_2: Final = ("record_outputs", "part")
+#: Keys that came after version 1; their defaults say what was so before.
+_LATER: Final = ("record_outputs", "part", "run_id")
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class RunHeader:
 
     `scene_yaml` is self-contained. `topics` maps the outputs' base names to the names they were sent under. `clock`
     says what the receive times are: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
-    `record_outputs` says which outputs are there: `all`, `decimated` or `none`; `part` counts the files of a run.
+    `record_outputs` says which outputs are there: `all`, `decimated` or `none`; `part` counts the files of a run, which
+    all have its `run_id`: made at random by the writer, empty in files from before there was one.
     """
 
     scene_yaml: str
@@ -51,6 +52,7 @@ class RunHeader:
     package_version: str = field(default_factory=package_version)
     record_outputs: str = "all"
     part: int = 0
+    run_id: str = ""
 
     @property
     def samples_topic(self) -> str:
@@ -106,7 +108,7 @@ class RunHeader:
         values: dict[str, Any] = {}
         for spec in fields(cls):
             text = record.get(spec.name)
-            if text is None and spec.name in _SINCE_VERSION_2:
+            if text is None and spec.name in _LATER:
                 continue
             if text is None:
                 raise RecordingError(f"{source}: metadata {HEADER_RECORD!r}: {spec.name} is missing")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -145,14 +145,18 @@ def listed_parts(folder: Path) -> list[str]:
     return [str(name) for name in found]
 
 
-def missing_files(folder: Path) -> list[str]:
-    """Return the files that `metadata.yaml` names and that are not there; none where it cannot be read."""
+def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
+    """Return the files that `metadata.yaml` names and that are not there, or in `without`; none without it."""
     try:
         listed = listed_parts(folder)
     except RecordingError:
         return []
     # old versions write the folder's name before that of the file
-    return [name for name in listed if not (folder / name).is_file() and not (folder / Path(name).name).is_file()]
+    return [
+        name
+        for name in listed
+        if Path(name).name in without or not ((folder / name).is_file() or (folder / Path(name).name).is_file())
+    ]
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, Any], *, sync: bool = False) -> None:

@@ -215,8 +215,8 @@ class RunReader:
     did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
     has been read, 0..1. `path` is the first file, `parts` are all but those `repeated`: files that hold a part once
     more, with the file that is read for it, and those `foreign`: of another run, by what differs in their headers from
-    most. A part that is no MCAP file, or is foreign, counts as a damaged chunk. `missing_parts` counts parts of a
-    folder that are named by `metadata.yaml`, or by those around them, and not there.
+    most. A part that is no MCAP file counts as a damaged chunk. `missing_parts` counts parts of a folder that are
+    named by `metadata.yaml`, or by those around them, and not there; `lost_parts` has both counts, where there are any.
 
     With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
     follows each time that all there is has been read.
@@ -290,8 +290,16 @@ class RunReader:
         there = {self.number(file) for file in self.parts}
         known = sorted(self._headers[file].part for file in self.parts if file in self._headers)
         between = known[-1] - known[0] + 1 - len({number for number in there if known[0] <= number <= known[-1]})
-        named = {_part_number(Path(name))[0] for name in missing_files(self._place)} - there
+        missing = missing_files(self._place, {file.name for file in self.foreign})
+        named = {_part_number(Path(name))[0] for name in missing} - there
         return between + sum(number >= 0 and not known[0] < number < known[-1] for number in named)
+
+    @property
+    def lost_parts(self) -> dict[str, int]:
+        """Parts that are not there and parts of another run, under their names in `lost`; not those that are 0."""
+        missing = self.missing_parts if self.tail is None else 0  # a tail may outlive the oldest ones
+        found = {"missing_parts": missing, "foreign_parts": len(self.foreign)}
+        return {name: count for name, count in found.items() if count}
 
     def number(self, file: Path) -> int:
         """Return the number of a part, by its header where that can be read."""
@@ -344,7 +352,6 @@ class RunReader:
         yield from merger.finish()
         if self.tail is not None and self.tail.stopped:
             return
-        self.damaged_chunks += len(self.foreign)
         if not finished:
             self.status = FileStatus.TRUNCATED
         elif self.damaged_chunks:

@@ -494,8 +494,7 @@ class _Replay:
         report.foreign_parts = {file.name: list(keys) for file, keys in reader.foreign.items()}
         report.stop_reason, report.inputs = reader.stop_reason, self.inputs.facts()
         report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
-        if reader.missing_parts:
-            report.lost["missing_parts"] = reader.missing_parts
+        report.lost |= reader.lost_parts
         if self.gaps > self.noted["journal"]:
             report.lost["journal, unaccounted"] = self.gaps - self.noted["journal"]
         if self.first_ns is not None and self.session.stamp_ns is not None:

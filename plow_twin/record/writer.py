@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ class RunWriter:
         self, folder: Path, header: RunHeader, chunk_size: int, min_free_bytes: int, *, sync: bool = False
     ) -> None:
         self.folder = folder
-        self.header = header
+        self.header = header = replace(header, run_id=uuid4().hex)
         self.path = folder / f"{folder.name}_0.mcap"
         self._chunk_size = chunk_size
         self._min_free_bytes = min_free_bytes

@@ -334,9 +334,7 @@ def _walk_own(
     journalled = Measured()  # where the node estimates
 
     def so_far() -> Analysis:
-        losses = {topic: count for topic, count in reader.lost.items() if count}
-        if reader.missing_parts and reader.tail is None:  # a tail may outlive the oldest ones
-            losses["missing_parts"] = reader.missing_parts
+        losses = {topic: count for topic, count in reader.lost.items() if count} | reader.lost_parts
         if walk.missing:
             losses["journal"] = max(walk.missing, losses.get("journal", 0))
         if walk.late:
