@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -154,6 +155,18 @@ main(["simulate", "paper", "--t-end", "1", "--output-dt", "1.1e-7", "--quiet"])
     assert done.returncode == 1, done.stderr
     assert done.stderr.startswith("plow-twin: not enough memory")
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stop_signal_while_the_interpreter_ends_changes_nothing(number: int) -> None:
+    code = f"""
+import atexit, os
+from plow_twin.cli import main
+atexit.register(os.kill, os.getpid(), {int(number)})
+main(["simulate", "no such scene"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=110, check=False)
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
 
 
 def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:

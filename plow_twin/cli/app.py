@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from typing import Final, NoReturn
 
@@ -66,6 +68,10 @@ for _verb in (simulate, demo, live, estimate, forecast, record, replay, analyse,
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
+    if threading.current_thread() is threading.main_thread():
+        # all is done: one more signal, as of a terminal and a launch at once, would end the process with another code
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
     try:
         sys.stdout.flush()
     except BrokenPipeError:
