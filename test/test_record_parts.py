@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import resource
 import shutil
@@ -14,12 +15,14 @@ import yaml
 from record_support import chunk_spans, paper_sample, record_run, rewrite
 from rosbags.highlevel import AnyReader
 
+from plow_twin import Wear
 from plow_twin.cli.app import run as cli
 from plow_twin.cli.recording_facts import read_recording
 from plow_twin.errors import RecordingError
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.doctor import examine, repair
 from plow_twin.record.header import RunHeader
+from plow_twin.record.measured import read_recording as read_measured
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.recorder import Recorder
 from plow_twin.record.replay import replay
@@ -27,7 +30,7 @@ from plow_twin.record.sources import open_source
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Sample, Snapshot
+from plow_twin.stream.journal import Pose, Sample, Snapshot
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis.analyse import analyse
 
@@ -291,6 +294,23 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
     times = np.diff(found.predictions[0].series()[0])
     assert times.max() == 1_000_000  # of one stretch
     assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
+
+
+def test_estimate_and_forecast_tell_of_parts_that_are_not_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = (Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)) for index in range(COUNT))
+    entries = (entry for pair in zip(map(paper_sample, range(COUNT)), poses, strict=True) for entry in pair)
+    run = record_run(tmp_path / "run", entries, frame_every=10**9, wear=Wear(1e-14, 0.015, 2.0), **SMALL)
+    forecast = ["forecast", str(run.folder), "--limit-horizontal", "40", "--limit-vertical", "45", "--json"]
+    assert read_measured(run.folder).lost == {} and cli(forecast) == 0
+    RunReader(run.folder).parts[1].unlink()
+    found = read_measured(run.folder)
+    assert found.lost == {"missing_parts": 1} and found.unreadable == 1
+    capsys.readouterr()
+    assert cli(forecast) == 3
+    said = capsys.readouterr()
+    assert json.loads(said.out)["lost"] == {"missing_parts": 1} and "there may be a newer estimate" in said.err
 
 
 def test_a_part_of_a_foreign_recording_that_is_not_there_is_counted(tmp_path: Path) -> None:

@@ -10,18 +10,21 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from matplotlib.backends import backend_agg
+from matplotlib.figure import Figure
 from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
 from rerun.chunk import RrdReader
 
+from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Wear
 from plow_twin.record.messages import JointState, Odometry
-from plow_twin.record.reader import FileStatus
+from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Entry, Pose, Travel
+from plow_twin.stream.journal import Entry, Pose, Reset, Sample, Travel
 from plow_twin.view import ViewSummary, layout, to_rrd
 from plow_twin.view.columns import extremes
 from plow_twin.view.contact_sets import masks_of, set_color
@@ -61,6 +64,17 @@ def curve_names(path: Path) -> dict[str, str]:
         if chunk.is_static and "SeriesLines:names" in batch.schema.names:
             names[chunk.entity_path] = batch["SeriesLines:names"].to_pylist()[-1][0]
     return names
+
+
+def journal_around_the_hole(folder: Path) -> list[Sample]:
+    """Return the samples before and after the place where entries are not there."""
+    samples = [
+        (record.sequence, record.entry)
+        for record in RunReader(folder)
+        if isinstance(record, EntryRecord) and isinstance(record.entry, Sample)
+    ]
+    place = int(np.argmax(np.diff([sequence for sequence, _ in samples])))
+    return [samples[place][1], samples[place + 1][1]]
 
 
 def scalars(table: pa.Table) -> np.ndarray:
@@ -300,3 +314,41 @@ def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
     share = curves.row_shares[names.index("Corners that carry force")] / sum(curves.row_shares)
     # of 620 pixels curves have 555; title, time axis, name and lane take 87, as drawn in a window of 1000 x 620
     assert share * 555.0 > 87.0
+
+
+def test_no_line_is_drawn_over_a_part_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = map(paper_sample, range(100)), (paper_sample(index) for index in range(100, 3000))
+    entries = [*first, Reset(BASE_NS + 99 * STEP_NS, "asked for"), *second]
+    run = record_run(tmp_path / "run", entries, part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000)
+    whole = read(to_rrd(run.folder, tmp_path / "whole.rrd").path)
+    assert [scalar for scalar in whole["/load/fx"]["Scalars:scalars"].to_pylist() if not scalar] == [[]]  # the reset
+    RunReader(run.folder).parts[1].unlink()
+    before, after = (sample.stamp_ns for sample in journal_around_the_hole(run.folder))
+    for most_rows in (10**6, 300):  # thinned, too
+        summary = to_rrd(run.folder, tmp_path / "run.rrd", most_rows=most_rows)
+        tables = read(summary.path)
+        assert summary.lost == {"missing_parts": 1}
+        for name in ("/load/fx", f"/force/{PAIR_NAMES[0]}", "/growth/horizontal"):
+            table = tables[name]
+            stamps = np.array(table["ros_time"].cast(pa.int64()).to_pylist())
+            ends = stamps[[not scalar for scalar in table["Scalars:scalars"].to_pylist()]]
+            behind = ends - np.array([entries[99].stamp_ns, before])  # clearances come at 10 Hz
+            assert (behind > -(10**8)).all() and (behind <= 1).all() and after - before > 10**8
+    lines = [text[0] for text in tables["/events"]["TextLog:text"].to_pylist()]
+    assert lines[-1] == "recording: 1 missing parts" and sum("are not there after this" in line for line in lines) == 1
+    figures: list[Figure] = []
+
+    class Kept(backend_agg.FigureCanvasAgg):
+        def __init__(self, figure: Figure) -> None:
+            figures.append(figure)
+            super().__init__(figure)
+
+    monkeypatch.setattr(backend_agg, "FigureCanvasAgg", Kept)
+    assert cli(["view", str(run.folder), "--png", str(tmp_path / "run.png")]) == 3
+    assert "lost {'missing_parts': 1}" in capsys.readouterr().err
+    for axis in figures[0].axes[2:]:
+        for line in axis.lines:
+            times = np.asarray(line.get_xdata(), float)
+            assert np.isnan(times).sum() == 2 and np.nanmax(np.diff(times)) < 0.11

@@ -96,7 +96,9 @@ def estimate(
     if more.get("live", {}).get("repeated") is False:
         click.echo("the journal gives another estimate than the node published", err=True)
         return FAILED
-    return DONE_WITH_LOSS if result.lost else DONE
+    if more["losses"]:
+        click.echo(f"plow-twin: {source}: lost {more['losses']}", err=True)
+    return DONE_WITH_LOSS if result.lost or more["losses"] else DONE
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
     lost = measured.unreadable + lost_load + lost_poses + lost_gaps
     told = gaps if len(gaps.t) else None
-    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost, told), {}))
+    losses = {"losses": dict(measured.lost)}
+    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost, told), losses))
 
 
 def _repeated(source: Path) -> _Task | None:
@@ -139,6 +142,8 @@ def _repeated(source: Path) -> _Task | None:
     if not whole:
         return None
     scene = loads_scene(reader.header.scene_yaml, source=str(reader.path))
+    losses = {**reader.lost, "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
+    losses = {name: count for name, count in losses.items() if count}
 
     def run() -> tuple[Estimate, dict[str, Any]]:
         entry, window = whole[-1].entry, whole[-1].window
@@ -146,7 +151,7 @@ def _repeated(source: Path) -> _Task | None:
         again = answer(scene, window, entry.guess, asked_of(settings(reader.header.parameters)))
         same = again.text == entry.result
         live = {"estimates": len(found), "repeated": same, "start_ns": entry.start_ns, "end_ns": entry.end_ns}
-        return again.estimate, {**again.also, "live": live}
+        return again.estimate, {**again.also, "live": live, "losses": losses}
 
     newest = whole[-1].window
     assert newest is not None

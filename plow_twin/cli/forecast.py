@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import DONE, POSITIVE, busy, json_option, output_console, quiet_option, table
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, busy, json_option, output_console, quiet_option, table
 from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
 
 
-@click.command(epilog="Exit codes: 0 done, also where the limit is not reached; 1 failed; 2 wrong usage or scene.")
+@click.command(
+    epilog="Exit codes: 0 done, also where the limit is not reached; 1 failed; 2 wrong usage or scene; 3 done, but "
+    "something of the run is missing."
+)
 @click.argument("scene")
 @click.option("--limit-horizontal", metavar="MM", type=POSITIVE, required=True, help="Limit of the clearance [mm].")
 @click.option("--limit-vertical", metavar="MM", type=POSITIVE, required=True, help="Limit of the clearance [mm].")
@@ -77,7 +80,7 @@ def forecast(
         raise click.UsageError("--estimate cannot be combined with --history: a history tells the clearances now")
     if stop is not None and stop > horizon:
         raise click.UsageError(f"--stop: got {stop:g} h, expected at most the horizon, --horizon {horizon:g}")
-    model, facts_now = _scene(scene)
+    model, facts_now, lost = _scene(scene)
     if model.wear is None or model.wear.travel_speed_m_s <= 0.0:
         raise click.UsageError(f"{scene}: wear: got none or no travel speed, expected both")
     if estimated is not None:
@@ -105,27 +108,32 @@ def forecast(
 
         plot.parent.mkdir(parents=True, exist_ok=True)
         draw_forecast(found, plot)
+    facts["lost"] = lost
+    if lost:
+        click.echo(f"plow-twin: {scene}: lost {lost}: there may be a newer estimate", err=True)
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:
         _show(facts)
-    return DONE
+    return DONE_WITH_LOSS if lost else DONE
 
 
-def _scene(name: str) -> tuple[Scene, dict[str, Any] | None]:
-    """Return the scene, and of a run the newest estimate."""
+def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
+    """Return the scene, and of a run the newest estimate and what of its journal is lost."""
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene
     from plow_twin.stream.journal import Estimated
 
     if not Path(name).exists() or own_run(Path(name)) is None:
-        return load_scene(scene_path(name)), None
+        return load_scene(scene_path(name)), None, {}
     reader = RunReader(Path(name))
     newest = None
     for batch in reader.batches(outputs=False):
         for entry in batch.entries.others.values():
             newest = entry if isinstance(entry, Estimated) else newest
-    return reader.header.scene(reader.path), None if newest is None else json.loads(newest.result)
+    counts = {"journal": reader.lost.get("journal", 0), "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
+    lost = {topic: count for topic, count in counts.items() if count}
+    return reader.header.scene(reader.path), None if newest is None else json.loads(newest.result), lost
 
 
 def _estimate(path: Path) -> Any:

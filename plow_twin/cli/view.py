@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, progress, quie
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
+    from plow_twin.record.reader import FileStatus
     from plow_twin.view.live import Sink
     from plow_twin.view.rrd import ViewSummary
 
@@ -63,7 +65,7 @@ def view(
     quiet: bool,
 ) -> int:
     """Make a .rrd of RECORDING: the cross-section in motion, force and clearance curves, the event log."""
-    from plow_twin.record.reader import FileStatus, mcap_path
+    from plow_twin.record.reader import mcap_path
 
     if not follow and not recording.exists():
         raise click.BadParameter(f"{recording}: does not exist", param_hint="RECORDING")
@@ -82,12 +84,10 @@ def view(
     if png is not None:
         from plow_twin.view.picture import to_png
 
-        status = to_png(recording, png, exaggerate=exaggerate)
-        if status is not FileStatus.COMPLETE:
-            click.echo(f"plow-twin: {recording}: {status.value}", err=True)
+        lossy = _tell_loss(recording, *to_png(recording, png, exaggerate=exaggerate))
         if not quiet:
             click.echo(f"{png}")
-        return DONE if status is FileStatus.COMPLETE else DONE_WITH_LOSS
+        return DONE_WITH_LOSS if lossy else DONE
     from plow_twin.view import to_rrd
 
     out = out or mcap_path(recording).with_suffix(".rrd")
@@ -113,19 +113,25 @@ def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
 
 def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:
     """Say what was drawn and what was missing; return the exit code."""
-    from plow_twin.record.reader import FileStatus
-
-    whole = (FileStatus.COMPLETE, FileStatus.UNREAD)
-    if summary.status not in whole:
-        click.echo(f"plow-twin: {recording}: {summary.status.value}", err=True)
-    if summary.lost:
-        click.echo(f"plow-twin: {recording}: lost {dict(summary.lost)}", err=True)
+    lossy = _tell_loss(recording, summary.status, summary.lost)
     if not quiet:
         thinned = "" if summary.curve_rows == summary.rows else f" of {summary.rows} read"
         click.echo(
             f"{out}: {summary.curve_rows} force rows{thinned}, {summary.section_rows} pictures, {summary.events} events"
         )
-    return DONE if summary.status in whole and not summary.lost else DONE_WITH_LOSS
+    return DONE_WITH_LOSS if lossy else DONE
+
+
+def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int]) -> bool:
+    """Say what of a recording is missing; return whether something is."""
+    from plow_twin.record.reader import FileStatus
+
+    whole = status in (FileStatus.COMPLETE, FileStatus.UNREAD)
+    if not whole:
+        click.echo(f"plow-twin: {recording}: {status.value}", err=True)
+    if lost:
+        click.echo(f"plow-twin: {recording}: lost {dict(lost)}", err=True)
+    return not whole or bool(lost)
 
 
 def _serve(file: Path, port: int) -> int:

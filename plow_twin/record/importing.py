@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mapping import Role, readings
-from plow_twin.record.reader import Entries
+from plow_twin.record.reader import Entries, Holes
 from plow_twin.record.sources import Arrived
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.stream.intake import Intake, Verdict
@@ -176,22 +176,16 @@ class JournalWalk:
         self._lost = not whole
         self._reached_ns = -1
         self.used = self.late = self.missing = 0
-        self._next: int | None = None  # number of the next entry
+        self._holes = Holes()
 
     def add(self, entries: Entries) -> None:
         """Take in entries."""
-        if not len(entries):
-            return
-        reached = np.maximum.accumulate(entries.sequence) + 1
-        start = int(entries.sequence[0]) if self._next is None else self._next
-        expected = np.maximum(np.concatenate(([start], reached[:-1])), start)
-        self._next = max(start, int(reached[-1]))
         begin = 0
-        for end in (*np.flatnonzero(entries.sequence > expected).tolist(), len(entries)):
-            self._whole(entries[begin:end])
-            if end < len(entries):
-                self._hole(int(entries.sequence[end] - expected[end]))
-            begin = end
+        for place, count in self._holes.take(entries).items():
+            self._whole(entries[begin:place])
+            self._hole(count)
+            begin = place
+        self._whole(entries[begin:])
 
     def _hole(self, count: int) -> None:
         """Begin a new stretch: a load is not drawn over what is not there."""

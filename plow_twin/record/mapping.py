@@ -25,6 +25,8 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "forces": PAIR_NAMES,
     "drive": ("power", "chain_force", "speed", "depth", "position"),
 }
+#: How a reason begins under which messages are counted that a role cannot use.
+UNFIT: Final = "unfit, "
 #: Key of a mapping that is no role: how a live twin makes the load of what the drive tells.
 LOAD_MODEL: Final = "load_model"
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}

@@ -7,6 +7,8 @@ and columns named after pairs); with it pose.csv may be missing.
 from __future__ import annotations
 
 import math
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -20,7 +22,7 @@ from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.estimated import stated
-from plow_twin.record.mapping import ROLES, messages_of, readings, roles_by_source
+from plow_twin.record.mapping import ROLES, UNFIT, messages_of, readings, roles_by_source
 from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source, read_table
 from plow_twin.record.times import EPOCH_S, time_ns
@@ -40,7 +42,8 @@ class Measured:
     """What a folder holds.
 
     load : (n, 4) t [s], Fx, Fy [N], M [N m] believed; poses : (k, 4) t [s], x, y [m], theta [rad], NaN where a cell is
-    empty; unreadable : rows that are not numbers; pose_deviation, load_deviation, gaps_deviation : stated standard
+    empty; unreadable : rows that are not numbers, and whatever else `lost` says, which could not be read or used of a
+    recording; pose_deviation, load_deviation, gaps_deviation : stated standard
     deviations, 0 where none is; gaps : (m, 9) t [s] and the gaps of the eight pairs [m], NaN where there is no sensor.
     """
 
@@ -52,6 +55,7 @@ class Measured:
     load_deviation: Deviation = UNSTATED
     gaps: Array = field(default_factory=lambda: np.zeros((0, 1 + PAIR_COUNT)))
     gaps_deviation: float = 0.0
+    lost: Mapping[str, int] = field(default_factory=dict)
 
 
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
@@ -98,7 +102,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         if scene is None and not file.is_file():
             raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
         model = load_scene(scene_path(str(file)))
-        rows, unfit, why = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
+        rows, lost, why = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
         loads, gaps, gaps_deviation = rows["excitation"], rows["gaps"], 0.0
     else:
         given = scene is not None
@@ -108,11 +112,12 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         of_poses, of_load = stated(own.header.parameters)
         journalled[:, 1:], of_poses = believed(of_poses, journalled[:, 1:], brought)
         deviations = of_poses, tuple(np.maximum(of_load, spread).tolist())
-        rows, unfit, why = {"head_pose": journalled}, 0, ""
+        rows, lost, why = {"head_pose": journalled}, Counter[str](), ""
         if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
-            rows, unfit, why = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
-        unfit += sum(own.lost.values())
+            rows, lost, why = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
+            lost.pop("missing_parts", 0)  # counted by the run itself
+        lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
     for name, found in (("load", len(loads)), ("measured pose", len(poses) + len(gaps))):
         if not found:
@@ -120,7 +125,8 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     origin = loads[0, 0]
     for table in (loads, poses, gaps):
         table[:, 0] = (table[:, 0] - origin) * 1e-9
-    return Measured(model, loads, poses, unfit, *deviations, gaps, gaps_deviation)
+    counted = {name: count for name, count in lost.items() if count}
+    return Measured(model, loads, poses, sum(counted.values()), *deviations, gaps, gaps_deviation, counted)
 
 
 def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
@@ -162,22 +168,21 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
 
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
-) -> tuple[dict[str, Array], int, str]:
-    """Return the rows of each role that is wanted, stamps in ns, how many messages did not fit, and why."""
+) -> tuple[dict[str, Array], Counter[str], str]:
+    """Return the rows of each wanted role, stamps in ns, what could not be read or used, and why nothing fits."""
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
-    unfit, reasons = 0, dict[str, None]()
+    lost = Counter[str]()
     for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/" if node else ""):
         roles = {name: role for name, role in roles.items() if name in wanted}
         for name, arrived, found in readings(messages_of(source, roles), roles):
             if found is None:
-                unfit += 1
-                reasons[f"; {name}: {roles[name].why_unfit(arrived)}"] = None
+                lost[f"{UNFIT}{name}: {roles[name].why_unfit(arrived)}"] += 1
             else:
                 stamp_ns, values = found
                 rows[name].append([float(stamp_ns), *(values.get(key, math.nan) for key in ROLES[name])])
-        unfit += sum(source.losses.counts.values())
+        lost.update(source.losses.counts)
     tables = {name: np.array(found, dtype=float).reshape(-1, 1 + len(ROLES[name])) for name, found in rows.items()}
-    return tables, unfit, "".join(reasons)
+    return tables, lost, "".join(f"; {why.removeprefix(UNFIT)}" for why in lost if why.startswith(UNFIT))
 
 
 def _read(path: Path, columns: tuple[str, ...], some: tuple[str, ...] = ()) -> tuple[Array, int]:

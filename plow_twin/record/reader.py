@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property, partial
@@ -205,6 +205,43 @@ class Batch:
     entries: Entries
     outputs: list[Outputs]
     damaged: bool = False
+
+    def parted(self, places: Sequence[int]) -> Iterator[Batch]:
+        """Yield the batch in pieces: the entries before each of these places, which rise, and the rest."""
+        outputs, begin = self.outputs, 0
+        for place in places:
+            now, outputs = _parted_at(outputs, int(self.entries.sequence[place]))
+            yield Batch(self.entries[begin:place], now, self.damaged)
+            begin = place
+        yield Batch(self.entries[begin:], outputs, self.damaged)
+
+
+class Holes:
+    """Where entries of a journal are not there, by their numbers, from batch to batch."""
+
+    def __init__(self) -> None:
+        self._next: int | None = None  # number of the next entry
+
+    def take(self, entries: Entries) -> dict[int, int]:
+        """Return the places before which entries are missing, in order, and how many."""
+        if not len(entries):
+            return {}
+        reached = np.maximum.accumulate(entries.sequence) + 1
+        start = int(entries.sequence[0]) if self._next is None else self._next
+        expected = np.maximum(np.concatenate(([start], reached[:-1])), start)
+        self._next = max(start, int(reached[-1]))
+        places = np.flatnonzero(entries.sequence > expected)
+        return dict(zip(places.tolist(), (entries.sequence - expected)[places].tolist(), strict=True))
+
+
+def _parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list[Outputs]]:
+    """Return the messages with a number below `end`, and the others."""
+    before, after = [], []
+    for part in outputs:
+        place = len(part) if part.newest < end else int((part.sequence >= end).argmax())
+        before += [part[:place]] if place else []
+        after += [part[place:]] if place < len(part) else []
+    return before, after
 
 
 @dataclass
@@ -482,12 +519,7 @@ class _Merger:
         count = int(later[0]) if later.size else len(waiting)
         entries, self._entries = waiting[:count], [waiting[count:]]
         self._count = len(waiting) - count
-        outputs, kept = [], []
-        for part in self._outputs:
-            place = len(part) if part.newest < end else int((part.sequence >= end).argmax())
-            outputs += [part[:place]] if place else []
-            kept += [part[place:]] if place < len(part) else []
-        self._outputs = kept
+        outputs, self._outputs = _parted_at(self._outputs, end)
         if len(entries) or outputs:
             damaged = self._run.damaged_chunks + (self._chunks.damaged if self._chunks is not None else 0)
             yield Batch(entries, outputs, damaged > self._damaged)

@@ -42,7 +42,8 @@ class Curves:
     """Some curves with common times: rows in, one entity per curve out.
 
     With `span_ns` a curve keeps the least and the largest value in each such span of stamps: no peak is lost. `rows`
-    counts what came in, `sent` the values of the first curve that went out.
+    counts what came in, `sent` the values of the first curve that went out. A row without a value ends the lines where
+    something is missing.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, entities: Sequence[str], span_ns: int = 0) -> None:
@@ -51,6 +52,8 @@ class Curves:
         self.span_ns = span_ns
         self.entities = tuple(entities)
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
+        self._ends: list[NDArray[np.bool_]] = []  # of each part the rows at which the lines end
+        self._last: tuple[Indexes, Indexes] | None = None
         self._waiting = self.rows = self.sent = 0
 
     @property
@@ -61,27 +64,48 @@ class Curves:
     def add(self, stamps: Indexes, steps: Indexes, values: Array) -> None:
         """Add rows, shapes (n,), (n,) and (n, number of entities)."""
         if len(stamps):
-            self._parts.append((stamps, steps, values))
+            self._append(stamps, steps, values, ends=False)
+            self._last = stamps[-1:] + 1, steps[-1:]
             self._waiting += len(stamps)
             self.rows += len(stamps)
         if self._waiting >= BLOCK_ROWS:
             self.flush()
+
+    def end(self) -> None:
+        """End the lines: the next row does not go on from the last one."""
+        if self._last is not None:
+            self._append(*self._last, np.zeros((1, len(self.entities))), ends=True)
+        self._last = None
+
+    def _append(self, stamps: Indexes, steps: Indexes, values: Array, *, ends: bool) -> None:
+        self._parts.append((stamps, steps, values))
+        self._ends.append(np.full(len(stamps), ends))
 
     def flush(self) -> None:
         """Send what has been collected."""
         if not self._parts:
             return
         stamps, steps, values = (np.concatenate(part) for part in zip(*self._parts, strict=True))
-        self._parts, self._waiting = [], 0
-        indexes = self._axis.columns(stamps, steps)
-        kept = extremes(stamps // self.span_ns, values) if self.span_ns else None
-        self.sent += len(stamps) if kept is None else int(kept[:, 0].sum())
+        ends = np.concatenate(self._ends)
+        self._parts, self._ends, self._waiting = [], [], 0
+        everywhere = np.arange(len(stamps))
+        kept = extremes(self._spans(stamps, ends), values) if self.span_ns else None
         for entity, number in zip(self.entities, range(values.shape[1]), strict=True):
-            column = np.ascontiguousarray(values[:, number])
-            if kept is not None:
-                chosen = np.flatnonzero(kept[:, number])
-                indexes, column = self._axis.columns(stamps[chosen], steps[chosen]), column[chosen]
-            rr.send_columns(entity, indexes, rr.Scalars.columns(scalars=column), recording=self._stream)
+            chosen = everywhere if kept is None else np.flatnonzero(kept[:, number])
+            valued = chosen[~ends[chosen]]
+            self.sent += len(valued) if number == 0 else 0
+            columns = rr.Scalars.columns(scalars=np.ascontiguousarray(values[valued, number]))
+            if len(valued) < len(chosen):
+                columns = columns.partition((~ends[chosen]).astype(np.int64))
+            indexes = self._axis.columns(stamps[chosen], steps[chosen])
+            rr.send_columns(entity, indexes, columns, recording=self._stream)
+
+    def _spans(self, stamps: Indexes, ends: NDArray[np.bool_]) -> Indexes:
+        """Return a number for each row that changes from span to span; the end of a line is one of its own."""
+        spans = stamps // self.span_ns
+        after = np.concatenate(([False], ends[:-1]))
+        changes: Indexes = np.cumsum((np.diff(spans, prepend=spans[0]) != 0) | ends | after)
+        return changes
 
 
 @compiled

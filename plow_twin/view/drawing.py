@@ -17,9 +17,9 @@ from plow_twin.record.alarms import ALARMS
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import publication_templates
-from plow_twin.record.reader import Batch, Entries, FileStatus
+from plow_twin.record.reader import Batch, Entries, FileStatus, Holes, RunReader
 from plow_twin.record.rows import Rows, rows_by_topic
-from plow_twin.stream.journal import Hold, Pose, Reset, Travel, Unload
+from plow_twin.stream.journal import Hold, Loss, Pose, Reset, Travel, Unload
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 from plow_twin.view import layout
 from plow_twin.view.columns import Array, Batches, Curves, Indexes, TimeAxis, buffers
@@ -97,6 +97,8 @@ class Drawing:
         self._residuals = Residuals()
         self._drawn_face_ns = -_FACE_NS
         self._band_end: tuple[Indexes, Indexes, Array] | None = None
+        self._band_colored = False
+        self._holes = Holes()
         self.head = Batches(stream, axis, "section/head", rr.LineStrips2D, ("strips", "colors"))
         self.corners = Batches(stream, axis, "section/corners", rr.Points2D, ("positions", "radii"))
         self.arrows = Batches(stream, axis, "section/force", rr.Arrows2D, ("origins", "vectors", "colors", "labels"))
@@ -154,7 +156,35 @@ class Drawing:
         self.stream.log("about", document, static=True)
 
     def add(self, batch: Batch) -> None:
-        """Draw a batch."""
+        """Draw a batch; no line goes over entries that are not there, nor over a reset."""
+        missing = self._holes.take(batch.entries)
+        resets = {index for index, entry in batch.entries.others.items() if isinstance(entry, Reset)}
+        places = sorted(resets | set(missing))
+        for place, part in zip((None, *places), batch.parted(places), strict=True):
+            if place is not None:
+                self._end_lines()
+            if place in missing:
+                self._hole(missing[place], part)
+            self._whole(part)
+
+    def _end_lines(self) -> None:
+        for buffer in buffers(self):
+            if isinstance(buffer, Curves):
+                buffer.end()
+        self.what_if.end_lines()
+        self._band_end = None
+        self._residuals = Residuals()
+
+    def _hole(self, count: int, after: Batch) -> None:
+        """Note that entries are missing before a batch, and forget what was before them."""
+        self._sample_ns = None
+        self.events.forget()
+        if not isinstance(after.entries.others.get(0), Loss):  # it says so itself
+            text = f"{count} journal entries are not there after this"
+            self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
+
+    def _whole(self, batch: Batch) -> None:
+        """Draw entries and messages of which none is missing."""
         entries = batch.entries
         advance = entries.sample.copy()
         advance[[index for index, entry in entries.others.items() if isinstance(entry, Hold | Unload)]] = True
@@ -245,7 +275,6 @@ class Drawing:
     def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
         """Draw the areas between the bounds: curves that change between them, row by row."""
         total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * (numbers[:, _BOUNDS] - self._bounds_new_m)), axis=1)
-        first = self._band_end is None
         if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)
             stamps, steps, total = (np.concatenate(pair) for pair in ends)
@@ -256,8 +285,9 @@ class Drawing:
             total = np.stack([np.interp(rows, known, column) for column in total.T], axis=1)
             stamps = stamps[0] + np.interp(rows, known, stamps - stamps[0]).astype(np.int64)
             steps = steps[rows.astype(np.int64)]
-        if first and len(stamps) > 1:
+        if not self._band_colored and len(stamps) > 1:
             self._color_bands(stamps, steps)
+            self._band_colored = True
         bound = np.arange(len(stamps)) % 2
         sides = total.reshape(len(stamps), len(layout.BAND), 2)
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
@@ -364,10 +394,13 @@ class Drawing:
         for part in (self.events, self.contact_sets, self.face, self.what_if):
             part.flush()
 
-    def finish(self, status: FileStatus) -> None:
-        """Draw how the recording ended, and send what is still collected."""
+    def finish(self, reader: RunReader) -> None:
+        """Draw how the recording ended and which parts are not there, and send what is still collected."""
         self._write_statuses()
         self.face.draw(self.stamp_ns, max(self.step, 0))
-        if status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
-            self.events.add(self.stamp_ns, max(self.step, 0), f"recording {status.value}", "ERROR")
+        told = [f"{count} {name.replace('_', ' ')}" for name, count in reader.lost_parts.items()]
+        if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
+            told.append(reader.status.value)
+        for text in told:
+            self.events.add(self.stamp_ns, max(self.step, 0), f"recording: {text}", "ERROR")
         self.flush()

@@ -79,6 +79,10 @@ class Events:
             text = f"{PAIR_NAMES[pair]} touches{times}, up to {peak[row, pair] / 1e3:.1f} kN"
             self.add(int(stamps[row]), int(steps[row]), text)
 
+    def forget(self) -> None:
+        """Take the next counts of touches for the first ones: what was before them is not known."""
+        self._makes_before = None
+
     def status(self, stamp_ns: int, step: int, message: DiagnosticStatus) -> None:
         """Write a status, or what alarms there are, when it differs from the one before of that name."""
         now = (message.level, message.message)

@@ -68,7 +68,7 @@ def follow(
             drawing.section_hz = SECTION_HZ
             drawing.flush()
             stream.flush()
-    drawing.finish(reader.status)
+    drawing.finish(reader)
     stream.flush()
     stream.disconnect()
     return ViewSummary.of(reader.path, drawing, reader)

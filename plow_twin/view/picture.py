@@ -14,18 +14,22 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
-from plow_twin.stream.journal import Sample
+from plow_twin.stream.journal import Reset, Sample
 from plow_twin.view.section import PAIR_COLORS, Section
 
 _MOST_ROWS: Final = 8000
+#: Numbers of entries are those modulo twice that.
+_HALF: Final = 2**31
 
 
 class _Largest:
     """Rows in time of which only the largest values of neighbours are kept when there are many."""
 
-    def __init__(self) -> None:
+    def __init__(self, width: int) -> None:
         self.times: list[float] = []
         self.rows: list[NDArray[np.float64]] = []
+        self._width = width
+        self._ends: list[int] = []  # places of rows to which no line is drawn from the one before
 
     def add(self, time_s: float, row: NDArray[np.float64]) -> None:
         self.times.append(time_s)
@@ -33,10 +37,23 @@ class _Largest:
         if len(self.rows) >= 2 * _MOST_ROWS:
             self.rows = [np.where(np.abs(a) >= np.abs(b), a, b) for a, b in zip(*[iter(self.rows)] * 2, strict=True)]
             self.times = self.times[::2]
+            self._ends = [(place + 1) // 2 for place in self._ends]
+
+    def end(self) -> None:
+        """End the lines: the next row does not go on from the last one."""
+        self._ends.append(len(self.rows))
+
+    def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return times and rows, shapes (n,) and (n, width), with a row of NaN where a line ends."""
+        times, rows = np.array(self.times), np.array(self.rows).reshape(-1, self._width)
+        ends = [place for place in self._ends if place < len(times)]
+        return np.insert(times, ends, np.nan), np.insert(rows, ends, np.nan, axis=0)
 
 
-def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> FileStatus:
-    """Draw a recording into a PNG and return how the recording ended.
+def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[FileStatus, dict[str, int]]:
+    """Draw a recording into a PNG; return how the recording ended, and what of it is lost.
+
+    No line goes over entries that are not there, nor over a reset.
 
     Raises
     ------
@@ -49,14 +66,20 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> FileSta
     reader = RunReader(path)
     scene = reader.header.scene(reader.path)
     section = Section.of(scene)
-    force, load, clearance = _Largest(), _Largest(), _Largest()
+    force, load, clearance = drawn = _Largest(8), _Largest(3), _Largest(6)
     names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}
     first_ns: int | None = None
     pose, contact = (0.0, 0.0, 0.0), np.full(8, -np.inf)
     largest, now, held = 0.0, (0.0, 0.0, 0.0), np.zeros(8)
     gaps, shown = np.zeros(8), np.zeros(8)
+    reached: int | None = None  # number of the newest entry
     for record in reader:
         if isinstance(record, EntryRecord):
+            ahead = 1 if reached is None else (record.sequence - reached + _HALF) % (2 * _HALF) - _HALF
+            if ahead > 1 or isinstance(record.entry, Reset):
+                for rows in drawn:
+                    rows.end()
+            reached = record.sequence if ahead > 0 else reached
             if isinstance(record.entry, Sample):
                 first_ns = record.entry.stamp_ns if first_ns is None else first_ns
                 load.add((record.entry.stamp_ns - first_ns) * 1e-9, np.array(record.entry.wrench) / 1e3)
@@ -94,13 +117,15 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> FileSta
     below = figure.add_subplot(grid[2, 1:], sharex=axis)
     _bands(below, clearance, (scene.clearance.horizontal_m, scene.clearance.vertical_m))
     below.set_xlabel("time since the first stamp [s]")
-    figure.suptitle(f"{reader.path.name}: {reader.status.value}")
+    lost = {name: count for name, count in {**reader.lost, **reader.lost_parts}.items() if count}
+    told = "".join(f", {name.replace('_', ' ')}: {count}" for name, count in lost.items())
+    figure.suptitle(f"{reader.path.name}: {reader.status.value}{told}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_png(str(out))  # type: ignore[no-untyped-call]
     except OSError as error:
         raise RecordingError(f"{out}: cannot be written: {error.strerror}") from error
-    return reader.status
+    return reader.status, lost
 
 
 def _clearance_row(message: JointState) -> NDArray[np.float64]:
@@ -145,10 +170,10 @@ def _draw_wide(axis: Any, section: Section, penetration: NDArray[np.float64], fa
 
 
 def _curves(axis: Any, rows: _Largest, names: Sequence[str], label: str, colors: Sequence[Any] | None) -> None:
-    values = np.array(rows.rows).reshape(-1, len(names))
+    times, values = rows.series()
     for index, name in enumerate(names):
         if len(values):
-            axis.plot(rows.times, values[:, index], lw=0.7, label=name, color=colors[index] if colors else None)
+            axis.plot(times, values[:, index], lw=0.7, label=name, color=colors[index] if colors else None)
     axis.set_ylabel(label)
     if len(values):
         _legend_beside(axis)
@@ -156,12 +181,12 @@ def _curves(axis: Any, rows: _Largest, names: Sequence[str], label: str, colors:
 
 def _bands(axis: Any, rows: _Largest, new_m: Sequence[float]) -> None:
     """Draw the growth of both clearances with its interval: beside millimetres of clearance it would not be seen."""
-    values = np.array(rows.rows).reshape(-1, 6)
+    times, values = rows.series()
     for index, name in enumerate(("horizontal", "vertical")):
         if len(values):
             value, low, high = 1e3 * (values[:, 3 * index : 3 * index + 3].T - 1e3 * new_m[index])
-            line = axis.plot(rows.times, value, label=f"{name},\n{values[-1, 3 * index]:.3f} mm at the end")[0]
-            axis.fill_between(rows.times, low, high, alpha=0.25, color=line.get_color())
+            line = axis.plot(times, value, label=f"{name},\n{values[-1, 3 * index]:.3f} mm at the end")[0]
+            axis.fill_between(times, low, high, alpha=0.25, color=line.get_color())
     axis.set_ylabel("growth of the clearance,\n5..95 % [um]")
     if len(values):
         _legend_beside(axis)

@@ -28,8 +28,8 @@ _BYTES_PER_ROW: Final = 400
 class ViewSummary:
     """What a .rrd holds: first stamp, rows of the curves, moments of the cross-section, events.
 
-    `status` is how the recording ended, `lost` what its recorder counted as lost, by topic. `rows` were read of the
-    force curves; fewer `curve_rows` were sent where they are thinned.
+    `status` is how the recording ended, `lost` what its recorder counted as lost, by topic, and parts that are not
+    there or of another run. `rows` were read of the force curves; fewer `curve_rows` were sent where they are thinned.
     """
 
     path: Path
@@ -53,7 +53,7 @@ class ViewSummary:
             drawing.section_rows,
             drawing.events.count,
             reader.status,
-            reader.lost,
+            {**reader.lost, **reader.lost_parts},
         )
 
 
@@ -116,7 +116,7 @@ def to_rrd(
         drawing.add(batch)
         if on_progress is not None:
             on_progress(reader.position)
-    drawing.finish(reader.status)
+    drawing.finish(reader)
     if on_progress is not None:
         on_progress(1.0)
     stream.flush()

@@ -62,6 +62,11 @@ class WhatIf:
         if self._curves:
             self._curves[0].add(stamps, steps, _largest_kn(peak))
 
+    def end_lines(self) -> None:
+        """End the lines: what comes does not go on from what was."""
+        for curve in self._curves:
+            curve.end()
+
     def flush(self) -> None:
         """Send what has been collected."""
         for curve in self._curves:
