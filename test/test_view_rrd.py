@@ -316,6 +316,21 @@ def test_the_lane_of_contact_sets_has_room_in_a_low_window() -> None:
     assert share * 555.0 > 87.0
 
 
+def test_the_legends_of_the_clearance_are_not_cut_in_a_low_window(
+    view: tuple[ViewSummary, dict[str, pa.Table]],
+) -> None:
+    curves = layout.blueprint(Section.of(load_scene(scene_path("paper"))), 3.0).root_container.contents[1]
+    height = curves.row_shares[-1] / sum(curves.row_shares) * 555.0 - 46.0  # without title and axis
+    for group in ("growth", "clearance"):
+        names = {
+            name
+            for entity, name in curve_names(view[0].path).items()
+            if entity.startswith(f"/{group}/") and not entity.endswith(("/p05", "/p95"))
+        }
+        # a line takes 23 pixels, of equal names one is shown; at 94 of 112 the last was cut
+        assert names >= {"horizontal", "vertical"} and 23 * len(names) + 2 < 0.77 * height
+
+
 def test_no_line_is_drawn_over_a_part_that_is_not_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

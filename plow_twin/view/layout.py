@@ -103,7 +103,7 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        row_shares=[4.8, 2.2, 2.3, 3.7],  # the lane of the sets is seen whole in a window of 600 pixels too
+        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets is seen whole in a window of 600 pixels too
     )
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -135,8 +135,7 @@ def style_curves(stream: rr.RecordingStream) -> None:
     for entity, name, color in zip(RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
-        way = entity.rpartition("/")[2]
-        _style(stream, entity, f"{way} 5..95 %", None, AggregationPolicy.MinMax, _BAND_WIDTH)
+        _style(stream, entity, "5..95 %", None, AggregationPolicy.MinMax, _BAND_WIDTH)
     for entity in (*TOTAL, *GROWTH, *WEAR):  # the bounds of an interval thinner than the value that they belong to
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
