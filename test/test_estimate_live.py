@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -23,12 +25,14 @@ from plow_twin import Twin, Wear
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.estimate.worker import Found, Worker
-from plow_twin.live.estimation import entry_of, message_of
+from plow_twin.live.estimation import Estimation, entry_of, message_of
+from plow_twin.live.parameters import settings
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.messages import JointState as JointStateMessage
 from plow_twin.record.replay import replay
 from plow_twin.ros.messages import set_stamp
 from plow_twin.scene_file import dump_scene
-from plow_twin.stream.journal import Sample, SetWear
+from plow_twin.stream.journal import Sample, SetModel, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
 
@@ -233,6 +237,73 @@ def test_what_is_estimated_stays_until_it_is_withdrawn_or_the_pads_are_changed()
     assert message_of(_found(State.ESTIMATED, State.WITHDRAWN), "f").name == ()
     session.apply(SetWear(START_NS + 2_000_000_000, (0.0,) * 8, "new pads"))
     assert clearance(3.0)["horizontal"] == pytest.approx(0.025, abs=1e-6)
+
+
+class _Finished:
+    """Stands in for the process: what it has found is given by hand."""
+
+    def __init__(self, *_: Any) -> None:
+        self.found: list[Found] = []
+
+    def poll(self) -> Found | None:
+        return self.found.pop() if self.found else None
+
+    def take_load(self, *_: Any) -> None:
+        pass
+
+    def restart(self) -> None:
+        self.found.clear()
+
+
+def test_other_pads_and_other_numbers_of_the_model_forget_what_was_told_of_those_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("plow_twin.live.estimation.Worker", _Finished)
+    scene = replace(preset("paper"), wear=Wear(1e-13, 0.015, 2.0))
+    estimation = Estimation(settings({"estimate": True, "forecast_limits": [0.04, 0.05]}), scene)
+    session = Session(Twin(scene, excitation="sampled"), on_entry=estimation.take)
+    session.apply(Sample(START_NS, (0.0, 0.0, 0.0)))
+
+    def told() -> dict[str, JointStateMessage]:
+        found = _found(State.ESTIMATED, State.ESTIMATED)
+        suspect = replace(found.estimate, model="suspect", reasons=("why",))
+        found = replace(found, estimate=suspect, also={"forecast": {"p50": {"hours": 3.0}}})
+        estimation._worker.found.append(found)
+        return estimation.poll(session)
+
+    assert told()["forecast"].name == ("seconds/p50",)
+    session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
+    # the clearance is the model's again: no estimate is held beside one that cannot be observed
+    assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}
+    assert estimation.forecast is not None and estimation.poll(session) == {}
+    told()
+    session.apply(SetWear(START_NS + 1, (0.0,) * 8, "new pads"))
+    assert (estimation.forecast, estimation.reasons, estimation.end_ns) == (None, (), None)
+    assert estimation.forecast_error and set(estimation.trust.values()) == {""}
+    # and takes back what is latched
+    messages = estimation.poll(session)
+    assert {topic: (message.stamp_ns, message.name) for topic, message in messages.items()} == dict.fromkeys(
+        ("estimate", "forecast"), (START_NS + 1, ())
+    )
+    assert estimation.poll(session) == {}
+
+
+def test_a_worker_that_reads_nothing_is_told_and_nothing_more_is_kept_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("plow_twin.estimate.worker._MOST_WAITING", 20_000)
+    worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
+    os.kill(worker._process.pid, signal.SIGSTOP)
+    give_up = time.monotonic() + 20.0
+    while not worker.error and time.monotonic() < give_up:
+        for _ in range(1000):
+            worker.take_load(START_NS, (0.0, 0.0, 0.0))
+        assert worker.poll() is None
+        # so slow that it is waited for with less than that in hand
+        time.sleep(0.1)
+    assert worker.error == "the estimator did not read for 20000 samples"
+    worker.take_load(START_NS, (0.0, 0.0, 0.0))
+    assert not worker._waiting
+    worker.close()
+    assert not worker._thread.is_alive()
 
 
 def test_a_worker_that_died_is_told_and_stops_nothing() -> None:

@@ -124,13 +124,22 @@ class Worker:
         """Return what has been found since the last call, if anything; what was before a restart is dropped."""
         if self.error:
             return None
+        if len(self._waiting) > _MOST_WAITING:
+            # the thread may be waiting for the far side to read
+            self._process.kill()
+            self._fail(f"the estimator did not read for {_MOST_WAITING} samples")
+            return None
         try:
             if self._connection.poll():
                 found: Found = self._connection.recv()
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
-            self.error = f"the estimator ended with code {self._process.wait(_STOP_S)}"
+            self._fail(f"the estimator ended with code {self._process.wait(_STOP_S)}")
         return None
+
+    def _fail(self, error: str) -> None:
+        """Estimate nothing more; what comes from now on is not kept."""
+        self.error, self._waiting = error, deque(maxlen=0)
 
     def close(self) -> None:
         """End the process."""
@@ -146,12 +155,8 @@ class Worker:
 
     def _hand_on(self) -> None:
         while not self._closed.wait(_HAND_ON_S):
-            if len(self._waiting) > _MOST_WAITING:
-                self.error = f"the estimator did not read for {_MOST_WAITING} samples"
-            if self.error:
-                self._waiting.clear()
-                continue
-            waiting = [self._waiting.popleft() for _ in range(len(self._waiting))]
+            taken = self._waiting
+            waiting = [taken.popleft() for _ in range(len(taken))]
             if waiting:
                 try:
                     self._connection.send(waiting)

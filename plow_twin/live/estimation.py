@@ -25,6 +25,7 @@ from plow_twin.stream.journal import (
     Pose,
     Reset,
     Sample,
+    SetModel,
     SetWear,
     Spread,
     whole_pose,
@@ -51,7 +52,12 @@ class Estimation:
         self._frame_id = settings.frame_id
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
-        self._worker = Worker(scene, windows, asked_of(settings))
+        asked = asked_of(settings)
+        self._worker = Worker(scene, windows, asked)
+        told = {ESTIMATE: True, FORCE_INTERVALS: bool(asked.members), FORECAST: asked.plan is not None}
+        self._topics = [topic for topic, wanted in told.items() if wanted]
+        #: when other pads were set, until that has been told [ns]
+        self._set_ns: int | None = None
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
         self.trust = {"model": "", "sensor": ""}
@@ -84,18 +90,28 @@ class Estimation:
                 self._worker.take_gaps(stamp_ns, pairs, gaps)
             case Spread(_, deviation):
                 self._worker.take_spread(deviation)
-            case SetWear():
+            case SetWear(stamp_ns):
                 self._worker.restart()
-                self.entry = None
-                self.states = dict.fromkeys(self.states, State.PRIOR)
+                self._forget()
+                self._set_ns, self.end_ns = stamp_ns, None
+                self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
+                self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
+            case SetModel():
+                # the clearances are those of the other numbers now
+                self._forget()
             case Reset():
                 self._worker.restart()
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
-        """Hand an estimate that has come to the session; return its messages by topic, none if none has come."""
+        """Hand an estimate that has come to the session; return its messages by topic, none if none has come.
+
+        Once other pads have been set, empty messages take the place of the latched ones.
+        """
         found = self._worker.poll()
+        stamp_ns, self._set_ns = self._set_ns, None
         if found is None:
-            return {}
+            told = self._topics if stamp_ns is not None else ()
+            return {topic: plain.JointState(stamp_ns or 0, self._frame_id, ()) for topic in told}
         self.count += 1
         self.skipped += found.skipped
         self.wall_s, self.end_ns = found.wall_s, found.end_ns
@@ -112,6 +128,11 @@ class Estimation:
         if "forecast" in found.also:
             messages[FORECAST] = forecast_message(found, self._frame_id)
         return messages
+
+    def _forget(self) -> None:
+        """Let the clearances be what the model says again."""
+        self.entry = None
+        self.states = dict.fromkeys(self.states, State.PRIOR)
 
     def close(self) -> None:
         """End the process."""
