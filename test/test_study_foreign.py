@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import sqlite3
 from pathlib import Path
@@ -235,3 +236,42 @@ def test_a_part_that_a_killed_recorder_has_only_named_costs_nothing_before_it(tm
     assert examine(run.folder).problems == ["run_1.mcap: cut off: it has no end", unnamed]
     repair(run.folder)
     assert replay(run.folder).exit_code == 0 and (run.folder / "run_1.mcap.damaged").exists()
+
+
+def bag_of_parts(folder: Path, kind: StoragePlugin) -> list[Path]:
+    """A bag of three parts, 10 ms of load each without a gap, as rosbag2 splits one; return the parts."""
+    ending, listed = kind.name.lower().replace("sqlite3", "db3"), []
+    folder.mkdir()
+    for part in range(3):
+        one = folder.parent / f"{folder.name}_{part}"
+        with BagWriter(one, version=9, storage_plugin=kind) as writer:
+            connection = writer.add_connection("/load", TYPE, typestore=STORE)
+            for index in range(100 * part, 100 * (part + 1)):
+                time_ns = BASE_NS + index * STEP_NS
+                writer.write(connection, time_ns, wrench_message(time_ns, paper_sample(index).wrench))
+        listed.append(shutil.move(one / f"{one.name}.{ending}", folder / f"{folder.name}_{part}.{ending}"))
+    text = (one / "metadata.yaml").read_text()
+    names = "".join(f"\n  - {part.name}" for part in listed)
+    text = re.sub(r"relative_file_paths:\n *- [^\n]*", f"relative_file_paths:{names}", text)
+    (folder / "metadata.yaml").write_text(text)
+    return listed
+
+
+@pytest.mark.parametrize("kind", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
+def test_of_a_bag_with_a_damaged_or_missing_part_the_others_are_used(kind: StoragePlugin, tmp_path: Path) -> None:
+    """And no load is drawn over the hole, however short: a damaged file made all of the bag unreadable."""
+    parts = bag_of_parts(tmp_path / "bag", kind)
+    plain = analyse(tmp_path / "bag", scene=PAPER)
+    assert (plain.input["samples_used"], plain.lost, len(plain.predictions[0].spans)) == (COUNT, {}, 1)
+    parts[1].write_bytes(b"no recording at all")
+    for reason in ("damaged_files", "missing_parts"):
+        found = analyse(tmp_path / "bag", scene=PAPER, out=tmp_path / reason)
+        assert (found.input["samples_used"], found.lost) == (2 * COUNT // 3, {reason: 1})
+        assert list(found.predictions[0].spans.values()) == [
+            tuple(BASE_NS + index * STEP_NS for index in ends) for ends in ((0, 99), (200, 299))
+        ]
+        parts[1].unlink(missing_ok=True)
+    for part in (parts[0], parts[2]):
+        part.write_bytes(b"no recording at all")
+    with pytest.raises(RecordingError, match=str(tmp_path / "bag")):
+        analyse(tmp_path / "bag", scene=PAPER)

@@ -260,6 +260,8 @@ class Feed:
             No sample could be used.
         """
         for name, arrived, found in readings(messages, self.roles):
+            if arrived.after_hole:
+                self._hole()
             if found is not None:
                 self._take(name, *found, arrived.log_time_ns)
             else:
@@ -278,6 +280,14 @@ class Feed:
             )
         for walker in self.walkers:
             walker.close()
+
+    def _hole(self) -> None:
+        """Begin a new stretch: the load is not drawn over what is not there."""
+        self._steps.end()
+        self.flush()
+        if self._reached_ns is not None:
+            for walker in self.walkers:
+                walker.apply(Reset(self._reached_ns, "loss"))
 
     def _take(self, name: str, stamp_ns: int, values: dict[str, float], log_time_ns: int) -> None:
         if name == "travel":

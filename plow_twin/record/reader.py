@@ -328,7 +328,7 @@ class RunReader:
         known = sorted(self._headers[file].part for file in self.parts if file in self._headers)
         between = known[-1] - known[0] + 1 - len({number for number in there if known[0] <= number <= known[-1]})
         missing = missing_files(self._place, {file.name for file in self.foreign})
-        named = {_part_number(Path(name))[0] for name in missing} - there
+        named = {part_number(Path(name))[0] for name in missing} - there
         return between + sum(number >= 0 and not known[0] < number < known[-1] for number in named)
 
     @property
@@ -340,11 +340,11 @@ class RunReader:
 
     def number(self, file: Path) -> int:
         """Return the number of a part, by its header where that can be read."""
-        return self._headers[file].part if file in self._headers else _part_number(file)[0]
+        return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
         """Return where a file stands among the parts; of two of the same number the one that is named so is first."""
-        named = _part_number(file)[0]
+        named = part_number(file)[0]
         number = self.number(file)
         return number, named != number, file.name
 
@@ -632,7 +632,7 @@ def run_parts(path: Path) -> list[Path]:
         There are none.
     """
     if path.is_dir():
-        files = sorted(path.glob("*.mcap"), key=_part_number)
+        files = sorted(path.glob("*.mcap"), key=part_number)
         if not files:
             raise RecordingError(f"{path}: got no .mcap file, expected a recording")
         return files
@@ -646,7 +646,8 @@ def mcap_path(path: Path) -> Path:
     return run_parts(path)[0]
 
 
-def _part_number(path: Path) -> tuple[int, str]:
+def part_number(path: Path) -> tuple[int, str]:
+    """Return by what the parts of a recording are put in order: the number at the end of the name, and the name."""
     digits = re.search(r"(\d+)$", path.stem)
     return (int(digits[1]) if digits else -1, path.name)
 

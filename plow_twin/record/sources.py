@@ -11,17 +11,18 @@ import re
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import IO, Any, Final, Protocol, TypeAlias
 from urllib.parse import quote
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun
+from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun, is_mcap
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.metadata_yaml import missing_files
-from plow_twin.record.reader import run_parts
+from plow_twin.record.reader import part_number, run_parts
 from plow_twin.record.times import NO_TIME, STAMP_UNITS, TIMES, time_ns
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
@@ -59,6 +60,8 @@ class Arrived:
     content: Any
     #: a broker had kept it from before anybody listened
     retained: bool = False
+    #: messages before it are not there: a part is missing, or damaged
+    after_hole: bool = False
 
 
 @dataclass
@@ -93,14 +96,19 @@ def open_source(path: Path) -> Source:
         There is none that can be read.
     """
     if path.is_dir():
-        for pattern, kind in (("*.mcap", McapSource), ("*.db3", SqliteSource), ("*.csv", CsvSource)):
-            files = sorted(path.glob(pattern))
-            if files:
-                source = kind(run_parts(path) if kind is McapSource else files)
-                if missing := missing_files(path):
-                    source.losses.counts["missing_parts"] = len(missing)
-                return source
-        raise RecordingError(f"{path}: got a folder without .mcap, .db3 or .csv, expected a recording")
+        missing = [Path(name) for name in missing_files(path)]
+        source: Source
+        if any(path.glob("*.mcap")):
+            source = McapSource(run_parts(path), missing)
+        elif databases := list(path.glob("*.db3")):
+            source = SqliteSource(databases, missing)
+        elif tables := sorted(path.glob("*.csv")):
+            return CsvSource(tables)
+        else:
+            raise RecordingError(f"{path}: got a folder without .mcap, .db3 or .csv, expected a recording")
+        if missing:
+            source.losses.counts["missing_parts"] = len(missing)
+        return source
     if not path.is_file():
         raise RecordingError(f"{path}: no such recording")
     with path.open("rb") as stream:
@@ -156,18 +164,25 @@ class Decoder:
         return None
 
 
-class McapSource:
-    """MCAP files."""
+def _behind_holes(parts: Sequence[Path], missing: Sequence[Path]) -> set[Path]:
+    """Return the parts before which some are missing."""
+    order = sorted((*parts, *missing), key=part_number)
+    return {part for before, part in pairwise(order) if before in missing}
 
-    def __init__(self, parts: list[Path]) -> None:
+
+class McapSource:
+    """MCAP files, in order, of a recording without the files `missing`."""
+
+    def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = parts
         self.losses = Losses()
+        self._behind_holes = _behind_holes(parts, missing)
 
     def topics(self) -> dict[str, str]:
         """Return types by topic, from the first chunks of each part."""
         found: dict[str, str] = {}
         for part in self.parts:
-            if len(self.parts) > 1 and not is_begun(part):
+            if len(self.parts) > 1 and not (is_begun(part) and is_mcap(part)):
                 continue
             reader = ChunkReader(part)
             for number, _ in enumerate(reader):
@@ -179,13 +194,18 @@ class McapSource:
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
         decoder = Decoder(self.losses)
+        hole = False
         for part in self.parts:
-            if len(self.parts) > 1 and not is_begun(part):
-                self.losses.counts["truncated_files"] += 1
+            hole = hole or part in self._behind_holes
+            if len(self.parts) > 1 and not (is_begun(part) and is_mcap(part)):
+                self.losses.counts["damaged_files" if is_begun(part) else "truncated_files"] += 1
+                hole = True
                 continue
             reader = ChunkReader(part)
             known: dict[int, bool] = {}
+            damaged = 0
             for messages in reader:
+                hole, damaged = hole or reader.damaged > damaged, reader.damaged
                 for index, number in enumerate(messages.channel.tolist()):
                     channel = reader.channels.get(number)
                     if channel is None:
@@ -198,7 +218,9 @@ class McapSource:
                     content = decoder.decode(messages.data(index), channel.message_type)
                     if content is not None:
                         log_time = int(messages.log_time_ns[index])
-                        yield Arrived(channel.topic, log_time, content)
+                        yield Arrived(channel.topic, log_time, content, after_hole=hole)
+                        hole = False
+            hole = hole or not reader.finished or reader.damaged > damaged
             if not reader.finished:
                 self.losses.counts["truncated_files"] += 1
             if reader.damaged:
@@ -206,12 +228,14 @@ class McapSource:
 
 
 class SqliteSource:
-    """Files of rosbag2's sqlite3 storage."""
+    """Files of rosbag2's sqlite3 storage, of a recording without the files `missing`; a damaged one is left out."""
 
-    def __init__(self, parts: list[Path]) -> None:
-        self.parts = sorted(parts, key=lambda path: (len(path.name), path.name))
+    def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
+        self.parts = sorted(parts, key=part_number)
         self.losses = Losses()
         self._unread: set[Path] = set()
+        self._damaged: dict[Path, str] = {}
+        self._behind_holes = _behind_holes(parts, missing)
 
     def _open(self, path: Path) -> sqlite3.Connection:
         log = path.with_name(path.name + "-wal")  # of a recorder that was killed: what it wrote last
@@ -230,38 +254,53 @@ class SqliteSource:
         return connection
 
     def topics(self) -> dict[str, str]:
-        """Return types by topic."""
+        """Return types by topic.
+
+        Raises
+        ------
+        RecordingError
+            None of the files can be read.
+        """
         found: dict[str, str] = {}
         for part in self.parts:
-            try:
-                connection = self._open(part)
-                try:
-                    rows = connection.execute("SELECT name, type FROM topics")
-                    found |= {name: kind for name, kind in rows if isinstance(name, str) and isinstance(kind, str)}
-                finally:
-                    connection.close()
-            except _SQLITE_ERRORS as error:
-                raise RecordingError(f"{part}: not a recording of rosbag2: {error}") from error
+            with self._reading(part) as (_, topics):
+                found |= {name: kind for _, name, kind in topics}
+        if len(self._damaged) == len(self.parts):
+            part, why = next(iter(self._damaged.items()))
+            raise RecordingError(f"{part}: not a recording of rosbag2: {why}")
         return found
+
+    @contextmanager
+    def _reading(self, part: Path) -> Iterator[tuple[sqlite3.Connection | None, list[tuple[int, str, str]]]]:
+        """Open a file for a while and read its topics: number, name and type; None and nothing where it is damaged."""
+        topics: list[tuple[int, str, str]] = []
+        with ExitStack() as opened:
+            try:
+                connection = opened.enter_context(closing(self._open(part)))
+                rows = connection.execute("SELECT id, name, type FROM topics").fetchall()
+                topics = [row for row in rows if isinstance(row[1], str) and isinstance(row[2], str)]
+            except _SQLITE_ERRORS as error:
+                self._damaged[part] = str(error)
+                self.losses.counts["damaged_files"] = len(self._damaged)
+                yield None, topics
+                return
+            yield connection, topics
 
     def messages(self, wanted: Callable[[str], bool], stamp_ns: StampOf[Arrived] | None = None) -> Iterator[Arrived]:
         """Yield the messages on wanted topics."""
         decoder = Decoder(self.losses)
+        hole = False
         for part in self.parts:
-            try:
-                connection = self._open(part)
-            except _SQLITE_ERRORS as error:
-                raise RecordingError(f"{part}: cannot be opened: {error}") from error
-            try:
-                rows = connection.execute("SELECT id, name, type FROM topics").fetchall()
+            hole = hole or part in self._behind_holes
+            with self._reading(part) as (connection, topics):
+                if connection is None:
+                    hole = True
+                    continue
                 named = {
-                    number: (name, kind)
-                    for number, name, kind in rows
-                    if isinstance(name, str) and isinstance(kind, str) and wanted(name) and decoder.knows(name, kind)
+                    number: (name, kind) for number, name, kind in topics if wanted(name) and decoder.knows(name, kind)
                 }
-                cursor = connection.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id")
-                while rows := cursor.fetchmany(_ROWS):
-                    for number, stamp_ns, data in rows:
+                try:
+                    for number, stamp_ns, data in _rows(connection):
                         if number not in named:
                             continue
                         name, kind = named[number]
@@ -270,11 +309,18 @@ class SqliteSource:
                             continue
                         content = decoder.decode(data, kind)
                         if content is not None:
-                            yield Arrived(name, stamp_ns, content)
-            except (*_SQLITE_ERRORS, OverflowError):
-                self.losses.counts["truncated_files"] += 1
-            finally:
-                connection.close()
+                            yield Arrived(name, stamp_ns, content, after_hole=hole)
+                            hole = False
+                except (*_SQLITE_ERRORS, OverflowError):
+                    self.losses.counts["truncated_files"] += 1
+                    hole = True
+
+
+def _rows(connection: sqlite3.Connection) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield topic, time and data of all messages in order."""
+    cursor = connection.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id")
+    while rows := cursor.fetchmany(_ROWS):
+        yield from rows
 
 
 class CsvSource:
