@@ -10,16 +10,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from scenes import preset
 
-from plow_twin import Clearance, Table, Wear, simulate
+from plow_twin import Clearance, Table, Twin, Wear, simulate
 from plow_twin.cli.app import run as cli
 from plow_twin.estimate.coefficient import History, coefficient
 from plow_twin.estimate.forecast import Plan, Scenario, forecast, with_clearances, with_estimate
 from plow_twin.estimate.life import LifeError, mean_forces, period_of, wear_path
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
+from plow_twin.record.estimated import left_by
+from plow_twin.record.reader import RunReader
 from plow_twin.scene_file import dump_scene
+from plow_twin.stream.journal import Estimated, SetModel, SetWear
+from plow_twin.stream.session import Session
 
 #: Wear so fast that a life fits into a simulation of a minute: 1 mm in some 20 s.
 FAST = Wear(1e-8, 1.0, 0.2)
@@ -144,10 +149,34 @@ def test_an_estimated_clearance_holds_the_wear_that_there_is() -> None:
     assert found.clearances(np.zeros(1))[1, 0] == pytest.approx([0.029, 0.034], abs=5e-5)
 
 
+def test_of_a_run_the_pads_as_it_left_them_count_and_no_estimate_of_others(tmp_path: Path) -> None:
+    facts = {
+        name: {"mean_m": 0.029, "p05_m": 0.0289, "p95_m": 0.0291, "state": "estimated"}
+        for name in ("horizontal", "vertical")
+    }
+    of_old_pads = Estimated(BASE_NS, BASE_NS + 1, 2, 20, (), (0.0,) * 6, json.dumps(facts))
+    depth = tuple(1e-4 * count for count in range(8))
+    changes = SetModel(BASE_NS, json.dumps({"clearance.vertical_m": 0.031}))
+    entries = [paper_sample(0), of_old_pads, changes, paper_sample(1), SetWear(BASE_NS + STEP_NS, depth, "measured")]
+    record_run(tmp_path / "set", [*entries, paper_sample(2)], wear=Wear(1e-14, 0.015, 2.0))
+    scene, newest = left_by(RunReader(tmp_path / "set"))
+    assert newest is None and scene.clearance.vertical_m == 0.031
+    assert scene.wear is not None and scene.wear.initial_depth_m == pytest.approx(depth, abs=1e-12)
+    # the wear that a run began with, from the folder that keeps it, stands in its first snapshot
+    session = Session(Twin(scene, excitation="sampled"), wear_depth=depth)
+    record_run(tmp_path / "kept", [session.snapshot(), paper_sample(0), of_old_pads], wear=Wear(1e-14, 0.015, 2.0))
+    scene, newest = left_by(RunReader(tmp_path / "kept"))
+    assert newest == of_old_pads
+    assert scene.wear is not None and scene.wear.initial_depth_m == pytest.approx(depth, abs=1e-12)
+
+
 def test_a_scene_without_wear_or_period_is_refused() -> None:
     scene = preset("paper")
     with pytest.raises(LifeError, match="wear: got none"):
         forecast(scene, Plan(0.03, 0.03, 100.0))
+    for unlikely in (0.0, 5e-13):
+        with pytest.raises(LifeError, match=r"expected one within wear\.prior_m2_n, 1e-15 to 1e-13"):
+            forecast(replace(scene, wear=Wear(unlikely, 0.015, 2.0)), Plan(0.03, 0.03, 100.0))
     with pytest.raises(LifeError, match="loads: got no harmonic"):
         mean_forces(replace(scene, loads=()), np.zeros(8))
 
@@ -155,7 +184,7 @@ def test_a_scene_without_wear_or_period_is_refused() -> None:
 def test_a_history_of_clearances_tells_the_coefficient(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The truth is a direct run, which shares no jump with the estimate; its coefficient is not the prior's middle."""
     true_k = 1.8e-9
-    scene = replace(preset("paper"), wear=replace(FAST, prior_m2_n=(2.5e-10, 4e-9)))
+    scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     worn = replace(scene, wear=replace(FAST, coefficient_m2_n=true_k))
     spans = np.arange(0.0, 25.0, 4.0) * period_of(scene)
     depth = np.array([np.zeros(8), *(simulate(worn, span, span, 1e-6).wear_depth for span in spans[1:])])
@@ -221,7 +250,7 @@ def test_a_clearance_hardly_known_is_none_below_zero() -> None:
 
 def test_a_history_that_the_prior_does_not_allow_is_refused() -> None:
     """All of the posterior lay at the end of the grid: an interval of no width, and none of the truth."""
-    scene = replace(preset("paper"), wear=replace(FAST, prior_m2_n=(2.5e-10, 4e-9)))
+    scene = replace(preset("paper"), wear=replace(FAST, coefficient_m2_n=1e-9, prior_m2_n=(2.5e-10, 4e-9)))
     travel = np.arange(5) * 10.0
     still = np.tile([0.025, 0.030], (5, 1))
     with pytest.raises(LifeError, match="expected a wider wear"):

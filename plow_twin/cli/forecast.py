@@ -69,7 +69,8 @@ def forecast(
 ) -> int:
     """Forecast when a clearance of SCENE, which has a section `wear`, reaches its limit.
 
-    SCENE is a scene file, a preset, or a run of ours: of that the scene, and the newest estimate of its node.
+    SCENE is a scene file, a preset, or a run of ours: of that the scene with the pads as worn as the run left them, and
+    the newest estimate of its node since these pads were set.
     """
     from plow_twin.estimate.coefficient import coefficient
     from plow_twin.estimate.forecast import Plan, Scenario, with_clearances
@@ -119,21 +120,18 @@ def forecast(
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene, and of a run the newest estimate and what of its journal is lost."""
+    """Return the scene, of a run as left, the newest estimate of these pads, and what is lost of the journal."""
+    from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene
-    from plow_twin.stream.journal import Estimated
 
     if not Path(name).exists() or own_run(Path(name)) is None:
         return load_scene(scene_path(name)), None, {}
     reader = RunReader(Path(name))
-    newest = None
-    for batch in reader.batches(outputs=False):
-        for entry in batch.entries.others.values():
-            newest = entry if isinstance(entry, Estimated) else newest
+    left, newest = left_by(reader)
     counts = {"journal": reader.lost.get("journal", 0), "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
     lost = {topic: count for topic, count in counts.items() if count}
-    return reader.header.scene(reader.path), None if newest is None else json.loads(newest.result), lost
+    return left, None if newest is None else json.loads(newest.result), lost
 
 
 def _estimate(path: Path) -> Any:

@@ -18,7 +18,7 @@ from plow_twin.estimate.coefficient import PATH_DEVIATION, Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, State
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
-from plow_twin.model.scene import Clearance, Scene, Table
+from plow_twin.model.scene import Clearance, Scene, Table, Wear
 
 Array = NDArray[np.float64]
 
@@ -192,7 +192,7 @@ def forecast(
     Raises
     ------
     LifeError
-        Where the scene has no wear, does not travel or has no period.
+        Where the scene has no wear, does not travel or has no period, or its coefficient lies outside the prior.
     """
     others = {
         one.name: _forecast(with_load(scene, one.load), plan, deviation_m, known, one.coefficient)
@@ -210,6 +210,8 @@ def _forecast(
         raise LifeError("wear: got none or no travel speed, expected both")
     if not all(0.0 <= value < math.inf for value in deviation_m):
         raise LifeError(f"deviations: got {deviation_m} m, expected two finite ones >= 0")
+    if known is None:
+        check_prior(wear)
     low, high = (math.log(value) for value in wear.prior_m2_n)
     travel = plan.horizon_h * HOUR_S * wear.travel_speed_m_s
     rng = np.random.default_rng(plan.seed)
@@ -237,6 +239,16 @@ def _forecast(
     hours = needed / rate
     reached = np.where(hours <= plan.horizon_h, hours, np.inf)
     return Forecast(reached, rate, size + now, wear.travel_speed_m_s, plan, path)
+
+
+def check_prior(wear: Wear) -> None:
+    """Raise LifeError for a coefficient that contradicts its prior, of which a forecast without a history is made."""
+    low, high = wear.prior_m2_n
+    if not low <= wear.coefficient_m2_n <= high:
+        raise LifeError(
+            f"wear.coefficient_m2_n: got {wear.coefficient_m2_n:g} m^2/N, expected one within wear.prior_m2_n, {low:g} "
+            f"to {high:g}: the forecast draws from that prior"
+        )
 
 
 def _exposure_at(exposure: Array, clearance: Array, limit: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from plow_twin.errors import Problem
 from plow_twin.estimate.answer import Asked
 from plow_twin.estimate.forces import FEWEST
-from plow_twin.estimate.forecast import HOUR_S, Plan, Scenario
+from plow_twin.estimate.forecast import HOUR_S, Plan, Scenario, check_prior
 from plow_twin.estimate.life import LifeError
 from plow_twin.estimate.result import Interval, State
 from plow_twin.estimate.window import Windows
@@ -236,6 +236,11 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
         found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))
     if any(limits) and (scene.wear is None or scene.wear.travel_speed_m_s <= 0.0):
         found.append(Problem("forecast_limits", limits, "0 where the scene has no wear or no travel speed"))
+    if any(limits) and scene.wear is not None:
+        try:
+            check_prior(scene.wear)
+        except LifeError as error:
+            found.append(Problem("forecast_limits", limits, f"0 with this scene: {error}"))
     if any(limits) and settings.forecast_stop > settings.forecast_horizon:
         expected = f"at most forecast_horizon, {settings.forecast_horizon:g} s"
         found.append(Problem("forecast_stop", settings.forecast_stop, expected))

@@ -1,15 +1,29 @@
-"""The estimates of a live node, made again from its journal."""
+"""The estimates of a live node, made again from its journal, and what a run has left."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from plow_twin.estimate.measurements import UNSTATED, Deviation
 from plow_twin.estimate.window import Window, Windows
+from plow_twin.model.scene import Scene
 from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import Estimated, Gaps, PartOfPose, Pose, Reset, SetWear, Spread, whole_pose
+from plow_twin.stream.journal import (
+    Estimated,
+    Gaps,
+    PartOfPose,
+    Pose,
+    Reset,
+    SetModel,
+    SetWear,
+    Snapshot,
+    Spread,
+    whole_pose,
+)
+from plow_twin.stream.model_changes import changed_scene, read_changes
+from plow_twin.stream.session import wear_in
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +70,27 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
                 case Estimated(end_ns=end_ns) as entry:
                     yield LiveEstimate(entry, _whole(formed.get(end_ns), entry))
                     formed = {end: window for end, window in formed.items() if end > end_ns}
+
+
+def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
+    """Return the scene as a run left it, worn pads and changed numbers, and the newest estimate of these pads."""
+    scene, newest = reader.header.scene(reader.path), None
+    depth, changes = None, dict[str, float]()
+    for batch in reader.batches(outputs=False):
+        for _, entry in sorted(batch.entries.others.items()):
+            match entry:
+                case Estimated():
+                    newest = entry
+                case SetWear(_, set_depth):
+                    newest, depth = None, set_depth
+                case SetModel(_, text):
+                    changes = read_changes(text)
+                case Snapshot(_, data):
+                    depth = wear_in(data)
+    scene = changed_scene(scene, changes)
+    if depth is not None and scene.wear is not None:
+        scene = replace(scene, wear=replace(scene.wear, initial_depth_m=depth))
+    return scene, newest
 
 
 def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:

@@ -610,3 +610,10 @@ class Session:
         self.origin_ns = origin_ns if known else self.origin_ns
         self.stamp_ns = stamp_ns if known else None
         self._advances, self.held, self._speed = advances, held, speed
+
+
+def wear_in(snapshot: bytes) -> tuple[float, ...]:
+    """Return the wear depths of the eight pads in m that a snapshot of a session holds."""
+    travels = _HEADER.unpack_from(snapshot)[-1]
+    depth: list[float] = np.frombuffer(snapshot, np.float64, PAIR_COUNT, _HEADER.size + travels * _TRAVEL.size).tolist()
+    return tuple(depth)
