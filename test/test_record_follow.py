@@ -13,7 +13,7 @@ import pytest
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.follow import Tail
+from plow_twin.record.follow import Tail, claim
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.running import find_run
 
@@ -21,6 +21,8 @@ COUNT = 3000
 
 
 def test_a_follower_sees_every_sample_of_every_part_and_ends_with_the_run(tmp_path: Path) -> None:
+    before = record_run(tmp_path / "before", map(paper_sample, range(10)))
+    assert sum(len(batch.entries) for batch in RunReader(before.folder, Tail()).batches())  # compiles what reads
     options = {"part_bytes": 100_000, "flush_period_s": 0.05}
     writer = threading.Thread(
         target=record_run, args=(tmp_path / "run", map(paper_sample, range(COUNT))), kwargs=options
@@ -37,6 +39,17 @@ def test_a_follower_sees_every_sample_of_every_part_and_ends_with_the_run(tmp_pa
     assert stamps == [BASE_NS + index * STEP_NS for index in range(COUNT)]
     assert len(reader.parts) > 3 and pauses > 1 and reader.status is FileStatus.COMPLETE
     assert sent == sum(sum(map(len, batch.outputs)) for batch in RunReader(tmp_path / "run").batches()) > 3 * COUNT
+
+
+def test_a_follower_waits_for_an_end_of_which_only_a_part_is_written(tmp_path: Path) -> None:
+    file = record_run(tmp_path / "run", map(paper_sample, range(10))).file
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-3])
+    with file.open("ab", buffering=0) as writer:
+        claim(writer.fileno())
+        reader = RunReader(file, Tail(lambda: not writer.write(whole[-3:])))
+        assert sum(len(batch.entries) for batch in reader.batches()) > 10
+    assert file.read_bytes() == whole and reader.status is FileStatus.COMPLETE
 
 
 WRITER = """

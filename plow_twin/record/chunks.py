@@ -37,6 +37,8 @@ _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: A head and the number that an index record begins with [B].
 _INDEX_HEAD: Final = _HEAD.size + 2
+#: Channels that have a bit each.
+_CHANNEL_BITS: Final = 63
 #: Heads of records looked up at once.
 _AHEAD: Final = 64
 #: The system's, to be called from compiled code: a recording has more heads than chunks that are opened.
@@ -129,13 +131,14 @@ class ChunkReader:
         with open_mcap(self.path) as stream:
             descriptor = stream.fileno()
             size = os.fstat(descriptor).st_size
-            heads, place = _Heads(descriptor), len(MAGIC)
+            heads, place = _Heads(descriptor, size), len(MAGIC)
             while True:
-                opcode, length, _ = heads.at(place)
+                opcode, length = heads.at(place)
                 begin = place + _HEAD.size
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
-                if begin + length > size:
+                behind = len(MAGIC) if opcode == _FOOTER else 0  # a writer may have come as far as between the two
+                if begin + length + behind > size:
                     if self.more is None:
                         break
                     yield from self._scan([*opened, *map(_bytes, loose)], schemas)
@@ -143,7 +146,8 @@ class ChunkReader:
                     yield Messages.none()
                     if not self.more(stream, size):
                         break
-                    size, heads = os.fstat(descriptor).st_size, _Heads(descriptor)
+                    size = os.fstat(descriptor).st_size
+                    heads = _Heads(descriptor, size)
                     continue
                 place = self.position = begin + length
                 if opcode == _MESSAGE:
@@ -158,8 +162,8 @@ class ChunkReader:
                     yield from self._scan(opened, schemas)
                     opened = []
                 if opcode == _CHUNK:
-                    numbers, place = heads.indexed(place, size)
-                    if not self._is_wanted(numbers):
+                    channels, place = heads.index()
+                    if not self._is_wanted(channels):
                         continue
                     content = self._open(os.pread(descriptor, length, begin))
                     if content is None or len(content) > _SMALL:
@@ -182,9 +186,12 @@ class ChunkReader:
                 opened.append(np.frombuffer(b"".join(loose), np.uint8))
             yield from self._scan(opened, schemas)
 
-    def _is_wanted(self, numbers: set[int]) -> bool:
-        """Ask for a chunk by the channels in its index; without one the chunk is wanted."""
-        return self.wanted is None or not numbers or not numbers <= self.channels.keys() or self.wanted(numbers)
+    def _is_wanted(self, channels: int) -> bool:
+        """Ask for a chunk by the channels in its index, a bit each; without one the chunk is wanted."""
+        if self.wanted is None or channels <= 0:
+            return True
+        numbers = {number for number in range(channels.bit_length()) if channels >> number & 1}
+        return not numbers <= self.channels.keys() or self.wanted(numbers)
 
     def _open(self, record: bytes) -> Bytes | None:
         """Return what a chunk holds, or None when it is damaged."""
@@ -326,52 +333,61 @@ def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
 class _Heads:
     """The heads of a file's records one after the other, looked up many at a time."""
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-        self._table = np.empty((_AHEAD, 4), np.int64)
-        self._rows: list[tuple[int, int, int, int]] = []
+    def __init__(self, descriptor: int, size: int) -> None:
+        self._descriptor, self._size = descriptor, size
+        self._table = np.empty((_AHEAD, 5), np.int64)
+        self._rows: list[tuple[int, int, int, int, int]] = []
         self._next = 0
+        self._index = [0, 0]  # end of the newest record with its index, and the channels in it
 
-    def at(self, place: int) -> tuple[int, int, int]:
-        """Return opcode and length of the record at a place, and the number its content begins with; zeros for none."""
+    def at(self, place: int) -> tuple[int, int]:
+        """Return opcode and length of the record at a place; zeros for none."""
         if self._next >= len(self._rows) or self._rows[self._next][0] != place:
-            count = look_ahead(self._descriptor, place, self._table)
+            count = look_ahead(self._descriptor, self._size, place, self._table)
             self._rows, self._next = self._table[:count].tolist(), 0
             if not self._rows:
                 os.pread(self._descriptor, 1, place)  # whoever has no more bytes for a reason says it here
-                return 0, 0, 0
-        _, opcode, length, number = self._rows[self._next]
+                return 0, 0
+        _, opcode, length, *self._index = self._rows[self._next]
         self._next += 1
-        return opcode, length & (1 << 64) - 1, number
+        return opcode, length & (1 << 64) - 1
 
-    def indexed(self, place: int, size: int) -> tuple[set[int], int]:
-        """Return the channels in the index records from `place` on, and where these end."""
-        numbers: set[int] = set()
-        while place + _INDEX_HEAD <= size:
-            opcode, length, number = self.at(place)
-            if opcode != _MESSAGE_INDEX or place + _HEAD.size + length > size:
-                self._next = max(self._next - 1, 0)  # it is asked for again
-                break
-            numbers.add(number)
-            place += _HEAD.size + length
-        return numbers, place
+    def index(self) -> tuple[int, int]:
+        """Return the channels, a bit each, in the index records behind the newest chunk, and where these end.
+
+        -1: a channel has no bit.
+        """
+        end, channels = self._index
+        return channels, end
 
 
 @compiled
-def look_ahead(descriptor, place, table):  # type: ignore[no-untyped-def]
-    """Fill rows with place, opcode, length and first number of the records from `place` on; return how many."""
+def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
+    """Fill rows with place, opcode, length, end and channels of the records from `place` on; return how many.
+
+    The index records behind a chunk have no rows: they count to its end, and their channels, a bit each, are the row's
+    (-1: there is one beyond the bits).
+    """
     head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
-    while count < len(table):
+    while True:
         read = _pread(descriptor, head.ctypes.data, head.size, place)
         if read < _HEAD_SIZE:
             break
-        length = word(head, 1)
-        table[count, 0], table[count, 1], table[count, 2] = place, head[0], length
-        table[count, 3] = np.int64(head[9]) | np.int64(head[10]) << 8
-        count += 1
-        if length < 0 or place + _HEAD_SIZE + length < 0:
+        length, end = word(head, 1), place + _HEAD_SIZE + word(head, 1)
+        whole = length >= 0 and place < end <= size
+        if whole and head[0] == _MESSAGE_INDEX and read == _INDEX_HEAD and count > 0 and table[count - 1, 1] == _CHUNK:
+            number = np.int64(head[9]) | np.int64(head[10]) << 8
+            table[count - 1, 3] = end
+            table[count - 1, 4] = -1 if number >= _CHANNEL_BITS else table[count - 1, 4] | np.int64(1) << number
+        elif count == len(table):
             break
-        place += _HEAD_SIZE + length
+        else:
+            table[count, 0], table[count, 1], table[count, 2] = place, head[0], length
+            table[count, 3], table[count, 4] = end, 0
+            count += 1
+        if length < 0 or end < 0:
+            break
+        place = end
     return count
 
 

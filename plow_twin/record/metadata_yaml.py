@@ -12,6 +12,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.durable import sync_path
 from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.scene_file.yaml_text import load_yaml as read_yaml
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
@@ -55,10 +56,17 @@ def qos_text(message_type: str) -> str:
 
 
 def load_yaml(text: str) -> Any:
-    """Return what YAML holds."""
-    from ruamel.yaml import YAML
+    """Return what YAML holds, read as a scene is: by libyaml where it is there.
 
-    return YAML(typ="safe").load(text)
+    Raises
+    ------
+    RecordingError
+        It is no YAML.
+    """
+    found, problems = read_yaml(text, "metadata", "those of a bag")
+    if problems:
+        raise RecordingError(f"{problems[0]}")
+    return found
 
 
 def dump_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:

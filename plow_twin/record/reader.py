@@ -114,6 +114,11 @@ class Entries:
             {index - first: entry for index, entry in self.rest.items() if first <= index < last},
         )
 
+    def samples(self) -> tuple[Indexes, NDArray[np.float64]]:
+        """Return stamps and wrenches of the samples alone."""
+        places = np.flatnonzero(self.sample)
+        return self.stamp_ns[places], self.wrench.take(places, axis=0)  # a mask of rows takes five times as long
+
     @cached_property
     def others(self) -> Mapping[int, Entry | Dropped]:
         """All entries that are no samples, by index."""

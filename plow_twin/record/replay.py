@@ -238,7 +238,7 @@ class _Replay:
         """Apply a run of samples and digests at once and compare what was sent; False: nothing was done."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
-        stamps = entries.stamp_ns[entries.sample]
+        stamps, wrench = entries.samples()
         before = self.session.snapshot(), self.session.outputs.pending, self.session.origin_ns
         self.messages, self.publications = None, None
         rows: bool | NDArray[np.void] = False
@@ -247,7 +247,7 @@ class _Replay:
                 self.rows = np.zeros(len(stamps), ROW)
             rows = self.rows
         try:
-            found = self.session.advance_marked(stamps, entries.wrench[entries.sample], done[digests], rows=rows)
+            found = self.session.advance_marked(stamps, wrench, done[digests], rows=rows)
         except ValueError:  # one by one: the sample that is refused is counted
             return False
         if found.status.any():

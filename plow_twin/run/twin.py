@@ -48,6 +48,8 @@ DEFAULT_BUDGET = 50_000_000
 _STOCK = 256
 #: Time, load before and at a sample, as the kernels take them; a load.
 _SAMPLE, _LOAD = struct.Struct("=7d"), struct.Struct("=3d")
+#: Kernels by what the types of their arguments follow from: to look at these takes milliseconds.
+_entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
@@ -261,7 +263,7 @@ class Twin:
         rows = self._stock.pop()
         arguments = *self._before_row, rows, *self._after_row
         if self._advance_one is None:
-            self._advance_one = for_arguments(loop.advance_batch, arguments)
+            self._advance_one = self._entry(loop.advance_batch, arguments)
         self._in_slices(self._advance_one, arguments, self._times, None, rows[0])
         _LOAD.pack_into(self._load.data, 0, fx, fy, moment)
         self._wrench = self._load
@@ -294,9 +296,7 @@ class Twin:
         if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
             raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
         rows = np.zeros(len(times), ROW)
-        ends = np.empty((1, len(times) + 1, 3))
-        ends[0, 0], ends[0, 1:] = self._wrench, samples
-        wrenches, members = ends / self._inertias, rows[None]
+        wrenches, members = self._per_inertia(samples)[None], rows[None]
         self._in_slices(loop.advance_batch, (
             self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, times,
             wrenches, self._budget, members, self._bound, self._pace.record,
@@ -342,14 +342,16 @@ class Twin:
         if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
             raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
         out = None if rows is False else np.zeros(len(t), ROW) if rows is True else rows[: len(t)]
+        times, marks = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(marks, np.int64)
         totals = None if out is None else self._all_totals
         status = np.zeros(len(t), np.int64)
         snapshots = np.zeros(len(marks), self._states.dtype)
-        per = np.concatenate([self._wrench[None], wrench]) / self._inertias
-        self._in_slices(loop.advance_marked, (
-            self._params, self._parts, self._states, self._pace.saved, self._works, totals, t, per,
-            self._budget, marks, snapshots, status, out, self._pace.record,
-        ), t, wrench, out)  # fmt: skip
+        per = self._per_inertia(wrench)
+        arguments = (
+            self._params, self._parts, self._states, self._pace.saved, self._works, totals, times, per,
+            self._budget, marks, snapshots, status, out, self._pace.argument,
+        )  # fmt: skip
+        self._in_slices(self._entry(loop.advance_marked, arguments, out is None), arguments, times, wrench, out)
         self._wrench = wrench[-1].copy() if len(wrench) else self._wrench
         digests = self._digests(snapshots, wrench[marks - 1])
         if out is not None:
@@ -471,6 +473,21 @@ class Twin:
     def bounded(self) -> int:
         """Advances so far whose end was coarse because of `max_evaluations`."""
         return int(self._state.bounded)
+
+    def _entry(self, kernel: Callable[..., bool], arguments: tuple[Any, ...], *kind: bool) -> Callable[..., bool]:
+        """Return a kernel compiled for its arguments, whose types follow from the signature and `kind`."""
+        key = kernel, self.signature, kind
+        if key not in _entries:
+            _entries[key] = for_arguments(kernel, arguments)
+        return _entries[key]
+
+    def _per_inertia(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the last sample and those that follow (n, 3) per mass and inertia, shape (n + 1, 3)."""
+        per = np.empty((len(samples) + 1, 3))
+        per[0], per[1:] = self._wrench, samples
+        for column, inertia in zip(per.T, self._inertia_numbers, strict=True):  # six times as fast as rows of three
+            column /= inertia
+        return per
 
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
         """Return what `digest` would be at some states with their last samples, shape (m, 3)."""

@@ -32,8 +32,10 @@ _CLEARANCES: Final = ("horizontal", "vertical", *PAD_NAMES)
 #: The names of `clearance`: the best values, then the 5 % and 95 % points of each.
 CLEARANCE_NAMES: Final = (*_CLEARANCES, *(f"{name}/{point}" for name in _CLEARANCES for point in ("p05", "p95")))
 
-_LEFT, _RIGHT = NORMAL_X < 0.0, NORMAL_X > 0.0
-_TOP, _BOTTOM = NORMAL_Y > 0.0, NORMAL_Y < 0.0
+#: The two pads on each side: left, right, top, bottom.
+_ON_SIDES: Final = np.array(
+    [np.flatnonzero(side) for side in (NORMAL_X < 0.0, NORMAL_X > 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)]
+)
 _STATE_SIZE: Final = 4 * PAIR_COUNT
 
 
@@ -167,10 +169,12 @@ def clearances(scene: Scene, wear_depth: Array) -> Array:
 
     A side's walls move out by the mean wear depth of the two pads on it.
     """
-    left, right, top, bottom = (wear_depth[..., side].mean(axis=-1) for side in (_LEFT, _RIGHT, _TOP, _BOTTOM))
-    horizontal = scene.clearance.horizontal_m + left + right
-    vertical = scene.clearance.vertical_m + top + bottom
-    return np.concatenate((np.stack((horizontal, vertical), axis=-1), wear_depth), axis=-1)
+    moved = 0.5 * (wear_depth[..., _ON_SIDES[:, 0]] + wear_depth[..., _ON_SIDES[:, 1]])
+    found = np.empty((*wear_depth.shape[:-1], len(_CLEARANCES)))
+    found[..., 0] = scene.clearance.horizontal_m + moved[..., 0] + moved[..., 1]
+    found[..., 1] = scene.clearance.vertical_m + moved[..., 2] + moved[..., 3]
+    found[..., 2:] = wear_depth
+    return found
 
 
 def prior_points(scene: Scene, wear_depth: Array) -> tuple[Array, Array]:
@@ -430,12 +434,7 @@ class Outputs:
         if before_ns is not None and stamps[0] > before_ns:
             elapsed_s[0], grown[0] = (stamps[0] - before_ns) * 1e-9, wear_depth[0] - wear_before
         self._slow_ns, self._slow_wear_depth = int(stamps[-1]), wear_depth[-1].copy()
-        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
-        intervals = np.stack((low, high), axis=-1).reshape(len(wear_depth), -1)
-        clearance = np.concatenate((clearances(self._scene, wear_depth), intervals), axis=-1)
-        if self._shift is not None:
-            clearance += self._shift
-        return index, clearance, grown / elapsed_s[:, None]
+        return index, self._clearance(wear_depth), grown / elapsed_s[:, None]
 
     def _is_slow_due(self) -> bool:
         before_ns = self._slow_ns
@@ -447,12 +446,18 @@ class Outputs:
         if before_ns is not None and self._stamp_ns > before_ns:
             grown, elapsed_s = wear_depth - self._slow_wear_depth, (self._stamp_ns - before_ns) * 1e-9
         self._slow_ns, self._slow_wear_depth = self._stamp_ns, wear_depth.copy()
-        low, high = (clearances(self._scene, points) for points in prior_points(self._scene, wear_depth))
-        intervals = np.stack((low, high), axis=1).ravel()
-        clearance = np.concatenate((clearances(self._scene, wear_depth), intervals))
+        return Slow(self._clearance(wear_depth), grown / elapsed_s)
+
+    def _clearance(self, wear_depth: Array) -> Array:
+        """Return what `CLEARANCE_NAMES` name, shape (..., 30) [m], from (..., 8)."""
+        best, points = clearances(self._scene, wear_depth), prior_points(self._scene, wear_depth)
+        low, high = (best if depth is wear_depth else clearances(self._scene, depth) for depth in points)
+        count = len(_CLEARANCES)
+        found = np.empty((*wear_depth.shape[:-1], 3 * count))
+        found[..., :count], found[..., count::2], found[..., count + 1 :: 2] = best, low, high
         if self._shift is not None:
-            clearance += self._shift
-        return Slow(clearance, grown / elapsed_s)
+            found += self._shift
+        return found
 
     def modelled(self, wear_depth: Array) -> Array:
         """Return the horizontal clearance of the model and its two points, then the vertical ones, shape (6,) [m]."""
