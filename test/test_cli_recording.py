@@ -34,12 +34,14 @@ SAMPLES = 600
         (["view", "RUN", "--follow", "--web", "--out", "x.rrd"], "--follow goes into --out or to --web, not both"),
         (["analyse", "RUN", "--watch", "1", "--workers", "2"], "--watch cannot be combined with --dask or --workers"),
         (["analyse", "RUN", "--dask", "tcp://127.0.0.1:1"], "--dask: got one recording, expected many"),
+        (["analyse", "RUN", "--workers", "2"], "--workers: got one recording, expected many"),
+        (["analyse", "RUN/..", "--workers", "2", "--dask", "tcp://127.0.0.1:1"], "--workers cannot be combined"),
     ],
 )
 def test_options_that_would_be_left_out_are_refused(
     given: list[str], expected: str, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli([str(run.folder) if word == "RUN" else word for word in given]) == 2
+    assert cli([word.replace("RUN", str(run.folder)) for word in given]) == 2
     assert expected in " ".join(capsys.readouterr().err.split())
 
 

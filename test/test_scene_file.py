@@ -210,6 +210,23 @@ def test_table_from_a_file_stands_in_the_dump(tmp_path: Path) -> None:
         assert table.hold == "zero"
 
 
+def test_a_table_is_read_as_any_other_csv_file(tmp_path: Path) -> None:
+    """A mark of the byte order was a part of `t`, and semicolons were no columns."""
+    scene = MINIMAL + "loads: [{name: cut, table: {file: load.csv}}]"
+    for text in (
+        "time;fx;fy;m\r\n0;1,5;2;3\r\n\r\n0,5;1;-2,25;3\r\n",
+        "\ufefft\tfx\tfy\tm\n0\t1,5\t2\t3\n0,5\t1\t-2,25\t3\n",
+    ):
+        (tmp_path / "load.csv").write_text(text, encoding="utf-8", newline="")
+        (table,) = loads_scene(scene, tmp_path).loads
+        assert isinstance(table, Table)
+        np.testing.assert_array_equal(table.t, [0.0, 0.5])
+        np.testing.assert_array_equal(table.wrench, [[1.5, 2.0, 3.0], [1.0, -2.25, 3.0]])
+    (tmp_path / "load.csv").write_text("t;fx;fy;fx;m\n")
+    with pytest.raises(SceneError, match="expected a header line with t, fx, fy, m, each once"):
+        loads_scene(scene, tmp_path)
+
+
 def test_bad_rows_of_a_table_are_named(tmp_path: Path) -> None:
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,1,2,3\n1,1,x,3\n2,1\n")
     with pytest.raises(SceneError) as caught:

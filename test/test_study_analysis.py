@@ -32,7 +32,7 @@ from plow_twin.stream.journal import Entry, Pose
 from plow_twin.study.analysis import loads, thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
 from plow_twin.study.analysis.loads import reversals
-from plow_twin.study.analysis.report import _write_tables
+from plow_twin.study.analysis.report import _write_tables, write_report
 from plow_twin.study.analysis.signals import compare
 
 COUNT = 8000
@@ -154,6 +154,14 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(
     assert found.lost == {"measured_implausible": 1} and found.lossy
     facts = json.loads(json.dumps(found.facts(), allow_nan=False))
     assert facts["signals"]["x"]["n"] == 39 and facts["lost"] == found.lost
+    assert "outside" not in facts
+    late = ((t + 0.3, x, "", "") if t < 0.3 else (t + 1e6, "", y, "") for t, (x, y, _) in poses)
+    pose.write_text("t,x,y,theta\n" + "".join(f"{t},{x},{y},{theta}\n" for t, x, y, theta in late))
+    found = analyse(tmp_path, scene=PAPER, out=tmp_path / "out")
+    assert found.facts()["outside"] == {"x": 10, "y": 11} and found.facts()["signals"]["x"]["n"] == 18
+    assert found.lost == {"measured_implausible": 1, "measured_outside_the_load": 11}  # y, of which no value is inside
+    write_report(found, tmp_path / "out")
+    assert "outside the time of the load" in (tmp_path / "out" / "report.html").read_text()
     pose.write_text("t,x,y,theta\n" + "".join(f"{t + 1e6},{0},{y},{theta}\n" for t, (_, y, theta) in poses))
     found = analyse(tmp_path, scene=PAPER)
     assert found.lost == {"measured_outside_the_load": 120} and found.lossy and found.facts()["signals"] == {}
@@ -190,6 +198,42 @@ def test_poses_in_the_journal_are_measured_ones(tmp_path: Path) -> None:
     assert {name: one.n for name, one in found.comparisons(found.predictions[0]).items()} == dict.fromkeys(
         ("x", "y", "theta"), len(range(20, 500, 21))
     )
+
+
+def test_messages_beside_a_run_that_do_not_fit_are_counted_by_topic(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(100)))
+    messages = [("/pose", pose_message(0 if i == 3 else BASE_NS + i * 10**7, (1e-3, 0.0, 0.0))) for i in range(10)]
+    with Writer(run.folder / "beside", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/pose", "geometry_msgs/msg/PoseStamped", typestore=STORE)
+        for number, (_, data) in enumerate(messages):
+            writer.write(connection, BASE_NS + number * 10**7, data)
+    found = analyse(run.folder)
+    assert found.lost == {"unfit, head_pose: /pose has stamps of 0": 1}
+    (mapping := tmp_path / "map.yaml").write_text("head_pose: {topic: /pose, fields: {x: pose.x}}")
+    found = analyse(run.folder, mapping=mapping)
+    assert found.lost == {"unfit, head_pose: /pose has no number at 'pose.x' for x": 10} and found.lossy
+
+
+def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "load.csv").write_text("zeit,fx,fy,m\n" + "".join(f"{t},0,0,0\n" for t in range(100)))
+    mapping = tmp_path / "map.yaml"
+    for stamp, said in (
+        ("", "names its column too: the columns zeit, fx, fy, m have none of"),
+        ("stamp: log, ", "none"),
+    ):
+        mapping.write_text(f"excitation: {{topic: load, {stamp}stamp_unit: ms}}")
+        with pytest.raises(RecordingError, match=f"excitation: stamp_unit: got 'ms', expected .*{said}"):
+            analyse(tmp_path, scene=PAPER, mapping=mapping)
+    mapping.write_text("excitation: {topic: load, stamp: zeit, stamp_unit: ms}")
+    assert analyse(tmp_path, scene=PAPER, mapping=mapping).predictions[0].loads.duration_s == pytest.approx(0.099)
+    (bag := tmp_path / "bag").mkdir()
+    kind = "geometry_msgs/msg/WrenchStamped"
+    with Writer(bag / "run", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/load", kind, typestore=STORE)
+        writer.write(connection, BASE_NS, wrench_message(BASE_NS, (0.0, 0.0, 0.0)))
+    mapping.write_text("excitation: {topic: /load, stamp_unit: ms}")
+    with pytest.raises(RecordingError, match=f"stamp_unit: got 'ms', expected none: {kind} has stamps in ns"):
+        analyse(bag / "run", scene=PAPER, mapping=mapping)
 
 
 def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:

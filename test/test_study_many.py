@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ import pytest
 from pyarrow import parquet
 from record_support import paper_sample, record_run
 
+from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -147,7 +149,7 @@ def test_whatever_one_of_many_fails_by_is_its_row(tmp_path: Path) -> None:
     assert found["run"] == str(run.folder) and "FileExistsError" in found["error"]
 
 
-def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path) -> None:
+def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("good", "gone"):
         record_run(tmp_path / name, map(paper_sample, range(10)))
     for part in (tmp_path / "gone").glob("*.mcap"):
@@ -156,10 +158,17 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path) -> None:
     assert expand([tmp_path]) == [tmp_path / "gone", tmp_path / "good"] and left_out(tmp_path) == [tmp_path / "empty"]
     rows = [analyse_task(Task(path, None, None, (), None)) for path in expand([tmp_path])]
     assert ["error" in row for row in rows] == [True, False]
-    write_table_of_runs(rows, tmp_path / "empty")
-    assert parquet.read_table(tmp_path / "empty" / "runs.parquet").column("lost").to_pylist() == [None, 0]
-    (tmp_path / "stray.mcap").touch()
+    write_table_of_runs(rows, out := tmp_path.with_name("out"), [tmp_path / "empty"])
+    table = parquet.read_table(out / "runs.parquet")
+    assert table.column("lost").to_pylist() == [None, 0, None]
+    assert table.column("error").to_pylist()[1:] == [None, "left out: no recording"]
+    assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1  # of the one without its parts
+    assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "empty")]
+    shutil.copy(tmp_path / "good" / "good_0.mcap", tmp_path / "stray.mcap")
     assert left_out(tmp_path) == [tmp_path / "good"]
+    assert cli(["analyse", str(tmp_path), "--json", "--quiet", "--out", str(out)]) == 0
+    assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "good")]
+    assert str(tmp_path / "good") in (out / "report.html").read_text()
 
 
 def test_a_run_that_was_killed_before_its_header_is_made_anew(runs: Path, tmp_path: Path) -> None:

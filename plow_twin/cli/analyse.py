@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,26 +74,32 @@ def analyse(
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
     found = list(dict.fromkeys(expand(recordings)))
-    for path in recordings:
-        for item in left_out(path):
-            # the results of an analysis before are no recording that was forgotten
-            if out is None or item.resolve() not in (out.resolve(), (out / "run").resolve()):
-                click.echo(f"plow-twin: {item}: left out: no recording of {path}", err=True)
     many = len(found) > 1 or found != list(recordings)
-    if dask is not None and not many:
-        raise click.UsageError("--dask: got one recording, expected many, or a folder of them")
+    for option, given in (("--dask", dask), ("--workers", workers)):
+        if given is not None and not many:
+            raise click.UsageError(f"{option}: got one recording, expected many, or a folder of them")
+    if dask is not None and workers is not None:
+        raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own")
+    # the results of an analysis before are no recording that was forgotten
+    results_before = () if out is None else (out.resolve(), (out / "run").resolve())
+    left = {item: path for path in recordings for item in left_out(path) if item.resolve() not in results_before}
+    for item, path in left.items():
+        click.echo(f"plow-twin: {item}: left out: no recording of {path}", err=True)
     extra = tuple(Path(name) for name in others)
     scene_file = Path(scene) if scene else None
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
-    tasks = [Task(path, scene_file, mapping, extra, folder) for path, folder in zip(found, folders, strict=True)]
+    beside = () if many else tuple(left)
+    tasks = [
+        Task(path, scene_file, mapping, extra, folder, beside) for path, folder in zip(found, folders, strict=True)
+    ]
     for task in tasks:  # before the first of them removes anything
         task.check(found)
     results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
 
-        write_table_of_runs(results, out)
-    _show(results, many, as_json, quiet)
+        write_table_of_runs(results, out, tuple(left))
+    _show(results, many, as_json, quiet, list(map(str, left)))
     failed = any("error" in facts for facts in results)
     lossy = any(facts.get("lossy") for facts in results)
     return FAILED if failed else DONE_WITH_LOSS if lossy else DONE
@@ -157,14 +164,15 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
     return {**found.facts(), "lossy": found.lossy}
 
 
-def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool) -> None:
+def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool, left_out: Sequence[str] = ()) -> None:
     for facts in results:
         if "error" in facts:
             click.echo(f"plow-twin: {facts['error']}", err=True)
         elif facts["lost"]:
             click.echo(f"plow-twin: {facts['run']}: lost {facts['lost']}", err=True)
     if as_json:
-        click.echo(json.dumps({"runs": results} if many else results[0], indent=2, allow_nan=False))
+        facts = {"runs": results, "left_out": left_out} if many else results[0]
+        click.echo(json.dumps(facts, indent=2, allow_nan=False))
         return
     if quiet:
         return
@@ -182,3 +190,6 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool)
         if "stretches" in facts:
             left = ", ".join(f"{name} {count}" for name, count in facts["not_compared"].items()) or "none"
             console.print(f"{facts['stretches']} stretches between resets; of the longest. Not compared: {left}.")
+        if "outside" in facts:
+            outside = ", ".join(f"{name} {count}" for name, count in facts["outside"].items())
+            console.print(f"Measured outside the time of the load, not compared: {outside}.")

@@ -338,6 +338,8 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, TopicType] | N
         sequence,
     )
     _check_columns(path, role, found)
+    if "stamp_unit" in entry:
+        _check_stamp_unit(path, role, found)
     if not isinstance(kind, Columns) and kind != "json" and stamp not in ("header", "log"):
         raise RecordingError(f"{path}: {role}: stamp: got {stamp!r}, expected header or log for {kind}")
     return found
@@ -354,6 +356,19 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
     for key, column in named:
         if not {column, re.split(r"[.\[]", column, maxsplit=1)[0]} & set(columns.names):
             raise RecordingError(f"{path}: {name}: {key}: got {column!r}, expected one of the {columns}")
+
+
+def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
+    """Raise a `RecordingError` where no stamp is read in the unit that was asked for."""
+    kind, why = role.message_type, ""
+    if role.stamp == "log":
+        why = "none beside stamp: log"
+    elif role.stamp == "header" and isinstance(kind, Columns) and not set(TIMES) & set(kind.names):
+        why = f"a stamp that names its column too: the {kind} have none of {', '.join(TIMES)}"
+    elif role.stamp == "header" and not isinstance(kind, Columns) and kind != "json":
+        why = f"none: {kind} has stamps in ns"
+    if why:
+        raise RecordingError(f"{path}: {name}: stamp_unit: got {role.stamp_unit!r}, expected {why}")
 
 
 def _topic(

@@ -7,15 +7,14 @@ as it goes. Only some chunks are in memory at a time.
 from __future__ import annotations
 
 import csv
-import re
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any, Final, Protocol, TypeAlias
+from typing import Any, Final, Protocol, TypeAlias
 from urllib.parse import quote
 
 from plow_twin.errors import RecordingError
@@ -24,11 +23,10 @@ from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.reader import part_number, run_parts
 from plow_twin.record.times import NO_TIME, STAMP_UNITS, TIMES, time_ns
+from plow_twin.scene_file.csv_rows import csv_rows, open_csv
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _ROWS: Final = 1000
-#: Characters of a CSV file that are looked at for what parts its columns.
-_LONGEST_HEADER: Final = 65_536
 #: What a damaged file makes of sqlite3: its own errors, texts of them that are no UTF-8, cells of impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
@@ -324,11 +322,7 @@ def _rows(connection: sqlite3.Connection) -> Iterator[tuple[Any, Any, Any]]:
 
 
 class CsvSource:
-    """CSV files with a header line, each a topic under its name without `.csv`.
-
-    Columns are parted by commas, or by semicolons or tabs where the header has more of these; numbers may have decimal
-    commas then, as spreadsheets write them in many countries.
-    """
+    """CSV files with a header line, each a topic under its name without `.csv`."""
 
     def __init__(self, parts: list[Path]) -> None:
         self.parts = parts
@@ -344,8 +338,8 @@ class CsvSource:
         """
         found: dict[str, TopicType] = {}
         for part in self.parts:
-            with _open_csv(part) as stream:
-                names = [name.strip() for name in next(csv.reader(stream, delimiter=_delimiter(stream)), [])]
+            with open_csv(part) as stream:
+                names = [name.strip() for name in next(csv_rows(stream), (0, []))[1]]
             found[part.stem] = columns_of(part, names)
         return found
 
@@ -358,15 +352,11 @@ class CsvSource:
 
     def _rows(self, part: Path) -> Iterator[Arrived]:
         try:
-            with _open_csv(part) as stream:
-                delimiter = _delimiter(stream)
-                rows = csv.reader(stream, delimiter=delimiter)
-                names = tuple(name.strip() for name in next(rows, []))
+            with open_csv(part) as stream:
+                rows = csv_rows(stream)
+                names = tuple(name.strip() for name in next(rows, (0, []))[1])
                 place = next((names.index(name) for name in TIMES if name in names), 0)
-                for cells in rows:
-                    if not any(cells):
-                        continue
-                    cells = cells if delimiter == "," else [cell.replace(",", ".") for cell in cells]
+                for _, cells in rows:
                     time = _row_time_ns(cells[place]) if place < len(cells) else NO_TIME
                     yield Arrived(part.stem, time, dict(zip(names, cells, strict=False)))
         except csv.Error:
@@ -382,19 +372,13 @@ def read_table(path: Path) -> tuple[Columns, list[list[str]]]:
         The file cannot be read, or a column's name stands twice.
     """
     try:
-        with _open_csv(path) as stream:
-            lines = (line for line in stream if not line.startswith("#"))
-            header = next(lines, "")
-            delimiter = delimiter_of(header)
-            rows = [cells for cells in csv.reader(chain([header], lines), delimiter=delimiter) if any(cells)]
+        with open_csv(path) as stream:
+            rows = [cells for _, cells in csv_rows(stream, "#")]
     except (OSError, csv.Error) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise RecordingError(f"{path}: {reason}") from None
     names = tuple(name.strip() for name in rows[0]) if rows else ()
-    columns = columns_of(path, names)
-    if delimiter != ",":
-        rows = [[cell.replace(",", ".") for cell in cells] for cells in rows]
-    return columns, rows[1:]
+    return columns_of(path, names), rows[1:]
 
 
 def columns_of(source: Path | str, names: Sequence[str]) -> Columns:
@@ -409,23 +393,6 @@ def columns_of(source: Path | str, names: Sequence[str]) -> Columns:
     if twice:
         raise RecordingError(f"{source}: column {twice[0]!r} stands there more than once, expected one of a name")
     return Columns(tuple(names))
-
-
-def _open_csv(path: Path) -> IO[str]:
-    """Open a text; a mark of the byte order at its beginning, as spreadsheets write it, is no part of it."""
-    return path.open(newline="", encoding="utf-8-sig", errors="replace")
-
-
-def _delimiter(stream: IO[str]) -> str:
-    """Return what parts the columns, by the header line, which is read again after that."""
-    header = stream.readline(_LONGEST_HEADER)
-    stream.seek(0)
-    return delimiter_of(header)
-
-
-def delimiter_of(header: str) -> str:
-    """Return what parts the columns of a header line: comma, semicolon or tab, the most frequent outside quotes."""
-    return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
 
 
 def _log_time_ns(arrived: Arrived) -> int | None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import Problem, SceneError
+from plow_twin.scene_file.csv_rows import csv_rows, open_csv
 from plow_twin.scene_file.schema import TABLE_COLUMNS
 
 Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -23,9 +24,9 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     Parameters
     ----------
     path : Path
-        The file; lines that start with `#` are left out.
+        The file, as `csv_rows` takes it; lines that start with `#` are left out.
     columns : sequence of str, optional
-        Names in the header of time, Fx, Fy and M; `t, fx, fy, m` by default.
+        Names in the header of time, Fx, Fy and M; `t, fx, fy, m` by default, or `time` for `t`.
     key : str
         What messages call the file.
 
@@ -34,18 +35,19 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     SceneError
         When the file, a column or a number is missing; it lists every line that is no use.
     """
-    columns = tuple(columns or TABLE_COLUMNS)
+    wanted = tuple(columns or TABLE_COLUMNS)
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [(line, row) for line, row in enumerate(csv.reader(file), 1) if row and not row[0].startswith("#")]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        with open_csv(path) as file:
+            rows = list(csv_rows(file, "#"))
+    except (OSError, csv.Error) as error:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise SceneError([Problem(key, str(path), f"a readable csv file ({reason})")]) from None
     header = [name.strip() for name in rows[0][1]] if rows else []
-    missing = [name for name in columns if name not in header]
-    if missing:
-        raise SceneError([Problem(key, header, f"a header line with {', '.join(columns)}")])
-    return _parse(rows[1:], [header.index(name) for name in columns], key)
+    if columns is None and "t" not in header:
+        header = ["t" if name == "time" else name for name in header]
+    if any(header.count(name) != 1 for name in wanted):
+        raise SceneError([Problem(key, header, f"a header line with {', '.join(wanted)}, each once")])
+    return _parse(rows[1:], [header.index(name) for name in wanted], key)
 
 
 def _parse(rows: list[tuple[int, list[str]]], places: list[int], key: str) -> Samples:

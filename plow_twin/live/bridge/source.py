@@ -9,7 +9,8 @@ from typing import Any, Final, Protocol
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.record.merging import StampOf
-from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of, delimiter_of
+from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of
+from plow_twin.scene_file.csv_rows import delimiter_of
 
 #: A longer line or payload is none of a sensor's [B].
 LONGEST: Final = 65536

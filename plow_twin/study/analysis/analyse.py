@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,9 +19,9 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed, JournalWalk, Walked, Walker
-from plow_twin.record.mapping import Role, messages_of, read_map, readings, roles_by_source
+from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
-from plow_twin.record.sources import Source, open_source
+from plow_twin.record.sources import open_source
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -79,11 +80,18 @@ class Prediction:
         self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, rows.penetration)))
         self.clearance.add(published.stamp_ns[published.slow_index], published.clearance)
 
-    def meets(self, signal: ThinnedSignal) -> bool:
-        """Tell whether a value of a measured signal lies in the time of the load."""
+    def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
+        """Tell of each measured value whether it lies in the time of the load."""
         stamps = signal.series()[0]
-        spans = self.spans.values()
-        return not spans or any(bool(((stamps >= first) & (stamps <= last)).any()) for first, last in spans)
+        if not self.spans:
+            return np.ones(len(stamps), np.bool_)
+        inside = [(stamps >= first) & (stamps <= last) for first, last in self.spans.values()]
+        return np.asarray(np.any(inside, axis=0))
+
+    def outside(self, signal: ThinnedSignal) -> int:
+        """Return how many values of a measured signal lie outside the time of the load."""
+        inside = self.is_inside(signal)
+        return round(signal.came * (1.0 - float(inside.mean()))) if len(inside) else 0
 
     def restart(self) -> None:
         """Begin a new stretch: the stamps may go back."""
@@ -165,6 +173,8 @@ class Analysis:
     losses: dict[str, int]
     unknown_types: dict[str, str]
     wall_s: float = 0.0
+    #: folders beside what was read that hold recordings of their own, or nothing
+    left_out: tuple[Path, ...] = ()
 
     @property
     def lossy(self) -> bool:
@@ -174,7 +184,8 @@ class Analysis:
     @property
     def lost(self) -> dict[str, int]:
         """What could not be read or used, and measured signals no value of which lies in the time of the load."""
-        outside = sum(signal.came for signal in self.measured.signals.values() if not self.predictions[0].meets(signal))
+        counts = ((self.predictions[0].outside(signal), signal.came) for signal in self.measured.signals.values())
+        outside = sum(count for count, came in counts if count == came)
         found = {"measured_implausible": self.measured.implausible, "measured_outside_the_load": outside}
         return self.losses | {name: count for name, count in found.items() if count}
 
@@ -208,16 +219,21 @@ class Analysis:
             "input": self.input,
             "lost": self.lost,
             "skipped_topics": self.unknown_types,
+            **({"left_out": list(map(str, self.left_out))} if self.left_out else {}),
             "wall_s": self.wall_s,
         }
 
     def _prediction(self, prediction: Prediction) -> dict[str, Any]:
         signals = {name: found.facts() for name, found in self.comparisons(prediction).items()}
         facts: dict[str, Any] = {"signals": signals, "loads": prediction.loads.facts()}
+        outside = {name: prediction.outside(signal) for name, signal in self.measured.signals.items()}
+        if any(outside.values()):
+            facts["outside"] = {name: count for name, count in outside.items() if count}
         if len(prediction.spans) > 1:
             facts["stretches"] = len(prediction.spans)
             left = {
-                name: int((~prediction.is_of_longest(signal)).sum()) for name, signal in self.measured.signals.items()
+                name: int((prediction.is_inside(signal) & ~prediction.is_of_longest(signal)).sum())
+                for name, signal in self.measured.signals.items()
             }
             facts["not_compared"] = {name: count for name, count in left.items() if count}
         if prediction.stride > 1:
@@ -341,8 +357,9 @@ def _walk_own(
             losses["samples_too_late"] = walk.late
         if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
             losses[reader.status.value] = 1
-        measured, unknown = _measured_beside(path, mapping, header.node)
+        measured, unknown, unused = _measured_beside(path, mapping, header.node)
         measured.signals = journalled.signals | measured.signals
+        losses |= unused
         return Analysis(reader.path, "run", predictions, measured, {"samples_used": walk.used}, losses, unknown)
 
     for batch in reader.batches(outputs=False):
@@ -360,21 +377,27 @@ def _walk_own(
     return so_far()
 
 
-def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measured, dict[str, str]]:
-    """Return what was measured beside a run, and the topics whose type is unknown; its loads are in the journal."""
-    measured, unknown = Measured(), dict[str, str]()
+def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measured, dict[str, str], dict[str, int]]:
+    """Return what was measured beside a run, the topics whose type is unknown, and what could not be used, by reason.
+
+    Its loads are in the journal.
+    """
+    measured, unknown, unused = Measured(), dict[str, str](), Counter[str]()
     folder = path if path.is_dir() else path.parent
     places = [place for place in (folder, *beside_folders(folder)) if any(place.glob("*.mcap"))]
     for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/"):
-        _collect(source, {name: roles[name] for name in roles.keys() - {"excitation", "travel"}}, measured)
+        roles = {name: role for name, role in roles.items() if name not in ("excitation", "travel")}
+        for name, arrived, found in readings(messages_of(source, roles) if roles else (), roles):
+            if found is None:
+                unused[f"{UNFIT}{name}: {roles[name].why_unfit(arrived)}"] += 1
+            elif found[0] <= 0:
+                unused[f"{UNFIT}{name}: {roles[name].topic} has stamps of 0"] += 1
+            else:
+                measured.add(name, *found)
         unknown |= source.losses.unknown_types
-    return measured, unknown
-
-
-def _collect(source: Source, roles: Mapping[str, Role], measured: Measured) -> None:
-    for name, _, found in readings(messages_of(source, roles) if roles else (), roles):
-        if found is not None:
-            measured.add(name, *found)
+        if source.losses.counts["undecodable"]:
+            unused["undecodable"] += source.losses.counts["undecodable"]
+    return measured, unknown, unused
 
 
 def _walk_other(
@@ -405,7 +428,7 @@ def _walk_other(
         f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count
     }
     losses = {**source.losses.counts, **dropped}
-    losses |= {f"unfit, {why}": count for why, count in feed.unfit.items()}
+    losses |= {f"{UNFIT}{why}": count for why, count in feed.unfit.items()}
     if walkers[0].failures:
         losses["solver_failures"] = walkers[0].failures
     if writer is not None:

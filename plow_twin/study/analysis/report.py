@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
 
 _MOST_POINTS: Final = 4000
+#: What stands in the place of results for a folder without a recording.
+LEFT_OUT: Final = "left out: no recording"
 
 _PAGE: Final = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{{ facts.run }}</title>
@@ -26,6 +29,7 @@ th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style><
 <h1>{{ facts.run }}</h1>
 <p>{{ facts.kind }}; {{ facts.input.samples_used }} samples used, {{ "%.1f" | format(facts.loads.duration_s) }} s.
 {% if facts.lost %}Lost: {{ facts.lost }}.{% endif %}
+{% if facts.left_out %}Left out, no part of this recording: {{ facts.left_out | join(", ") }}.{% endif %}
 {% if facts.skipped_topics %}Topics passed over: {{ facts.skipped_topics }}.{% endif %}</p>
 {% for part in parts %}
 <h2>Scene {{ part.scene }}</h2>
@@ -38,6 +42,7 @@ th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style><
 {% else %}<p>Nothing was measured.</p>{% endif %}
 {% if part.stretches %}<p>Resets part the run into {{ part.stretches }} stretches: signals are of the longest one;
 measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
+{% if part.outside %}<p>Measured values outside the time of the load, not compared: {{ part.outside }}.</p>{% endif %}
 <h3>Contacts</h3>
 <table><tr><th>pair</th><th>impacts</th><th>largest force [kN]</th><th>impulse [kN s]</th><th>duty [%]</th></tr>
 {% for name in pairs %}<tr><td>{{ name }}</td><td>{{ part.loads.impacts[name] }}</td>
@@ -168,13 +173,13 @@ def _picture(found: Analysis) -> str:
     return base64.b64encode(stream.getvalue()).decode()
 
 
-def write_table_of_runs(rows: list[dict[str, Any]], out: Path) -> None:
-    """Write one row a recording to `runs.parquet`."""
+def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:
+    """Write one row a recording to `runs.parquet`, and one with the reason for each folder that was left out."""
     import pyarrow as pa
     from pyarrow import parquet
 
     flat = []
-    for facts in rows:
+    for facts in [*rows, *({"run": str(path), "error": LEFT_OUT} for path in left_out)]:
         lost = sum(facts["lost"].values()) if "lost" in facts else None
         row: dict[str, Any] = {"run": facts["run"], "error": facts.get("error"), "lost": lost}
         for name, signal in facts.get("signals", {}).items():

@@ -55,6 +55,8 @@ class Task:
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
+    #: what the recording's folder holds besides, which is said in the results
+    left_out: tuple[Path, ...] = ()
 
     def stored(self) -> dict[str, Any] | None:
         """Return the facts of this very analysis when its files are there, whole."""
@@ -125,6 +127,7 @@ class Task:
             out=self.out,
             on_progress=on_progress,
         )
+        found.left_out = self.left_out
         if self.out is not None:
             write_report(found, self.out)
             write_atomically(self.out / _ASKED, json.dumps(asked, indent=1).encode())
