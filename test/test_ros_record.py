@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import bench
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -35,19 +35,25 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
         note = DiagnosticArray(status=[DiagnosticStatus(name="n", values=[KeyValue(key="k", value="v")])])
         notes.publish(note)
         camera = probe.node.create_publisher(PoseStamped, "camera/pose", 1000)
+        strong = probe.node.create_publisher(PoseStamped, "gauge", 1000)
         others = f"^(?!{namespace}/)"  # other tests may run beside this one
         command = [sys.executable, "-m", "plow_twin", "record", str(run), "--all", "--exclude", others, "--json"]
         with log.open("wb") as stream:
             recorder = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=stream, text=True)
         try:
             probe.until(lambda: camera.get_subscription_count() == 1, "the recorder")
+            # one that offers less comes later: both are heard, nothing twice
+            best_effort = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+            weak = probe.node.create_publisher(PoseStamped, "gauge", best_effort)
+            probe.until(lambda: weak.get_subscription_count() == 1, "a subscription that the weaker publisher matches")
             send = probe.excitation()
             for index in range(COUNT):
                 send(T0 + index * 1_000_000, (32e3, 0.0, -45e3))
                 pose = PoseStamped()
                 set_stamp(pose.header, T0 + index * 1_000_000)
                 pose.pose.position.x = float(index)
-                camera.publish(pose)
+                for publisher in (camera, strong, weak):
+                    publisher.publish(pose)
                 probe.pace(index)
             probe.until_figure("input", "samples_used", str(COUNT))
             recorder.send_signal(signal.SIGTERM)
@@ -55,9 +61,11 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
         finally:
             recorder.kill()
             recorder.wait()
-    assert recorder.returncode == 0, log.read_text()
     facts = json.loads(out)
+    assert recorder.returncode == (3 if facts["lost"] else 0), log.read_text()
     assert facts["messages"][f"{namespace}/camera/pose"] == COUNT and facts["messages"][f"{namespace}/notes"] == 1
+    gauge = f"{namespace}/gauge"
+    assert facts["messages"][gauge] + facts["lost"].pop(gauge, 0) == 2 * COUNT  # best effort
     assert facts["lost"] == {} and facts["skipped_topics"] == {}
     # what the run holds itself is left out
     assert not facts["messages"].keys() & {*RunReader(run).header.topics.values()}

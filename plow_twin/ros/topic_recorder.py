@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import rclpy
 from rclpy.clock import Clock
@@ -32,6 +32,26 @@ _LOOK_S: Final = 0.5
 _FLUSH_S: Final = 1.0
 
 
+class _Quality(NamedTuple):
+    """What of a quality of service decides who hears whom."""
+
+    reliable: bool
+    latched: bool
+
+
+def _quality(profile: Any) -> _Quality:
+    return _Quality(
+        profile.reliability == ReliabilityPolicy.RELIABLE, profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    )
+
+
+def message_class(message_type: str) -> type:
+    """Return the class of a message type that is installed."""
+    package, folder, kind = message_type.split("/")
+    found: type = getattr(import_module(f"{package}.{folder}"), kind)
+    return found
+
+
 class TopicRecorder:
     """Record topics as they appear.
 
@@ -47,7 +67,10 @@ class TopicRecorder:
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
-        self._topics: set[str] = set()
+        #: by topic: its type, its number in the file, and the qualities of service that are subscribed to
+        self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
+        #: of the publishers that are known, which subscription their messages are taken from
+        self._taken_as: dict[tuple[str, bytes], _Quality] = {}
         self._turns = Turns()
         self._loop = InputLoop(self._turns, lambda error: None)
         #: why a topic is not recorded
@@ -71,46 +94,60 @@ class TopicRecorder:
             raise self._loop.error
         for name, types in self._node.get_topic_names_and_types():
             publishers = self._node.get_publishers_info_by_topic(name)
-            if publishers and name not in self._topics and name not in self.skipped and self._wanted(name):
+            if publishers and self._wanted(name) and (name in self._topics or name not in self.skipped):
                 try:
                     self._subscribe(name, types, publishers)
                 except (LookupError, ImportError, AttributeError, OSError) as error:
                     self.skipped[name] = f"{', '.join(types)}: {error}"
 
     def _subscribe(self, name: str, types: Sequence[str], publishers: Sequence[Any]) -> None:
-        if len(types) != 1:
-            raise LookupError("expected one type")
-        package, folder, kind = types[0].split("/")
-        message_class = getattr(import_module(f"{package}.{folder}"), kind)
-        profiles = [publisher.qos_profile for publisher in publishers]
-        reliable = all(profile.reliability == ReliabilityPolicy.RELIABLE for profile in profiles)
-        latched = all(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for profile in profiles)
-        topic = Topic(
-            name,
-            types[0],
-            schema_of(types[0]),
-            str(publishers[0].topic_type_hash),
-            dump_yaml([offered(reliable, latched, max(1, profile.depth)) for profile in profiles]).strip(),
-        )
+        """Subscribe to each quality of service that publishers of a topic offer, as they come."""
+        if name not in self._topics:
+            if len(types) != 1:
+                raise LookupError("expected one type")
+            profiles = [publisher.qos_profile for publisher in publishers]
+            topic = Topic(
+                name,
+                types[0],
+                schema_of(types[0]),
+                str(publishers[0].topic_type_hash),
+                dump_yaml([offered(*_quality(profile), max(1, profile.depth)) for profile in profiles]).strip(),
+            )
+            message_class(types[0])
+            with self._turns:
+                self._topics[name] = types[0], self._writer.topic(topic), set()
+        kind, number, subscribed = self._topics[name]
+        for publisher in publishers:
+            if publisher.topic_type != kind:
+                self.skipped[name] = f"{publisher.topic_type}: the topic is recorded as {kind}"
+                continue
+            quality = _quality(publisher.qos_profile)
+            with self._turns:
+                self._taken_as.setdefault((name, bytes(publisher.endpoint_gid)), quality)
+            if quality not in subscribed:
+                subscribed.add(quality)
+                self._add_queue(name, kind, quality, number)
+
+    def _add_queue(self, name: str, kind: str, quality: _Quality, number: int) -> None:
         subscription = self._node.create_subscription(
-            message_class,
+            message_class(kind),
             name,
             lambda message: None,
             QoSProfile(
                 depth=_DEPTH,
-                reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+                reliability=ReliabilityPolicy.RELIABLE if quality.reliable else ReliabilityPolicy.BEST_EFFORT,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if quality.latched else DurabilityPolicy.VOLATILE,
             ),
             raw=True,
         )
-        with self._turns:
-            take = partial(self._take, name, self._writer.topic(topic))
-        self._topics.add(name)
-        self._loop.add(InputQueue(self._node, subscription, take))
+        self._loop.add(InputQueue(self._node, subscription, partial(self._take, name, quality, number)))
 
-    def _take(self, name: str, number: int, taken: list[Taken]) -> None:
+    def _take(self, name: str, quality: _Quality, number: int, taken: list[Taken]) -> None:
         for message in taken:
             key = (name, message.sender)
+            # a weaker subscription of the topic gets the messages of a stronger publisher as well
+            if self._taken_as.setdefault(key, quality) != quality:
+                continue
             before = self._newest.get(key, message.number - 1)
             self.missed[name] = self.missed.get(name, 0) + max(0, message.number - before - 1)
             self._newest[key] = message.number
