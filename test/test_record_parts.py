@@ -231,6 +231,24 @@ def test_a_full_disk_is_named_and_a_repair_leaves_nothing_half_done(tmp_path: Pa
     assert error.value.filename == f"{run.file}.partial" and sorted(run.folder.iterdir()) == there
 
 
+def test_a_full_disk_ends_the_writing_of_a_replay_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), frame_every=10**9, pause_every=0)
+    before, full = run.file.read_bytes(), tmp_path / "full"
+    assert cli(["replay", str(run.folder), "--write", str(tmp_path / "whole"), "-q"]) == 0  # what it compiles is cached
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        assert cli(["replay", str(run.folder), "--write", str(full), "-q"]) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = capsys.readouterr().err
+    assert str(full / "full_0.mcap") in said and "too large" in said and "Traceback" not in said
+    # what there was room for is a recording that was cut off, and what was read is as it was
+    assert run.file.read_bytes() == before and (full / "full_0.mcap").stat().st_size <= 200_000
+    report = replay(full)
+    assert (report.exit_code, report.status, report.divergences) == (3, FileStatus.TRUNCATED, 0)
+
+
 def test_a_part_that_is_no_mcap_file_is_named_and_the_rest_is_read(tmp_path: Path) -> None:
     run = record_run(
         tmp_path / "run", map(paper_sample, range(COUNT)), part_bytes=200_000, flush_period_s=0.01, chunk_size=50_000
