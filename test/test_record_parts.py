@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from mcap.reader import make_reader
 from record_support import chunk_spans, paper_sample, record_run, rewrite
 from rosbags.highlevel import AnyReader
 
@@ -19,10 +20,12 @@ from plow_twin import Wear
 from plow_twin.cli.app import run as cli
 from plow_twin.cli.recording_facts import read_recording
 from plow_twin.errors import RecordingError
+from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.doctor import examine, repair
 from plow_twin.record.header import RunHeader
 from plow_twin.record.measured import read_recording as read_measured
+from plow_twin.record.metadata_yaml import listed_parts
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.recorder import Recorder
 from plow_twin.record.replay import replay
@@ -145,6 +148,39 @@ def test_what_other_programs_would_stumble_over_is_named_and_repaired(tmp_path: 
     assert repair(run.folder) == [run.file] and examine(run.folder).problems == []
     with AnyReader([run.folder]) as reader:
         assert reader.message_count
+
+
+def test_a_repair_keeps_every_old_file_and_lists_every_part(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
+    parts = RunReader(run.folder).parts
+    old = [parts[1].read_bytes()[:-1000]]
+    for _ in range(2):  # cut, repaired, cut again
+        parts[1].write_bytes(old[-1])
+        assert repair(parts[1]) == [parts[1]]  # one part of many
+        assert listed_parts(run.folder) == [part.name for part in parts]
+        old.append(parts[1].read_bytes()[:-2000])
+    kept = [parts[1].with_name(f"{parts[1].name}.damaged{ending}") for ending in ("", "_2")]
+    assert [file.read_bytes() for file in kept] == old[:2]
+
+
+def test_what_was_recorded_beside_a_run_is_examined_and_repaired(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(100)))
+    writer = BagWriter(run.folder / "beside")
+    number = writer.topic(Topic("/level", "own/msg/Level", "float64 value", "RIHS01_" + 64 * "0", "[]"))
+    for index in range(100):
+        writer.add(number, index, index, index, bytes(12))
+        writer.flush()
+    writer.close()
+    assert examine(run.folder).problems == []
+    writer.path.write_bytes(writer.path.read_bytes()[:2000])  # its recorder was killed
+    (writer.folder / "metadata.yaml").unlink()
+    assert examine(run.folder).problems == ["beside/beside_0.mcap: cut off: it has no end"]
+    assert repair(run.folder) == [writer.path] and examine(run.folder).problems == []
+    with writer.path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and summary.statistics is not None and summary.statistics.message_count > 5
+    assert summary.channels[1].metadata["topic_type_hash"] == "RIHS01_" + 64 * "0"  # of a type that is not ours
+    assert "own/msg/Level" in (writer.folder / "metadata.yaml").read_text()
 
 
 def test_a_part_that_stands_there_twice_is_named_and_read_once(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import struct
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -60,6 +60,7 @@ class Channel:
     message_type: str
     encoding: str
     schema: bytes
+    metadata: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -243,7 +244,9 @@ class ChunkReader:
             else:
                 channel = records.Channel.read(stream)
                 name, text = schemas.get(channel.schema_id, ("", b""))
-                self.channels[channel.id] = Channel(channel.topic, name, channel.message_encoding, text)
+                self.channels[channel.id] = Channel(
+                    channel.topic, name, channel.message_encoding, text, channel.metadata
+                )
         except Exception:  # damage: what it would have named is passed over
             self.damaged += 1
 
@@ -276,7 +279,9 @@ class ChunkReader:
             schemas.setdefault(schema.id, (schema.name, schema.data))
         for channel in summary.channels.values():
             name, text = schemas.get(channel.schema_id, ("", b""))
-            self.channels.setdefault(channel.id, Channel(channel.topic, name, channel.message_encoding, text))
+            self.channels.setdefault(
+                channel.id, Channel(channel.topic, name, channel.message_encoding, text, channel.metadata)
+            )
 
 
 def is_begun(path: Path) -> bool:

@@ -7,12 +7,13 @@ invented: what was lost stays lost and is counted.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import RecordingError
+from plow_twin.record.bag import beside_folders
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_begun, is_mcap
 from plow_twin.record.follow import is_claimed
@@ -21,13 +22,14 @@ from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, listed_parts, qos_text, write_metadata
-from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.reader import FileStatus, RunReader, run_parts
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Loss, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
 #: Key in the loss record of a repaired part.
 REPAIRED_KEY: Final = "repaired"
+_HASH: Final = "topic_type_hash"
 
 
 @dataclass
@@ -140,6 +142,9 @@ def examine(path: Path) -> RunReport:
     report.status = reader.status.value
     report.layout_version = _layout(reader)
     _name_problems(report, reader)
+    for folder in beside_folders(reader.path.parent) if path.is_dir() else ():
+        for part in run_parts(folder):
+            report.problems += [f"{folder.name}/{text}" for text in _part_problems(_part(part))]
     return report
 
 
@@ -175,16 +180,7 @@ def _part(path: Path) -> PartReport:
 
 def _name_problems(report: RunReport, reader: RunReader) -> None:
     for part in report.parts:
-        if not part.mcap:
-            report.problems.append(f"{part.path.name}: not an MCAP file: nothing of it can be read")
-        elif not part.finished:
-            report.problems.append(f"{part.path.name}: cut off: it has no end")
-        if part.damaged_chunks:
-            report.problems.append(f"{part.path.name}: {part.damaged_chunks} damaged chunk(s)")
-        if part.left_out:
-            report.problems.append(f"{part.path.name}: {part.left_out} chunk(s) left out by a repair")
-        if part.trailing_bytes:
-            report.problems.append(f"{part.path.name}: {part.trailing_bytes} B behind its end")
+        report.problems += _part_problems(part)
     for file, read in reader.repeated.items():
         report.problems.append(f"{file.name}: repeats {read.name} (part {reader.number(file)}): it is not read")
     for file, keys in reader.foreign.items():
@@ -204,6 +200,21 @@ def _name_problems(report: RunReport, reader: RunReader) -> None:
         report.problems.append(f"stopped early: {reader.stop_reason}")
     if not report.entries[Snapshot.__name__] and report.entries[Digest.__name__]:
         report.problems.append("no snapshot: nothing can be compared")
+
+
+def _part_problems(part: PartReport) -> list[str]:
+    problems = []
+    if not part.mcap:
+        problems.append("not an MCAP file: nothing of it can be read")
+    elif not part.finished:
+        problems.append("cut off: it has no end")
+    if part.damaged_chunks:
+        problems.append(f"{part.damaged_chunks} damaged chunk(s)")
+    if part.left_out:
+        problems.append(f"{part.left_out} chunk(s) left out by a repair")
+    if part.trailing_bytes:
+        problems.append(f"{part.trailing_bytes} B behind its end")
+    return [f"{part.path.name}: {problem}" for problem in problems]
 
 
 def _metadata_problems(reader: RunReader) -> list[str]:
@@ -226,8 +237,9 @@ def repair(path: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The parts that were rewritten; the old ones stay beside them as `<name>.damaged`, those that hold nothing too,
-        those that repeat another part as `<name>.repeated`, those of another run as `<name>.foreign`.
+        The parts that were rewritten, those of what was recorded beside the run too; the old ones stay beside them as
+        `<name>.damaged` (`<name>.damaged_2`, ...), those that hold nothing too, those that repeat another part as
+        `<name>.repeated`, those of another run as `<name>.foreign`.
 
     Raises
     ------
@@ -235,30 +247,61 @@ def repair(path: Path) -> list[Path]:
         There is no recording of ours, it is still being written, or there is no room.
     """
     reader = RunReader(path)
-    with reader.parts[-1].open("rb") as stream:
-        if is_claimed(stream.fileno()):
-            raise RecordingError(f"{path}: is being written, expected a recording that has ended")
-    rewritten, facts = [], []
+    folder = reader.path.parent
+    whole = RunReader(folder) if path.is_file() else reader
+    besides = beside_folders(folder) if path.is_dir() else ()
+    for parts in (reader.parts, whole.parts, *map(run_parts, besides)):
+        with parts[-1].open("rb") as stream:
+            if is_claimed(stream.fileno()):
+                raise RecordingError(f"{parts[-1]}: is being written, expected a recording that has ended")
+    rewritten = []
     for files, ending in ((reader.repeated, "repeated"), (reader.foreign, "foreign")):
         for file in files:
-            file.replace(file.with_name(f"{file.name}.{ending}"))
+            _put_aside(file, ending)
             rewritten.append(file)
-    for part in reader.parts:
-        report = _part(part)
-        if not (is_begun(part) and is_mcap(part)):
-            part.replace(part.with_name(f"{part.name}.damaged"))
-            rewritten.append(part)
-            continue
-        if not report.healthy:
-            _rewrite(part, last=part == reader.parts[-1])
-            rewritten.append(part)
-        facts.append(_facts(part))
-    wrong = _metadata_problems(reader)
-    if rewritten or wrong:
-        repaired = [part.name for part in rewritten] + [text for text in wrong if "is missing:" in text]
-        custom = {f"plow_twin_{REPAIRED_KEY}": ", ".join(repaired)} if repaired else {}
-        write_metadata(reader.path.parent, bag_metadata(facts, custom))
+    rewritten += _mend(reader.parts, whole.parts[-1])
+    if path.is_dir() or reader.parts[0] in whole.parts:
+        wrong = _metadata_problems(whole)
+        if rewritten or wrong:
+            texts = [text for text in wrong if "is missing:" in text]
+            _list_parts(folder, whole.parts, [*(part.name for part in rewritten), *texts])
+    for beside in besides:
+        parts = run_parts(beside)
+        mended = _mend(parts, parts[-1])
+        if mended:
+            _list_parts(beside, parts, [part.name for part in mended])
+        rewritten += mended
     return rewritten
+
+
+def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
+    """Rewrite parts that were cut off or damaged, put those aside that hold nothing, and return both."""
+    mended = []
+    for part in parts:
+        if not (is_begun(part) and is_mcap(part)):
+            _put_aside(part, "damaged")
+        elif not _part(part).healthy:
+            _rewrite(part, last=part == last)
+        else:
+            continue
+        mended.append(part)
+    return mended
+
+
+def _put_aside(file: Path, ending: str) -> None:
+    """Give a file another name, that of no other."""
+    target, number = file.with_name(f"{file.name}.{ending}"), 2
+    while target.exists():
+        target, number = file.with_name(f"{file.name}.{ending}_{number}"), number + 1
+    file.replace(target)
+
+
+def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
+    """Write `metadata.yaml` for those parts that can be read."""
+    facts = [_facts(part) for part in parts if part.exists() and is_begun(part) and is_mcap(part)]
+    custom = {f"plow_twin_{REPAIRED_KEY}": ", ".join(repaired)} if repaired else {}
+    if facts:
+        write_metadata(folder, bag_metadata(facts, custom))
 
 
 def _rewrite(part: Path, *, last: bool) -> None:
@@ -299,7 +342,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
         raise
     finally:
         file.close()
-    part.replace(part.with_name(f"{part.name}.damaged"))
+    _put_aside(part, "damaged")
     target.replace(part)
 
 
@@ -311,12 +354,9 @@ def _copy(messages: Messages, reader: ChunkReader, file: McapFile, numbers: dict
             continue
         if number not in numbers:
             kind = channel.message_type
-            qos = (
-                {"offered_qos_profiles": qos_text(kind), "topic_type_hash": type_hash(kind)}
-                if kind in MESSAGE_TYPES
-                else {}
-            )
-            numbers[number] = file.channel(channel.topic, kind, channel.schema, qos)
+            known = kind in MESSAGE_TYPES
+            qos = {"offered_qos_profiles": qos_text(kind), "topic_type_hash": type_hash(kind)} if known else {}
+            numbers[number] = file.channel(channel.topic, kind, channel.schema, channel.metadata or qos)
         builder.add(
             numbers[number],
             int(messages.sequence[index]),
@@ -338,10 +378,10 @@ def _facts(part: Path) -> PartFacts:
         if len(messages):
             first, last = int(messages.log_time_ns.min()), int(messages.log_time_ns.max())
             start, end = first if not start else min(start, first), max(end, last)
-    known: Mapping[int, Any] = reader.channels
-    topics = [
-        TopicCount(known[number].topic, known[number].message_type, count)
-        for number, count in sorted(counts.items())
-        if number in known and known[number].message_type in MESSAGE_TYPES
-    ]
+    topics = []
+    for number, count in sorted(counts.items()):
+        channel = reader.channels.get(number)
+        if channel is not None and (channel.message_type in MESSAGE_TYPES or _HASH in channel.metadata):
+            qos, digest = channel.metadata.get("offered_qos_profiles", ""), channel.metadata.get(_HASH, "")
+            topics.append(TopicCount(channel.topic, channel.message_type, count, qos, digest))
     return PartFacts(part.name, start, end, topics)
