@@ -197,6 +197,21 @@ def test_how_far_off_a_path_is_is_told_by_the_drawn_ones() -> None:
     assert np.mean(np.array(wrong) > estimating.MOST_PATH) > 0.9
 
 
+@pytest.mark.parametrize("seed", [56004, 56005])
+def test_between_soft_and_hard_the_fit_comes_to_its_end_and_its_intervals_hold(seed: int) -> None:
+    # the search took all the work of one, the other's error was three of its deviations
+    truth = draw(GROUPS["middle"], seed)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    for value, state, true in zip(
+        (result.horizontal, result.vertical),
+        (result.horizontal_state, result.vertical_state),
+        truth.clearance,
+        strict=True,
+    ):
+        assert state is State.ESTIMATED
+        assert abs(value.mean - true) < 2.0 * value.deviation and value.deviation < 2e-4
+
+
 @pytest.mark.parametrize("turn", [0.0, -0.1])
 def test_a_biased_sensor_behind_a_hard_contact_is_found_out(turn: float) -> None:
     """Half a degree of bias had the estimate withdrawn, 9 mm along y made the horizontal clearance 1 mm too large."""

@@ -85,7 +85,9 @@ def refine(
     horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
-    starts = [shared, *([range_of_hard(unknowns, poses, shared)] if hard else [])]
+    starts = [shared]
+    if unknowns.is_hard(shared):  # a softer contact is never best from there, and the work is needed for the fit
+        starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:
         states = better_states(near, start, states_at(window, start))
