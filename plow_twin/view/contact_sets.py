@@ -39,6 +39,7 @@ class ContactSets:
         self._span_ns = span_ns
         self._before: str | None = None
         self._at: int | None = None
+        self._last: tuple[int, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):
             mask = self._pairs(ccw, True) | self._pairs(cw, False)
@@ -66,6 +67,8 @@ class ContactSets:
     def add(self, stamps: Indexes, steps: Indexes, force: Array) -> None:
         """Take in forces, shape (n, 8)."""
         masks = masks_of(force)
+        if len(stamps):
+            self._last = int(stamps[-1]) + 1, int(steps[-1])
         changed = np.flatnonzero(np.diff(masks, prepend=-1))
         for row in changed.tolist():
             name = self.name(int(masks[row]))
@@ -73,6 +76,12 @@ class ContactSets:
             if name != self._before and (span is None or span != self._at):
                 self._states.add(int(stamps[row]), int(steps[row]), state=[name])
                 self._before, self._at = name, span
+
+    def end(self) -> None:
+        """End the lane: which corners carry force from here on is not known."""
+        if self._last is not None:
+            self._states.add(*self._last, state=[])
+        self._before = self._at = self._last = None
 
     def flush(self) -> None:
         """Send what has been collected."""

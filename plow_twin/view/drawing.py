@@ -171,6 +171,7 @@ class Drawing:
         for buffer in buffers(self):
             if isinstance(buffer, Curves):
                 buffer.end()
+        self.contact_sets.end()
         self.what_if.end_lines()
         self._band_end = None
         self._residuals = Residuals()

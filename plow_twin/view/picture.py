@@ -118,8 +118,10 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     _bands(below, clearance, (scene.clearance.horizontal_m, scene.clearance.vertical_m))
     below.set_xlabel("time since the first stamp [s]")
     lost = {name: count for name, count in {**reader.lost, **reader.lost_parts}.items() if count}
-    told = "".join(f", {name.replace('_', ' ')}: {count}" for name, count in lost.items())
-    figure.suptitle(f"{reader.path.name}: {reader.status.value}{told}")
+    told = [f"{name.replace('_', ' ')}: {count}" for name, count in lost.items()]
+    if reader.status is not FileStatus.COMPLETE or not told:
+        told.insert(0, reader.status.value)
+    figure.suptitle(f"{reader.path.name}: {', '.join(told)}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_png(str(out))  # type: ignore[no-untyped-call]
