@@ -461,6 +461,26 @@ def test_a_load_that_never_changes_is_none_and_of_long_data_the_newest_are_taken
     assert (result.t_start, result.t_end) == (pytest.approx(t[-1] - 60.0, abs=0.03), pytest.approx(t[-1]))
 
 
+def test_a_machine_that_stands_is_no_suspect_model(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, _ = known[0]
+    rng = np.random.default_rng(5)
+    t = np.arange(0.0, 32.0, 0.01)
+    rests = [-9e-3, -4e-3, 2e-3] + 5e-4 * rng.standard_normal((len(t), 3))
+    idle = np.full((len(t), 3), 500.0)
+    for load in (idle, idle + 100.0 * rng.standard_normal(idle.shape)):
+        result = estimate(truth.nominal, Load.of(t, load)[0], Poses.of(t, rests)[0])
+        assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
+        assert (result.model, result.sensor) == ("ok", "ok") and "the head rests" in result.reasons[0]
+    # one that has just come to rest shows the noise of a hard wall, and nothing else of it
+    rests[:200] += np.linspace(1e-2, 0.0, 200)[:, None]
+    result = estimate(truth.nominal, Load.of(t, idle)[0], Poses.of(t, rests)[0])
+    assert (result.horizontal_state, result.model) == (State.NOT_OBSERVABLE, "ok")
+    # one that is pushed and does not move is stuck, or its sensor is
+    pushed = Load.of(t, idle + np.outer(np.sin(2.0 * t), [3e4, 1e4, 4e4]))[0]
+    result = estimate(truth.nominal, pushed, Poses.of(t, rests)[0])
+    assert result.horizontal_state is State.WITHDRAWN
+
+
 def test_a_fit_that_cannot_be_computed_is_withdrawn(
     known: list[tuple[Truth, Estimate]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

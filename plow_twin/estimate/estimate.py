@@ -19,6 +19,7 @@ from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, MOVING, SIZE, SOFTNESS, Spread, Unknowns
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, sandwich
+from plow_twin.model import geometry
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import inertias
 
@@ -38,6 +39,8 @@ MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
 _LONGEST_S = 600.0
 #: Scatter of the last half of the poses, in that of their quick changes, from which on the head moves.
 _MOVES = 5.0
+#: The same up to which it rests, and how much the load scatters meanwhile at most, in weights of the head.
+_RESTS, _IDLE_LOAD, _STANDARD_GRAVITY = 1.3, 0.05, 9.81
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
 #: Knots of the load in a period that are simulated, about.
@@ -138,6 +141,10 @@ def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess
         return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=lacking), ()
     if _is_dead(load, poses):
         return _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves"), ()
+    if _is_idle(scene, load, poses):
+        nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
+        unseen, why = State.NOT_OBSERVABLE, "the head rests under a load that hardly changes: its motion tells nothing"
+        return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=(why,)), ()
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
     felt, broad = thinned(load, period)
     drift = _LEFT_OPEN * load.left_open() / np.asarray(inertias(scene)) ** 2 if broad else None
@@ -504,6 +511,14 @@ def _is_dead(load: Load, poses: Poses) -> bool:
     """Tell whether a load that never changes is none: under a constant one the head comes to rest."""
     late = filled(poses)[len(poses.t) // 2 :]
     return not np.ptp(load.wrench, axis=0).any() and bool((late.std(axis=0) > _MOVES * noise_level(late)).any())
+
+
+def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
+    """Tell whether a machine stands: all but the first of its pose is noise, and the load hardly changes throughout."""
+    q = filled(poses)[len(poses.t) // 4 :]
+    weight = scene.head.mass_kg * _STANDARD_GRAVITY
+    most = _IDLE_LOAD * weight * np.array([1.0, 1.0, geometry.half_diagonal(scene)])
+    return bool((load.wrench.std(axis=0) < most).all() and (q.std(axis=0) < _RESTS * noise_level(q)).all())
 
 
 def _without_fit(
