@@ -17,7 +17,7 @@ from scenes import ROOT, gaps_at, preset
 from scipy.stats import truncnorm
 from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
-from plow_twin import Scene, Table, Twin, Wear, simulate
+from plow_twin import Friction, Initial, Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate import estimate as estimating
 from plow_twin.estimate.answer import followed
 from plow_twin.estimate.arrow import Arrow
@@ -28,6 +28,7 @@ from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, f
 from plow_twin.estimate.gaps import Gaps, GapsError, tell
 from plow_twin.estimate.measurements import EstimateError, Load, Poses, believed
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
+from plow_twin.estimate.similar import Units
 from plow_twin.estimate.unknowns import GAIN, Spread, Unknowns
 from plow_twin.model.loads import compile_loads
 from plow_twin.record.measured import read_recording
@@ -459,6 +460,34 @@ def test_a_load_that_never_changes_is_none_and_of_long_data_the_newest_are_taken
     assert (result.model, result.horizontal_state) == ("suspect", State.WITHDRAWN)
     assert result.reasons == ("load: the same value throughout, while the head moves",)
     assert (result.t_start, result.t_end) == (pytest.approx(t[-1] - 60.0, abs=0.03), pytest.approx(t[-1]))
+
+
+def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size(known: list[tuple[Truth, Estimate]]) -> None:
+    truth, result = known[0]
+    desk = Units(8.0, 1024.0, 4.0)  # an eighth as large, a thousandth as heavy, four times as fast
+    scene = desk.scene(truth.nominal)
+    found = estimate(scene, desk.load(truth.load), desk.poses(truth.poses))
+    assert found.t_end == result.t_end / 4.0 and found.bias_x is not None and found.delay is not None
+    # in units that are powers of two each number is the same one
+    back = desk.in_si(found, truth.nominal)
+    assert back == replace(result, lost=back.lost) and found.horizontal.mean == result.horizontal.mean / 8.0
+    twins, gain = draw_scenes(scene, found, 20, np.random.default_rng(0))
+    alike, same = draw_scenes(truth.nominal, result, 20, np.random.default_rng(0))
+    assert gain == pytest.approx(same)
+    assert [8.0 * twin.clearance.vertical_m for twin in twins] == pytest.approx(
+        [twin.clearance.vertical_m for twin in alike]
+    )
+
+
+@pytest.mark.parametrize("friction", [Friction(0.2, 0.02), Friction(0.3, stick_stiffness_n_m=5e7)])
+def test_a_scene_in_other_units_moves_alike(friction: Friction) -> None:
+    thrown = Initial((1e-3, 0.0, 1e-3), (0.4, 0.3, 0.5))
+    scene = replace(preset("bench_kv"), friction=friction, initial=thrown, loads=())
+    units = Units(8.0, 1024.0, 4.0)
+    run, other = simulate(scene, 0.4, 0.01, 1e-9), simulate(units.scene(scene), 0.1, 0.0025, 1e-9)
+    assert np.ptp(run.q, axis=0).min() > 1e-3
+    assert other.q * [8.0, 8.0, 1.0] == pytest.approx(run.q, rel=1e-6, abs=1e-9)
+    assert other.force * units.force == pytest.approx(run.force, rel=1e-6, abs=1e-3)
 
 
 def test_a_machine_that_stands_is_no_suspect_model(known: list[tuple[Truth, Estimate]]) -> None:

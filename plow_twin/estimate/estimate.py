@@ -16,6 +16,7 @@ from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
 from plow_twin.estimate.pads import askew, by_group, turned
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.search import candidate, refine
+from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, MOVING, SIZE, SOFTNESS, Spread, Unknowns
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, sandwich
@@ -104,6 +105,18 @@ def estimate_window(
 
     Where the fit from `guess` does not hold, all is searched as without one.
     """
+    units = Units.of(scene, load)
+    if units == Units():
+        return _estimate(scene, load, poses, lost, guess, gaps)
+    its = units.load(load), units.poses(poses)
+    found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps))
+    return units.in_si(found, scene), following
+
+
+def _estimate(
+    scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess, gaps: Gaps | None
+) -> tuple[Estimate, Guess]:
+    """Estimate in the units that all is given in."""
     known, measured = len(load.t), len(poses.t)
     load = load.longest_stretch()
     lost += known - len(load.t)

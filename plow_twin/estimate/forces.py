@@ -30,7 +30,8 @@ TOLERANCE: Final = 1e-4
 FEWEST = 20
 #: Quantiles that are told.
 POINTS: Final = (0.05, 0.5, 0.95)
-_LEAST_CLEARANCE = 5e-4
+#: Least clearance that is drawn, as a share of the one believed.
+_LEAST_SHARE = 0.02
 #: Samples that are advanced in one call: what it returns for all members is to stay in the processor's cache.
 _CALL = 10
 
@@ -168,7 +169,7 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
     if found.correlation is not None:
         white = white @ np.linalg.cholesky(np.array(found.correlation) + 1e-9 * np.eye(7)).T
     horizontal, vertical = (
-        np.maximum(_normal(value, white[:, index]), _LEAST_CLEARANCE)
+        np.maximum(_normal(value, white[:, index]), _LEAST_SHARE * value.mean)
         for index, value in enumerate((found.horizontal, found.vertical))
     )
     stiffness = np.exp(_normal(_logarithm(found.stiffness), -white[:, 2]))

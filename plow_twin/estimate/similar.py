@@ -1,0 +1,146 @@
+"""Machines of other sizes: estimated as one of the size that the search and its thresholds were made for.
+
+Lengths, masses and times in units of their own leave the equations of motion as they are (similarity of mechanics), so
+a machine ten times as large is one of the paper's size in other units. Units are powers of two: nothing is rounded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+from plow_twin.estimate.gaps import CONSTANT_ERROR, Gaps
+from plow_twin.estimate.measurements import Deviation, Load, Poses
+from plow_twin.estimate.result import Estimate, Interval
+from plow_twin.model import geometry
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Scene
+
+#: The machine of the paper: half of the frame's diagonal [m], mass [kg], period of the load [s].
+_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
+#: Factors in length, mass and time by which a machine may differ and be estimated in SI units.
+_ALIKE: Final = (2.5, 6.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Units:
+    """Units of length [m], mass [kg] and time [s]."""
+
+    length: float = 1.0
+    mass: float = 1.0
+    time: float = 1.0
+
+    @staticmethod
+    def of(scene: Scene, load: Load) -> Units:
+        """Return units in which a machine is of the paper's size; SI units where it nearly is."""
+        period = load.oscillation() or _PERIOD
+        sizes = geometry.half_diagonal(scene) / _LENGTH, scene.head.mass_kg / _MASS, period / _PERIOD
+        if scene.support is not None or all(
+            1.0 / most <= size <= most for size, most in zip(sizes, _ALIKE, strict=True)
+        ):
+            return Units()
+        return Units(*(2.0 ** round(math.log2(size)) for size in sizes))
+
+    @property
+    def force(self) -> float:
+        """The unit of force in N."""
+        return self.mass * self.length / self.time**2
+
+    def scene(self, scene: Scene) -> Scene:
+        """Return a scene without loads and wear in these units."""
+        length, mass, time = self.length, self.mass, self.time
+        head, frame, clearance, gravity = scene.head, scene.frame, scene.clearance, scene.gravity
+        x, y = head.com_offset_m
+        (qx, qy, theta), (vx, vy, omega) = scene.initial.q, scene.initial.v
+        speed = length / time
+        return replace(
+            scene,
+            head=replace(
+                head,
+                mass_kg=head.mass_kg / mass,
+                inertia_kg_m2=head.inertia_kg_m2 / (mass * length**2),
+                com_offset_m=(x / length, y / length),
+            ),
+            frame=replace(frame, width_m=frame.width_m / length, height_m=frame.height_m / length),
+            clearance=Clearance(clearance.horizontal_m / length, clearance.vertical_m / length),
+            contact=self._contact(scene.contact),
+            gravity=replace(
+                gravity,
+                acceleration_m_s2=gravity.acceleration_m_s2 * time**2 / length,
+                arm_m=gravity.arm_m / length,
+            ),
+            initial=Initial((qx / length, qy / length, theta), (vx / speed, vy / speed, omega * time)),
+            friction=None if scene.friction is None else self._friction(scene.friction),
+            loads=(),
+            wear=None,
+        )
+
+    def load(self, load: Load) -> Load:
+        """Return a load in these units."""
+        fx, fy, moment = load.deviation
+        force, torque = self.force, self.force * self.length
+        deviation = fx / force, fy / force, moment / torque
+        return Load(load.t / self.time, load.wrench / [force, force, torque], deviation)
+
+    def poses(self, poses: Poses) -> Poses:
+        """Return poses in these units."""
+        length = [self.length, self.length, 1.0]
+        deviation: Deviation = tuple(value / unit for value, unit in zip(poses.deviation, length, strict=True))
+        return Poses(poses.t / self.time, poses.q / length, deviation)
+
+    def gaps(self, gaps: Gaps | None) -> Gaps | None:
+        """Return gaps in these units; the error of a sensor does not grow with the machine."""
+        if gaps is None:
+            return None
+        return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or CONSTANT_ERROR) / self.length)
+
+    def in_si(self, found: Estimate, scene: Scene) -> Estimate:
+        """Return what was found in these units in those of SI, `scene` being that in SI."""
+        contact = scene.contact
+        length, time = self.length, self.time
+        stiffness = self.force / length**contact.exponent
+        damping = 1.0 if contact.damping is None else self._damping(contact)
+        told = (f"all in units of {length:g} m, {self.mass:g} kg, {time:g} s: the machine is not of the paper's size",)
+        return replace(
+            found,
+            t_start=found.t_start * time,
+            t_end=found.t_end * time,
+            horizontal=_times(found.horizontal, length),
+            vertical=_times(found.vertical, length),
+            stiffness=_times(found.stiffness, stiffness),
+            damping=None if found.damping is None else _times(found.damping, damping),
+            bias_x=None if found.bias_x is None else _times(found.bias_x, length),
+            bias_y=None if found.bias_y is None else _times(found.bias_y, length),
+            delay=None if found.delay is None else _times(found.delay, time),
+            noise=None if found.noise is None else (found.noise[0] * length, found.noise[1] * length, found.noise[2]),
+            groups={name: (_times(value, length), state) for name, (value, state) in found.groups.items()},
+            reasons=found.reasons + told if found.reasons else (),
+        )
+
+    def _damping(self, contact: Contact) -> float:
+        """Return the unit of the law's damping: N s/m, or s/m of a factor of the force."""
+        return self.mass / self.time if LAWS[contact.law].additive else self.time / self.length
+
+    def _contact(self, contact: Contact) -> Contact:
+        damping, ramp = contact.damping, contact.ramp_m
+        return replace(
+            contact,
+            stiffness=contact.stiffness * self.length**contact.exponent / self.force,
+            damping=None if damping is None else damping / self._damping(contact),
+            impact_speed_floor_m_s=contact.impact_speed_floor_m_s * self.time / self.length,
+            ramp_m=None if ramp is None else ramp / self.length,
+        )
+
+    def _friction(self, friction: Friction) -> Friction:
+        stiffness, damping = friction.stick_stiffness_n_m, friction.stick_damping_n_s_m
+        return replace(
+            friction,
+            regularisation_speed_m_s=friction.regularisation_speed_m_s * self.time / self.length,
+            stick_stiffness_n_m=None if stiffness is None else stiffness * self.time**2 / self.mass,
+            stick_damping_n_s_m=None if damping is None else damping * self.time / self.mass,
+        )
+
+
+def _times(value: Interval, unit: float) -> Interval:
+    return Interval(value.mean * unit, value.p05 * unit, value.p95 * unit)
