@@ -360,11 +360,30 @@ def test_estimate_and_forecast_tell_of_parts_that_are_not_there(
     assert read_measured(run.folder).lost == {} and cli(forecast) == 0
     RunReader(run.folder).parts[1].unlink()
     found = read_measured(run.folder)
-    assert found.lost == {"missing_parts": 1} and found.unreadable == 1
+    assert found.lost["missing_parts"] == 1 and found.unreadable == sum(found.lost.values())
     capsys.readouterr()
     assert cli(forecast) == 3
     said = capsys.readouterr()
     assert json.loads(said.out)["lost"] == {"missing_parts": 1} and "there may be a newer estimate" in said.err
+
+
+def test_an_estimate_draws_no_load_over_a_damaged_chunk(tmp_path: Path) -> None:
+    """A silence is one from half a second on only; what is known to be missing is short."""
+    poses = [Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)) for index in range(0, COUNT, 10)]
+    entries = [entry for index in range(COUNT) for entry in (paper_sample(index), *poses[index : index + 1])]
+    run = record_run(tmp_path / "run", entries, frame_every=10**9, flush_period_s=0.01)
+    assert len(read_measured(run.folder).load) == COUNT
+    spans = chunk_spans(run.file, journal=True)
+    start, length = spans[len(spans) // 3]
+    data = bytearray(run.file.read_bytes())
+    data[start + length // 2] ^= 0xFF
+    run.file.write_bytes(data)
+    found = read_measured(run.folder)
+    apart = np.diff(found.load[:, 0])
+    assert apart.max() == pytest.approx(1e-3, abs=1e-6) and found.lost["damaged_chunks"] == 1
+    kept, aside = len(found.load), found.lost["samples_of_other_stretches"]
+    assert kept > COUNT // 2 and 0 < aside < COUNT - kept and 0.02 < 1e-3 * (COUNT - kept - aside) < 0.5
+    assert found.load[0, 0] > 0.0  # times count from the first sample of all
 
 
 def test_a_part_of_a_foreign_recording_that_is_not_there_is_counted(tmp_path: Path) -> None:

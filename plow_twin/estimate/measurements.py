@@ -37,7 +37,7 @@ _REPEATING, _LONGER = 0.25, 3.0
 _FEWEST_VALUES = 50
 #: Longest silence of the load in s: what acts meanwhile is not known; and in units of the median distance of samples,
 #: since a load may be given by few knots.
-LONGEST_GAP_S, _LONGEST_GAP = 0.5, 20.0
+LONGEST_GAP_S, LONGEST_GAP = 0.5, 20.0
 
 
 class EstimateError(PlowTwinError):
@@ -178,7 +178,7 @@ class Load:
     def longest_stretch(self) -> Load:
         """Return the longest part without a silence."""
         apart = np.diff(self.t)
-        silent = np.flatnonzero(apart > max(LONGEST_GAP_S, _LONGEST_GAP * float(np.median(apart))))
+        silent = np.flatnonzero(apart > max(LONGEST_GAP_S, LONGEST_GAP * float(np.median(apart))))
         if not len(silent):
             return self
         bounds = np.concatenate([[0], silent + 1, [len(self.t)]])

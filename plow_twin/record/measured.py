@@ -10,6 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -17,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.estimate.measurements import UNSTATED, Deviation, believed, own_deviations
+from plow_twin.estimate.measurements import LONGEST_GAP, UNSTATED, Deviation, believed, own_deviations
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.estimated import stated
 from plow_twin.record.mapping import ROLES, UNFIT, messages_of, readings, roles_by_source
-from plow_twin.record.reader import RunReader, own_run
+from plow_twin.record.reader import Holes, RunReader, own_run
 from plow_twin.record.sources import open_source, read_table
 from plow_twin.record.times import EPOCH_S, time_ns
 from plow_twin.scene_file import load_scene
@@ -102,12 +103,12 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         if scene is None and not file.is_file():
             raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
         model = load_scene(scene_path(str(file)))
-        rows, lost, why = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
+        rows, begins, lost, why = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
         loads, gaps, gaps_deviation = rows["excitation"], rows["gaps"], 0.0
     else:
         given = scene is not None
         model = load_scene(scene_path(str(scene))) if given else own.header.scene(own.path)
-        loads, journalled, gaps, spread, brought = _journal(own)
+        loads, begins, journalled, gaps, spread, brought = _journal(own)
         gaps_deviation = float(own.header.parameters.get("gaps_deviation", 0.0))
         of_poses, of_load = stated(own.header.parameters)
         journalled[:, 1:], of_poses = believed(of_poses, journalled[:, 1:], brought)
@@ -115,28 +116,32 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         rows, lost, why = {"head_pose": journalled}, Counter[str](), ""
         if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
-            rows, lost, why = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
+            rows, _, lost, why = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
             lost.pop("missing_parts", 0)  # counted by the run itself
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
     for name, found in (("load", len(loads)), ("measured pose", len(poses) + len(gaps))):
         if not found:
             raise RecordingError(f"{path}: got no {name}, expected some{why}")
-    origin = loads[0, 0]
+    origin, count = loads[0, 0], len(loads)
+    loads = _longest(loads, begins)
+    lost["samples_of_other_stretches"] = count - len(loads)
     for table in (loads, poses, gaps):
         table[:, 0] = (table[:, 0] - origin) * 1e-9
     counted = {name: count for name, count in lost.items() if count}
     return Measured(model, loads, poses, sum(counted.values()), *deviations, gaps, gaps_deviation, counted)
 
 
-def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
-    """Return samples, poses and gaps of a journal, stamps in ns in front, and what it says of deviations.
+def _journal(reader: RunReader) -> tuple[Array, list[int], Array, Array, Array, Array]:
+    """Return samples, the rows of them before which some are missing, poses and gaps, and what is said of deviations.
 
-    Those are the largest of the load, (3,), and those that came with each pose, (n, 3), NaN where none did. What was
-    before new skids, or a step of the clock, is of another machine or time: the last stretch counts.
+    Stamps in ns are in front. The deviations are the largest of the load, (3,), and those that came with each pose,
+    (n, 3), NaN where none did. What was before new skids, or a step of the clock, is of another machine or time: the
+    last stretch counts.
     """
     nothing = [np.zeros((0, 4))]
     loads, spread = [*nothing], np.zeros(3)
+    holes, begins = Holes(), list[int]()
     poses: list[tuple[float, ...]] = []
     brought: list[tuple[float, ...]] = []
     gaps: list[Array] = []
@@ -145,7 +150,7 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
         rows, since = np.column_stack([entries.stamp_ns, entries.wrench]), 0
         for index, entry in sorted(entries.others.items()):
             if isinstance(entry, Reset | SetWear):
-                loads, since = [*nothing], index
+                loads, since, begins = [*nothing], index, []
                 poses.clear()
                 brought.clear()
                 gaps.clear()
@@ -161,20 +166,43 @@ def _journal(reader: RunReader) -> tuple[Array, Array, Array, Array, Array]:
                 gaps.append(row)
             elif isinstance(entry, Spread):
                 spread = np.maximum(spread, entry.deviation)
+        before = sum(map(len, loads))
+        begins += [before + int(entries.sample[since:place].sum()) for place in holes.take(entries) if place >= since]
         loads.append(rows[since:][entries.sample[since:]])
     measured = np.array(poses, dtype=np.float64).reshape(-1, 4)
-    return np.concatenate(loads), measured, np.array(gaps).reshape(-1, 1 + PAIR_COUNT), spread, own_deviations(brought)
+    all_gaps = np.array(gaps).reshape(-1, 1 + PAIR_COUNT)
+    return np.concatenate(loads), begins, measured, all_gaps, spread, own_deviations(brought)
+
+
+def _longest(rows: Array, begins: list[int]) -> Array:
+    """Return the longest stretch of a load.
+
+    A stretch begins at those of the rows `begins` before which samples are missing for longer than some would take:
+    unlike in a silence, it is known that something acted there.
+    """
+    if len(rows) < 2:
+        return rows
+    apart = np.diff(rows[:, 0])
+    longest = LONGEST_GAP * float(np.median(apart))
+    bounds = [0, *(row for row in begins if 0 < row < len(rows) and apart[row - 1] > longest), len(rows)]
+    first, end = max(pairwise(bounds), key=lambda ends: rows[ends[1] - 1, 0] - rows[ends[0], 0])
+    return rows[first:end]
 
 
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
-) -> tuple[dict[str, Array], Counter[str], str]:
-    """Return the rows of each wanted role, stamps in ns, what could not be read or used, and why nothing fits."""
+) -> tuple[dict[str, Array], list[int], Counter[str], str]:
+    """Return the rows of each wanted role, stamps in ns, and what could not be read or used.
+
+    Second the rows of the load before which some are missing, last why nothing fits.
+    """
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
-    lost = Counter[str]()
+    lost, begins = Counter[str](), list[int]()
     for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/" if node else ""):
         roles = {name: role for name, role in roles.items() if name in wanted}
         for name, arrived, found in readings(messages_of(source, roles), roles):
+            if arrived.after_hole:
+                begins.append(len(rows.get("excitation", ())))
             if found is None:
                 lost[f"{UNFIT}{name}: {roles[name].why_unfit(arrived)}"] += 1
             else:
@@ -182,7 +210,7 @@ def _collect(
                 rows[name].append([float(stamp_ns), *(values.get(key, math.nan) for key in ROLES[name])])
         lost.update(source.losses.counts)
     tables = {name: np.array(found, dtype=float).reshape(-1, 1 + len(ROLES[name])) for name, found in rows.items()}
-    return tables, lost, "".join(f"; {why.removeprefix(UNFIT)}" for why in lost if why.startswith(UNFIT))
+    return tables, begins, lost, "".join(f"; {why.removeprefix(UNFIT)}" for why in lost if why.startswith(UNFIT))
 
 
 def _read(path: Path, columns: tuple[str, ...], some: tuple[str, ...] = ()) -> tuple[Array, int]:
