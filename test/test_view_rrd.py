@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+import rerun as rr
 from matplotlib.backends import backend_agg
 from matplotlib.figure import Figure
 from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
@@ -24,10 +25,10 @@ from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Entry, Pose, Reset, Sample, Travel
+from plow_twin.stream.journal import Entry, Hold, Pose, Reset, Sample, SetWear, Travel, Unload
 from plow_twin.view import ViewSummary, layout, to_rrd
-from plow_twin.view.columns import extremes
-from plow_twin.view.contact_sets import masks_of, set_color
+from plow_twin.view.columns import TimeAxis, extremes
+from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
 from plow_twin.view.picture import to_png
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, Section
 
@@ -203,6 +204,44 @@ def test_each_change_of_the_corners_that_carry_force_is_drawn(
     assert len(states) == 1 + np.count_nonzero(np.diff(masks)) and states[0] == "free"
     assert {state.split()[0] for state in states} == {"free", "ccw", "cw"}
     assert set_color(0b1) != set_color(0b10) != set_color(0)
+
+
+def test_a_touch_that_is_over_is_not_drawn_on_in_a_thinned_run(tmp_path: Path) -> None:
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "sets.rrd")
+    sets = ContactSets(stream, TimeAxis(), ("a", "b", "c", "d"), span_ns=40)
+    touching = [0] * 5 + [1, 1] + [0] * 93 + [1] * 100
+    force = np.outer(touching, [1e3] + [0.0] * 7)
+    stamps = np.arange(0, 2000, 10)
+    for some in (slice(0, 6), slice(6, 150), slice(150, 200)):
+        sets.add(stamps[some], np.arange(200)[some], force[some])
+    sets.finish()
+    sets.flush()
+    stream.flush()
+    stream.disconnect()
+    found = read(tmp_path / "sets.rrd")["/contact_set"]
+    times = found["ros_time"].combine_chunks().cast(pa.int64()).to_pylist()
+    states = [row[0] for row in found["StateChange:state"].to_pylist()]
+    assert list(zip(times, states, strict=True)) == [(0, "free"), (50, "ccw a"), (80, "free"), (1000, "ccw a")]
+
+
+def test_what_is_over_is_not_drawn_on(tmp_path: Path) -> None:
+    """A load that has fallen to zero, one that is held, and the wear of pads that have been replaced."""
+    wear = Wear(1e-14, pad_area_m2=0.015, travel_speed_m_s=2.0)
+    end = BASE_NS + 1000 * STEP_NS
+    silent: list[Entry] = [Hold(end), *(Unload(end + index * 10 * STEP_NS) for index in range(1, 30))]
+    new = SetWear(end + 300 * STEP_NS, (0.0,) * 8, "new pads")
+    still = [Unload(new.stamp_ns + index * 100 * STEP_NS) for index in range(1, 21)]
+    after = [paper_sample(index) for index in range(3400, 5000)]
+    run = record_run(tmp_path / "run", [*map(paper_sample, range(1000)), *silent, new, *still, *after], wear=wear)
+    tables = read(to_rrd(run.file, tmp_path / "run.rrd").path)
+    load = scalars(tables["/load/fx"])
+    held = paper_sample(999).wrench[0] / 1e3
+    assert load[999] == load[1000] == held != 0.0 and set(load[1001:1030]) == {0.0}
+    labels = [row[0] for row in tables["/section/load"]["Arrows2D:labels"].to_pylist()]
+    assert labels.count("load 0 kN, +0 kN m") == 29 + 20
+    drawn = [len(row) for row in tables["/exaggerated/pads"]["Boxes2D:half_sizes"].to_pylist()]
+    assert 0 in drawn[1:] and drawn[0] and drawn[-1]
 
 
 def test_an_arrow_pushes_the_wall_off_its_corner() -> None:

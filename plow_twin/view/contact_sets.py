@@ -31,7 +31,7 @@ def masks_of(force: Array) -> Indexes:
 
 
 class ContactSets:
-    """Write each change of the set, at most one in each span of stamps [ns] of a thinned run."""
+    """Write each change of the set; of a thinned run the first in each span of stamps [ns], and how the span ends."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
         self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
@@ -40,6 +40,8 @@ class ContactSets:
         self._before: str | None = None
         self._at: int | None = None
         self._last: tuple[int, int] | None = None
+        #: set that the newest change within the span has left, and its step
+        self._left: tuple[str, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):
             mask = self._pairs(ccw, True) | self._pairs(cw, False)
@@ -71,17 +73,36 @@ class ContactSets:
             self._last = int(stamps[-1]) + 1, int(steps[-1])
         changed = np.flatnonzero(np.diff(masks, prepend=-1))
         for row in changed.tolist():
+            self._end_span(int(stamps[row]))
             name = self.name(int(masks[row]))
             span = int(stamps[row]) // self._span_ns if self._span_ns else None
-            if name != self._before and (span is None or span != self._at):
+            if span is not None and span == self._at:
+                self._left = name, int(steps[row])
+            elif name != self._before:
                 self._states.add(int(stamps[row]), int(steps[row]), state=[name])
                 self._before, self._at = name, span
+        if len(stamps):
+            self._end_span(int(stamps[-1]))
+
+    def _end_span(self, stamp_ns: int) -> None:
+        """Write how a span has ended that a stamp lies beyond."""
+        if self._left is None or self._at is None or stamp_ns // self._span_ns == self._at:
+            return
+        name, step = self._left
+        if name != self._before:
+            self._states.add((self._at + 1) * self._span_ns, step, state=[name])
+        self._before, self._left = name, None
+
+    def finish(self) -> None:
+        """Write how the last span has ended."""
+        if self._left is not None and self._at is not None:
+            self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
         """End the lane: which corners carry force from here on is not known."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
-        self._before = self._at = self._last = None
+        self._before = self._at = self._last = self._left = None
 
     def flush(self) -> None:
         """Send what has been collected."""

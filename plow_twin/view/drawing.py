@@ -114,7 +114,8 @@ class Drawing:
         self._shown: int | None = None
         self._sample_ns: int | None = None
         self._early: list[tuple[int, DiagnosticStatus]] = []
-        self._wrench = np.zeros(3)
+        self._wrench = np.full(3, np.nan)  # not known yet
+        self._worn = False
         self._largest_load = self._named_load = np.zeros(3)
         self._new_m = np.array(
             [getattr(scene.clearance, f"{name.partition('/')[0]}_m") for name in np.array(CLEARANCE_NAMES)[~_PADS]]
@@ -178,7 +179,7 @@ class Drawing:
 
     def _hole(self, count: int, after: Batch) -> None:
         """Note that entries are missing before a batch, and forget what was before them."""
-        self._sample_ns = None
+        self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
         if not isinstance(after.entries.others.get(0), Loss):  # it says so itself
             text = f"{count} journal entries are not there after this"
@@ -212,10 +213,8 @@ class Drawing:
         self.what_if.add(entries, stamps, steps)
         contact, head = found.get("contact_forces"), found.get("head_state")
         if contact is not None and head is not None:
-            samples = np.flatnonzero(entries.sample)
-            loads = np.concatenate((before[1][None], entries.wrench[samples]))
-            at = places(head)
-            self._section(contact, head, steps_before[at], loads[np.searchsorted(samples, at)])
+            at, loads = places(head), np.concatenate((before[1][None], self._loads(entries, advance, before[1])))
+            self._section(contact, head, steps_before[at], loads[np.searchsorted(np.flatnonzero(advance), at)])
         if head is not None:
             poses = [(index, entry) for index, entry in sorted(entries.others.items()) if isinstance(entry, Pose)]
             self.residual.add(*self._residuals.take(poses, steps, head))
@@ -223,10 +222,14 @@ class Drawing:
 
     def _entries(self, entries: Entries, stamps: Indexes, steps: Indexes, advance: NDArray[np.bool_]) -> None:
         """Draw load, quality and events of the journal."""
+        if self.header.excitation_source != "scene" and advance.any():
+            loads = self._loads(entries, advance, self._wrench)
+            told = np.isfinite(loads[:, 0])
+            self.load.add(stamps[advance][told], steps[advance][told], loads[told] / 1e3)
+            self._wrench = loads[-1]
         samples = np.flatnonzero(entries.sample)
         if samples.size:
             at, wrench = stamps[samples], entries.wrench[samples]
-            self.load.add(at, steps[samples], wrench / 1e3)
             self._largest_load = np.maximum(self._largest_load, np.abs(wrench).max(axis=0) / 1e3)
             age = entries.log_time_ns[samples] - at
             near = np.abs(age) <= _LARGEST_AGE_NS
@@ -234,7 +237,7 @@ class Drawing:
             interval = np.diff(at, prepend=at[0] if self._sample_ns is None else self._sample_ns)
             known = slice(1 if self._sample_ns is None else 0, None)
             self.interval.add(at[known], steps[samples][known], interval[known, None] / 1e6)
-            self._sample_ns, self._wrench = int(at[-1]), wrench[-1]
+            self._sample_ns = int(at[-1])
         for index in sorted(entries.others):
             self._back(samples[: np.searchsorted(samples, index)], stamps, steps)
             entry, stamp_ns = entries.others[index], int(stamps[index])
@@ -247,6 +250,16 @@ class Drawing:
         reached = np.flatnonzero(advance)
         if reached.size:
             self.step, self.stamp_ns = int(steps[-1]), int(stamps[reached[-1]])
+
+    @staticmethod
+    def _loads(entries: Entries, advance: NDArray[np.bool_], before: Array) -> Array:
+        """Return the load that each advance has led to, (n, 3): that of its sample, the one held, or none."""
+        places = np.flatnonzero(advance)
+        loads = np.where(entries.sample[places, None], entries.wrench[places], 0.0)
+        for row in np.flatnonzero(~entries.sample[places]).tolist():
+            if isinstance(entries.others[int(places[row])], Hold):
+                loads[row] = loads[row - 1] if row else before
+        return loads
 
     def _back(self, samples: Indexes, stamps: Indexes, steps: Indexes) -> None:
         if samples.size:
@@ -310,6 +323,10 @@ class Drawing:
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
                 labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} um" for depth in depth_mm[row]]
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
+            elif self._worn:  # the pads are new ones
+                self.pads.add(int(stamps[row]), int(steps[row]), centers=[], half_sizes=[])
+                self.pad_names.add(int(stamps[row]), int(steps[row]), positions=[], labels=[])
+            self._worn = bool(depth_mm[row].any())
 
     def _along_face(self, entries: Entries, rows: Rows, places: Indexes) -> None:
         """Assign the forces of some messages to places along the face, each under the speed at its time."""
@@ -360,7 +377,7 @@ class Drawing:
         centre, name = self.section.head_points(pose)
         self.names.add(stamp_ns, step, positions=[name])
         fx, fy, moment = load.tolist()
-        if self.header.excitation_source != "scene":
+        if self.header.excitation_source != "scene" and math.isfinite(fx):
             vector = (ARROW_MM_PER_N * fx, -ARROW_MM_PER_N * fy)
             label = f"load {math.hypot(fx, fy) / 1e3:.0f} kN, {moment / 1e3:+.0f} kN m"
             self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
@@ -399,6 +416,7 @@ class Drawing:
         """Draw how the recording ended and which parts are not there, and send what is still collected."""
         self._write_statuses()
         self.face.draw(self.stamp_ns, max(self.step, 0))
+        self.contact_sets.finish()
         told = [f"{count} {name.replace('_', ' ')}" for name, count in reader.lost_parts.items()]
         if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
             told.append(reader.status.value)
