@@ -12,9 +12,11 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import fields
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
 import setuptools
@@ -27,6 +29,7 @@ from rosbags.highlevel import AnyReader
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode, typestore
+from plow_twin.record.chunks import decompress, independent_blocks
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests, to_message
 from plow_twin.record.messages import JointState, Odometry, Text, WrenchStamped
@@ -347,3 +350,24 @@ def test_digests_are_read_in_compiled_code_as_from_their_text_or_left_to_it() ->
 def test_a_string_has_the_bytes_that_rosbags_gives_it(text: str) -> None:
     types = typestore()
     assert encode(Text(text)) == bytes(types.serialize_cdr(types.types[Text.TYPE](text), Text.TYPE))
+
+
+def test_frames_of_lz4_are_read_as_its_library_reads_them() -> None:
+    noise = np.random.default_rng(5).bytes(70_000)
+    contents = (b"", b"x", bytes(range(256)) * 1000, noise, 3 * (noise[:9000] + bytes(90_000)))
+    taken = 0
+    for content, linked, checksum, size in product(contents, (False, True), (False, True), (False, True)):
+        frame = lz4.frame.compress(content, block_linked=linked, content_checksum=checksum, store_size=size)
+        assert bytes(decompress("lz4", memoryview(frame), len(content))) == content
+        direct = independent_blocks(memoryview(frame), len(content))
+        assert direct is None or direct.tobytes() == content
+        taken += direct is not None
+    assert taken >= 6  # those that the recorder writes
+    whole = np.frombuffer(lz4.frame.compress(contents[4][:5000], block_linked=False), np.uint8)
+    for place in range(len(whole)):
+        assert independent_blocks(whole[:place].data, 5000) is None
+        for bit in range(8):
+            flipped = whole.copy()
+            flipped[place] ^= 1 << bit
+            found = independent_blocks(flipped.data, 5000)
+            assert found is None or len(found) == 5000
