@@ -23,6 +23,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from plow_twin import Wear
 from plow_twin.errors import RecordingError
+from plow_twin.record.bag import BagWriter, Topic
+from plow_twin.record.cdr import schema_text, type_hash
+from plow_twin.record.measured import read_recording
 from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
@@ -212,6 +215,28 @@ def test_messages_beside_a_run_that_do_not_fit_are_counted_by_topic(tmp_path: Pa
     (mapping := tmp_path / "map.yaml").write_text("head_pose: {topic: /pose, fields: {x: pose.x}}")
     found = analyse(run.folder, mapping=mapping)
     assert found.lost == {"unfit, head_pose: /pose has no number at 'pose.x' for x": 10} and found.lossy
+
+
+def test_what_a_killed_recorder_has_left_beside_a_run_is_read_as_far_as_it_goes_and_counted(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(1000)))
+    for name, data in (("beside", b""), ("beside_2", b"no such file")):
+        (run.folder / name).mkdir()
+        (run.folder / name / f"{name}_0.mcap").write_bytes(data)
+    text = "geometry_msgs/msg/PoseStamped"
+    writer = BagWriter(run.folder / "beside_3")
+    number = writer.topic(Topic("/pose", text, schema_text(text), type_hash(text), "[]"))
+    for index in range(90):
+        stamp = BASE_NS + index * 10**7
+        writer.add(number, index, stamp, stamp, bytes(pose_message(stamp, (1e-3, 0.0, 0.0))))
+        writer.flush()
+    writer.close()
+    counted = {"truncated_files": 1, "damaged_files": 1}
+    found = analyse(run.folder)
+    assert found.lost == counted and found.comparisons(found.predictions[0])["x"].n == 90
+    assert read_recording(run.folder).lost == counted
+    writer.path.write_bytes(writer.path.read_bytes()[:8000])
+    found = analyse(run.folder)
+    assert found.lost == {**counted, "truncated_files": 2} and 10 < found.comparisons(found.predictions[0])["x"].n < 90
 
 
 def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from plow_twin.build import package_version
+from plow_twin.record.chunks import is_begun, is_mcap
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, write_metadata
 from plow_twin.record.writer import BESIDE, make_folder, shortage
@@ -103,3 +104,15 @@ class BagWriter:
 def beside_folders(run: Path) -> Sequence[Path]:
     """Return the folders in a run's folder with what was recorded beside it."""
     return sorted(path for path in run.glob(f"{BESIDE}*") if path.is_dir() and any(path.glob("*.mcap")))
+
+
+def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
+    """Return of `beside_folders` those of which something can be read; the files of the others count as lost."""
+    found = []
+    for folder in beside_folders(run):
+        unreadable = [part for part in folder.glob("*.mcap") if not (is_begun(part) and is_mcap(part))]
+        if len(unreadable) < len([*folder.glob("*.mcap")]):  # else its reader counts them
+            found.append(folder)
+        else:
+            lost.update("damaged_files" if is_begun(part) else "truncated_files" for part in unreadable)
+    return found

@@ -21,7 +21,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import LONGEST_GAP, UNSTATED, Deviation, believed, own_deviations
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
-from plow_twin.record.bag import beside_folders
+from plow_twin.record.bag import readable_beside
 from plow_twin.record.estimated import stated
 from plow_twin.record.mapping import ROLES, UNFIT, messages_of, readings, roles_by_source
 from plow_twin.record.reader import Holes, RunReader, own_run
@@ -116,8 +116,11 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         rows, lost, why = {"head_pose": journalled}, Counter[str](), ""
         if mapping is not None or not (len(journalled) or len(gaps)):
             folder = path if path.is_dir() else path.parent
-            rows, _, lost, why = _collect([folder, *beside_folders(folder)], mapping, ("head_pose",), own.header.node)
+            unread = Counter[str]()
+            places = [folder, *readable_beside(folder, unread)]
+            rows, _, lost, why = _collect(places, mapping, ("head_pose",), own.header.node)
             lost.pop("missing_parts", 0)  # counted by the run itself
+            lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
     for name, found in (("load", len(loads)), ("measured pose", len(poses) + len(gaps))):

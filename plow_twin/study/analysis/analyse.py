@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
-from plow_twin.record.bag import beside_folders
+from plow_twin.record.bag import beside_folders, readable_beside
 from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed, JournalWalk, Walked, Walker
 from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source
@@ -384,8 +384,9 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
     """
     measured, unknown, unused = Measured(), dict[str, str](), Counter[str]()
     folder = path if path.is_dir() else path.parent
-    places = [place for place in (folder, *beside_folders(folder)) if any(place.glob("*.mcap"))]
-    for source, roles in roles_by_source([*map(open_source, places)], mapping, f"{node}/"):
+    places = [folder] if any(folder.glob("*.mcap")) else []
+    sources = [*map(open_source, [*places, *readable_beside(folder, unused)])]
+    for number, (source, roles) in enumerate(roles_by_source(sources, mapping, f"{node}/")):
         roles = {name: role for name, role in roles.items() if name not in ("excitation", "travel")}
         for name, arrived, found in readings(messages_of(source, roles) if roles else (), roles):
             if found is None:
@@ -395,8 +396,9 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
             else:
                 measured.add(name, *found)
         unknown |= source.losses.unknown_types
-        if source.losses.counts["undecodable"]:
-            unused["undecodable"] += source.losses.counts["undecodable"]
+        for name, count in source.losses.counts.items():
+            if count and (name == "undecodable" or number >= len(places)):  # the run counts the others of its own
+                unused[name] += count
     return measured, unknown, unused
 
 
