@@ -17,7 +17,7 @@ from scenes import ROOT, gaps_at, preset
 from scipy.stats import truncnorm
 from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
-from plow_twin import Friction, Initial, Scene, Table, Twin, Wear, simulate
+from plow_twin import Clearance, Friction, Initial, Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate import estimate as estimating
 from plow_twin.estimate.answer import followed
 from plow_twin.estimate.arrow import Arrow
@@ -662,6 +662,30 @@ def test_walls_worn_less_askew_do_not_make_the_clearance_too_small() -> None:
     result, true = worn_askew(0.6 * UNEVEN, 2)
     off = result.vertical.mean - 0.5 * (true["vertical_left"] + true["vertical_right"])
     assert abs(off) < 1.5e-4 and result.vertical.deviation < 2e-4
+
+
+def test_pads_that_are_not_touched_leave_a_clearance_between_askew_walls_open(
+    known: list[tuple[Truth, Estimate]],
+) -> None:
+    """The lower left pad is never reached: how far apart the lower pads are no motion tells, nor the mean of all."""
+    truth, _ = known[0]
+    depth = tuple(1e-3 * value for value in (3.0, 0.0, 0.0, 2.0, 0.0, 4.0, 1.0, 0.0))
+    scene = replace(
+        truth.scene,
+        clearance=Clearance(0.0324, 0.0185),
+        contact=replace(truth.scene.contact, stiffness=2.9e7, damping=1.2),
+        wear=Wear(0.0, 0.015, 0.0, initial_depth_m=depth),
+        loads=(Table("true", truth.load.t, truth.load.wrench * [0.98, 0.925, 0.912]),),
+    )
+    run = simulate(scene, float(truth.poses.t[-1]), 0.01, 1e-6)
+    noise = np.random.default_rng(1).standard_normal(run.q.shape) * [5e-4, 5e-4, 2e-3]
+    result = estimate(truth.nominal, truth.load, Poses.of(run.t, run.q + noise)[0])
+    assert run.statistics["bottom_left_left"]["time_in_contact"] == 0.0
+    # it was 1.1 mm too large, under a deviation of 0.03 mm
+    assert abs(result.horizontal.mean - 0.0354) < 3.0 * result.horizontal.deviation
+    assert abs(result.vertical.mean - 0.0205) < 3.0 * result.vertical.deviation < 3e-4
+    assert result.groups["horizontal_bottom"][1] is State.NOT_OBSERVABLE
+    assert result.groups["horizontal_top"][0].deviation < 1e-4
 
 
 def test_arrays_of_the_wrong_shape_are_named() -> None:

@@ -13,7 +13,7 @@ from plow_twin.estimate.fit import MOST_LEFT, Fit, Problem
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, Told, tell
 from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
-from plow_twin.estimate.pads import askew, by_group, turned
+from plow_twin.estimate.pads import askew, by_group, of_turns, turned
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.similar import Units
@@ -364,7 +364,8 @@ def warm_up(scene: Scene) -> None:
 def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estimate:
     """Turn a fit into values, intervals and states."""
     unknowns, poses = problem.unknowns, problem.window.poses
-    covariance = _covariance(problem, fit, verdict)
+    plain = _plain(problem, fit)
+    covariance = _covariance(problem, fit, verdict, plain)
     deviation, shared = np.sqrt(np.diag(covariance)), fit.shared
     suspect = bool(verdict.model or verdict.sensor)
     finished = fit.finished
@@ -407,7 +408,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
         sensor="suspect" if verdict.sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
-        groups=_groups(problem, fit, covariance, states),
+        groups=_groups(problem, fit, float(np.sqrt(covariance[GX, GX] / plain[GX, GX])), states),
         correlation=_correlation(covariance),
         figures={
             **verdict.figures,
@@ -418,8 +419,13 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
     )
 
 
-def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
-    """Return the covariance of the shared unknowns: as the noise gives it, or as the swings scatter if that is more.
+def _plain(problem: Problem, fit: Fit) -> Array:
+    """Return the covariance that the noise gives; walls that were found turned may be turned otherwise too."""
+    return fit.covariance + of_turns(problem, fit) if problem.turns.any() else fit.covariance
+
+
+def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
+    """Return the covariance of the shared unknowns: `plain` of the noise, or as the swings scatter if that is more.
 
     What scatters is one thing for all unknowns that move the head: the ratio is the mean of theirs, since each by
     itself is a chance of some tens of swings. Linked swings have it in their links. The fit has taken its own freedom
@@ -427,8 +433,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict) -> Array:
     size, not with its root. The step that a fit would still take is no part of what it knows.
     """
     size = len(fit.shared)
-    plain = fit.covariance
-    ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(plain)))
+    ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else UNFINISHED)
     covariance: Array = plain * (widened**2 * ratio) + np.outer(fit.left[:size], fit.left[:size])
@@ -449,9 +454,8 @@ def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
     return freed * float((scattered / variance)[moving].mean())
 
 
-def _groups(problem: Problem, fit: Fit, covariance: Array, states: list[State]) -> dict[str, tuple[Interval, State]]:
+def _groups(problem: Problem, fit: Fit, widened: float, states: list[State]) -> dict[str, tuple[Interval, State]]:
     """Return the clearance of each group of pads; not observable where the motion does not tell it."""
-    widened = float(np.sqrt(covariance[GX, GX] / fit.covariance[GX, GX]))
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
         state = states[0 if name.startswith("horizontal") else 1]

@@ -79,6 +79,17 @@ def turned(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
     return problem, found
 
 
+def of_turns(problem: Problem, found: Fit) -> Array:
+    """Return what walls that may be turned add to the covariance of the shared unknowns, shape (11, 11).
+
+    Where only one of the pads that face each other is touched, how far the others are apart is not known.
+    """
+    _, covariance = _joint_step(problem, found)
+    held = np.linalg.inv(covariance)[:SIZE, :SIZE]
+    added: Array = covariance[:SIZE, :SIZE] - np.linalg.inv(held)
+    return added
+
+
 def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
     """Return the linearised step of the shared unknowns and the turns together, shape (15,), and its covariance."""
     turns = _columns(problem, found)
