@@ -25,7 +25,7 @@ from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Entry, Hold, Pose, Reset, Sample, SetWear, Travel, Unload
+from plow_twin.stream.journal import Entry, Hold, Parameter, Pose, Reset, Sample, SetWear, Travel, Unload
 from plow_twin.view import ViewSummary, layout, to_rrd
 from plow_twin.view.columns import TimeAxis, extremes
 from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
@@ -80,6 +80,19 @@ def journal_around_the_hole(folder: Path) -> list[Sample]:
 
 def scalars(table: pa.Table) -> np.ndarray:
     return np.array(table["Scalars:scalars"].to_pylist(), dtype=np.float64).ravel()
+
+
+def kept_figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Return a list that receives the figures drawn from now on."""
+    figures: list[Figure] = []
+
+    class Kept(backend_agg.FigureCanvasAgg):
+        def __init__(self, figure: Figure) -> None:
+            figures.append(figure)
+            super().__init__(figure)
+
+    monkeypatch.setattr(backend_agg, "FigureCanvasAgg", Kept)
+    return figures
 
 
 def test_rerun_verifies_the_file_and_finds_a_blueprint(view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:
@@ -326,6 +339,16 @@ def test_a_picture_needs_no_viewer(run: Run, tmp_path: Path) -> None:
     assert (tmp_path / "run.png").read_bytes()[:4] == b"\x89PNG" and (tmp_path / "run.png").stat().st_size > 50_000
 
 
+def test_what_is_not_in_a_recording_is_not_in_its_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures = kept_figures(monkeypatch)
+    journal = [Parameter("hold", "hold"), *map(paper_sample, range(100))]
+    run = record_run(tmp_path / "run", journal, frame_every=10**9)
+    to_png(run.folder, tmp_path / "run.png")
+    section, wide, force, load, clearance = figures[0].axes
+    said = [axis.texts[0].get_text() for axis in (section, wide, force, clearance)]
+    assert all(text.endswith("in the recording") for text in said) and not section.lines and load.lines
+
+
 def test_a_run_without_a_row_has_no_picture(tmp_path: Path) -> None:
     empty = record_run(tmp_path / "run", ())
     with pytest.raises(RecordingError, match=r"run_0\.mcap: got no row to draw"):
@@ -393,14 +416,7 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
         assert [state for state in tables["/contact_set"]["StateChange:state"].to_pylist() if not state] == [[], []]
     lines = [text[0] for text in tables["/events"]["TextLog:text"].to_pylist()]
     assert lines[-1] == "recording: 1 missing parts" and sum("are not there after this" in line for line in lines) == 1
-    figures: list[Figure] = []
-
-    class Kept(backend_agg.FigureCanvasAgg):
-        def __init__(self, figure: Figure) -> None:
-            figures.append(figure)
-            super().__init__(figure)
-
-    monkeypatch.setattr(backend_agg, "FigureCanvasAgg", Kept)
+    figures = kept_figures(monkeypatch)
     assert cli(["view", str(run.folder), "--png", str(tmp_path / "run.png")]) == 3
     assert "lost {'missing_parts': 1}" in capsys.readouterr().err
     for axis in figures[0].axes[2:]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,9 +69,8 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     force, load, clearance = drawn = _Largest(8), _Largest(3), _Largest(6)
     names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}
     first_ns: int | None = None
-    pose, contact = (0.0, 0.0, 0.0), np.full(8, -np.inf)
-    largest, now, held = 0.0, (0.0, 0.0, 0.0), np.zeros(8)
-    gaps, shown = np.zeros(8), np.zeros(8)
+    shown: _Moment | None = None
+    held, gaps = np.zeros(8), np.zeros(8)
     reached: int | None = None  # number of the newest entry
     for record in reader:
         if isinstance(record, EntryRecord):
@@ -89,8 +88,8 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
         if isinstance(message, Odometry):
             turn = message.orientation
             now = (message.position[0], message.position[1], 2.0 * math.atan2(turn[2], turn[3]))
-            if held.max() > largest or first_ns is None:
-                largest, pose, contact, shown = float(held.max()), now, held, gaps
+            if shown is None or held.max() > shown.force.max():
+                shown = _Moment(now, held, gaps)
         elif isinstance(message, JointState):
             first_ns = message.stamp_ns if first_ns is None else first_ns
             time_s = (message.stamp_ns - first_ns) * 1e-9
@@ -105,8 +104,13 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     figure = Figure(figsize=(15, 8.5), layout="constrained")
     grid = figure.add_gridspec(3, 3)
     factor = exaggerate or section.exaggeration()
-    _draw_section(figure.add_subplot(grid[:2, 0]), section, pose, contact, largest)
-    _draw_wide(figure.add_subplot(grid[2, 0]), section, shown, factor)
+    upper, lower = figure.add_subplot(grid[:2, 0]), figure.add_subplot(grid[2, 0])
+    if shown is None:
+        _say_nothing(upper, "no pose in the recording")
+        _say_nothing(lower, "no penetrations in the recording")
+    else:
+        _draw_section(upper, section, shown)
+        _draw_wide(lower, section, shown.penetration, factor)
     axis = figure.add_subplot(grid[0, 1:])
     _curves(
         axis, force, PAIR_NAMES, "largest force [kN]", [tuple(part / 255 for part in color) for color in PAIR_COLORS]
@@ -135,9 +139,22 @@ def _clearance_row(message: JointState) -> NDArray[np.float64]:
     return np.array([1e3 * message.position[message.name.index(name)] for name in wanted])
 
 
-def _draw_section(
-    axis: Any, section: Section, pose: tuple[float, float, float], force: NDArray[np.float64], largest: float
-) -> None:
+class _Moment(NamedTuple):
+    """Pose x, y [m], theta [rad] of the head at a stamp, forces [N] and penetrations [m] of the pairs."""
+
+    pose: tuple[float, float, float]
+    force: NDArray[np.float64]
+    penetration: NDArray[np.float64]
+
+
+def _say_nothing(axis: Any, text: str) -> None:
+    """Say in the place of a drawing that there is nothing to draw."""
+    axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes)
+    axis.set(yticks=[])
+
+
+def _draw_section(axis: Any, section: Section, moment: _Moment) -> None:
+    pose, force, largest = moment.pose, moment.force, float(moment.force.max())
     axis.plot(*section.frame_strip().T, color="0.5", label=section.frame_name)
     for number, strip in enumerate(section.head_strips(pose)):
         axis.plot(*strip.T, color="k", lw=1.0, label="" if number else "head")
@@ -148,7 +165,7 @@ def _draw_section(
             axis.annotate("", origin + vector, origin, arrowprops={"arrowstyle": "->", "color": color, "lw": 2})
             text = f"{force[pair] / 1e3:.0f} kN"
             axis.annotate(text, origin + 1.25 * vector, color=color, ha="center", va="center", fontsize=8)
-    axis.set(aspect="equal", title=f"Cross-section [mm] at the largest force, {largest / 1e3:.1f} kN")
+    axis.set(aspect="equal", title=f"Cross-section [mm], largest force at a stamp: {largest / 1e3:.1f} kN")
     axis.margins(0.1)
     axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.06), ncols=2, fontsize=7)
     _y_upwards(axis)
@@ -179,6 +196,8 @@ def _curves(axis: Any, rows: _Largest, names: Sequence[str], label: str, colors:
     axis.set_ylabel(label)
     if len(values):
         _legend_beside(axis)
+    else:
+        _say_nothing(axis, "not in the recording")
 
 
 def _bands(axis: Any, rows: _Largest, new_m: Sequence[float]) -> None:
@@ -192,6 +211,8 @@ def _bands(axis: Any, rows: _Largest, new_m: Sequence[float]) -> None:
     axis.set_ylabel("growth of the clearance,\n5..95 % [um]")
     if len(values):
         _legend_beside(axis)
+    else:
+        _say_nothing(axis, "not in the recording")
 
 
 def _legend_beside(axis: Any) -> None:
