@@ -112,6 +112,7 @@ def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
         (["simulate", "bad.yaml", "--t-end", "1"], "head.mass: got 2430.0, expected a known key, nearest is mass_kg"),
         (["replay", "missing.mcap"], "missing.mcap"),
         (["demo", "--speed", "warp"], "warp"),
+        (["record", "run", "--all", "--exclude", "["], "expected a regular expression"),
         (["nonsense"], "nonsense"),
     ],
 )
@@ -123,6 +124,12 @@ def test_wrong_usage_and_wrong_scenes_exit_with_2(arguments: list[str], said: st
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
+
+
+def test_a_closed_standard_output_is_no_traceback() -> None:
+    command = [sys.executable, "-m", "plow_twin", "info", "paper"]
+    done = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *command], capture_output=True, text=True, timeout=100)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_what_cannot_be_done_exits_with_1(tmp_path: Path) -> None:

@@ -140,12 +140,16 @@ def test_failed_members_are_listed_and_other_questions_refused(
     assert run([*arguments, "--set", "head.mass_kg=2000"]) == 2
     assert "differs in the scene" in capsys.readouterr().err
     assert (tmp_path / "sweep.parquet").read_bytes() == stored
+    (tmp_path / "chunks" / "notes.txt").write_text("somebody's")
     assert run([*arguments, "--set", "head.mass_kg=2000", "--fresh", "-q"]) == 3
+    assert (tmp_path / "chunks" / "notes.txt").read_text() == "somebody's"
     for wrong, message in (
         (["--x", "contact.stiffness=1:2"], "PATH=LOW:HIGH:COUNT".replace("PATH", "contact.stiffness")),
         (["--statistic", "max.ccw.z"], "nearest: max.ccw"),
         (["--x", "contact.law=flores,hu_gou"], "contact.law: got 'hu_gou', expected one of exact_restitution"),
         (["--y", "contact.stiffness=1:2:3"], "two different ones"),
+        (["--x", "contact.stiffness=1:2:100000000"], "expected at most 1000000"),
+        (["--x", "contact.stiffness=1:2:2000", "--y", "head.mass_kg=1:2:2000"], "got 4000000 members"),
         (["--dask", "tcp://127.0.0.1:1"], "expected the address of a scheduler"),
     ):
         extra = ["--fresh", "--x", "contact.stiffness=1e7:2e7:2"] if "--dask" in wrong else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -39,6 +40,12 @@ def record(
     """
     if not topics and not every:
         raise click.UsageError("got no topic, expected some or --all")
+    try:
+        re.compile(exclude or "")
+    except re.error as error:
+        raise click.BadParameter(
+            f"got {exclude!r}, expected a regular expression: {error}", param_hint="--exclude"
+        ) from None
     os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels: where the types' texts stand
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.reader import RunReader

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
+import re
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
@@ -24,6 +24,8 @@ from plow_twin.study.sweep.table import Sweep, Table, chunks_of
 Array = NDArray[np.float64]
 
 FORMAT: Final = 1
+#: A chunk, or what a process killed while it wrote one has left.
+_CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 
 
 class Store:
@@ -49,11 +51,13 @@ class Store:
         self.folder, self.sweep, self.chunk = folder, sweep, chunk
         self._chunks = folder / "chunks"
         if fresh:
-            shutil.rmtree(self._chunks, ignore_errors=True)
+            for path in [*self._chunks.glob("*.npz*"), *self._chunks.glob(".*.npz.*")]:
+                if _CHUNK_NAME.fullmatch(path.name):  # what is not a sweep's stays
+                    path.unlink()
             (folder / "sweep.json").unlink(missing_ok=True)
         if (folder / "sweep.json").exists():
             self._take_up()
-        elif self._chunks.exists():
+        elif self._chunks.exists() and not fresh:
             raise StudyError(
                 f"{folder}: got chunks without sweep.json, expected a sweep's folder (--fresh discards it)"
             )

@@ -106,8 +106,9 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     factor = exaggerate or section.exaggeration()
     upper, lower = figure.add_subplot(grid[:2, 0]), figure.add_subplot(grid[2, 0])
     if shown is None:
-        _say_nothing(upper, "no pose in the recording")
-        _say_nothing(lower, "no penetrations in the recording")
+        for place, what in ((upper, "pose"), (lower, "penetrations")):
+            _say_nothing(place, f"no {what} in the recording")
+            place.set(xticks=[])
     else:
         _draw_section(upper, section, shown)
         _draw_wide(lower, section, shown.penetration, factor)

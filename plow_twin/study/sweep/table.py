@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 #: Status of a member whose values no scene can have.
 UNUSABLE: Final = -1
+#: A sweep has at most that many members: the table, and the list of chunks, are held in memory.
+_MOST_MEMBERS: Final = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -59,9 +61,13 @@ def parse_axis(text: str, scene: Scene) -> Axis:
             log = scale == ["log"]
             if scale not in ([], ["lin"], ["log"]) or (log and min(float(low), float(high)) <= 0.0) or int(count) < 1:
                 raise ValueError
+            if int(count) > _MOST_MEMBERS:
+                raise StudyError(f"axis: got {int(count)} values of {path}, expected at most {_MOST_MEMBERS}")
             # numpy's spacing ends at the bounds exactly
             spaced = (np.geomspace if log else np.linspace)(float(low), float(high), int(count))
             values = tuple(map(float, spaced))
+    except StudyError:
+        raise
     except ValueError:
         raise StudyError(f"axis: got {text!r}, expected {expected} (log: bounds > 0)") from None
     if not values or not all(math.isfinite(value) for value in values) or len(set(values)) < len(values):
@@ -84,6 +90,8 @@ class Sweep:
         paths = [axis.path for axis in self.axes]
         if not 1 <= len(paths) <= 2 or len(set(paths)) < len(paths):
             raise StudyError(f"axes: got {paths}, expected one parameter or two different ones")
+        if self.size > _MOST_MEMBERS:
+            raise StudyError(f"axes: got {self.size} members, expected at most {_MOST_MEMBERS}")
         if not self.statistics or len(set(self.statistics)) < len(self.statistics):
             raise StudyError(f"statistics: got {list(self.statistics)}, expected at least one, each once")
         for name in self.statistics:
