@@ -266,6 +266,16 @@ def test_another_law_is_told_by_what_classifies_draws_of_both() -> None:
     assert (wrong > estimating.MOST_OTHER_LAW).mean() > 0.8
 
 
+def test_another_law_behind_a_soft_contact_is_told_where_residuals_hardly_repeat(
+    known: list[tuple[Truth, Estimate]],
+) -> None:
+    truth = draw(GROUPS["kelvin_voigt"], 57001)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.model == "suspect" and "law" in result.reasons[0] and result.figures["repeated"] < 2.0
+    for _, right in known:
+        assert abs(right.figures["law"]) < 4.0
+
+
 def test_behind_a_soft_contact_the_fit_tells_the_bias(known: list[tuple[Truth, Estimate]]) -> None:
     truth, _ = known[0]
     assert not bias_of_hard(Unknowns(truth.nominal), truth.poses).any()

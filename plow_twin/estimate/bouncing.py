@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches, smooth_width
-from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, Unknowns
+from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, OTHER_LAW, Unknowns, with_other_law
 from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
@@ -58,9 +58,8 @@ _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
 _NO_LAG = 4
 #: Draws of each round.
 _DRAWS: Final = (30, 30, 40)
-#: The law that a linear contact may have instead of the one believed; draws of it, and the steps after which no further
-#: one is made; median share of the critical damping that they have, and the deviation of its logarithm.
-_OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
+#: Draws of another law, and the steps after which no further one is made; median share of the critical damping that
+#: they have, and the deviation of its logarithm.
 _OTHER_DRAWS, _OTHER_WORK = 60, 1_500_000
 _DAMPING_SHARE, _SHARE_DEVIATION = 0.2, 0.6
 #: Distances in rows over which the changes of pose and reaches are told, and what a coefficient is held to zero by in
@@ -269,21 +268,16 @@ class _Drawn:
         drawn = self.rng.standard_normal(5)
         numbers: Array = mean + spread * drawn
         numbers[0] = np.clip(numbers[0], *np.log(_BOUNDS))
-        if self.unknowns.scene.contact.law in _OTHER_LAW.values():
+        if self.unknowns.scene.contact.law in OTHER_LAW.values():
             # a share of the critical damping of the head's mass, whatever the stiffness
-            stiffness = self.unknowns.force / math.exp(numbers[0])
-            critical = 2.0 * math.sqrt(stiffness * self.unknowns.scene.head.mass_kg)
+            critical = self.unknowns.critical_damping(self.unknowns.force / math.exp(numbers[0]))
             numbers[1] = math.log(_DAMPING_SHARE * critical) + _SHARE_DEVIATION * drawn[1]
         return numbers
 
     def of_other_law(self) -> _Drawn | None:
         """Return none yet of the law that the contact may have instead, None where no such is known."""
-        contact = self.unknowns.scene.contact
-        law = _OTHER_LAW.get(contact.law)
-        if law is None or contact.exponent != 1.0:
-            return None
-        scene = replace(self.unknowns.scene, contact=replace(contact, law=law, damping=1.0, restitution=None))
-        return _Drawn(self.forward.of(scene), replace(self.unknowns, scene=scene), self.eye, self.rng)
+        other = with_other_law(self.unknowns)
+        return None if other is None else _Drawn(self.forward.of(other.scene), other, self.eye, self.rng)
 
     def like(self) -> Array:
         """Return what the motions are like, shape (n, m)."""

@@ -51,6 +51,8 @@ _LEAST_DRIFT = 1e-8
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
 #: Gain in the cost that a fit may still have before it.
 MOST_LEFT = 25.0
+#: Rows of a swing with fewer of which it tells nothing beside its own state.
+_FEWEST_ROWS = 4
 #: Longest step of the iteration in units of the prior's standard deviation.
 _LONGEST_STEP = 1.0
 
@@ -364,6 +366,36 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
     gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2
     gradient[SIZE:] += ((problem.window.states - point.states) / _START_SPREAD**2).ravel()
     return normal.plus(np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / _START_SPREAD**2, swings)])), gradient
+
+
+def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
+    """Return the linearised step of the shared unknowns and of further ones together, and its covariance.
+
+    `columns` (n, 3, k) are the derivatives of the prediction by the further unknowns, `precision` and `pull` (k,) what
+    the prior adds to their normal equations. Each swing's starting state is eliminated.
+    """
+    size = SIZE + len(precision)
+    normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
+    gradient = np.concatenate([(problem.mean - found.shared) / problem.deviation**2, pull])
+    z = np.abs(np.nan_to_num(found.point.residual)) / np.sqrt(found.variance)
+    weight = np.isfinite(found.point.residual) * np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / found.variance
+    residual = np.nan_to_num(found.point.residual)
+    for swing in range(problem.window.swings):
+        inside = found.point.swing == swing
+        if inside.sum() < _FEWEST_ROWS:
+            continue
+        shared = np.concatenate([found.linear.rows[inside][:, :, :SIZE], columns[inside]], axis=2).reshape(-1, size)
+        own = found.linear.rows[inside][:, :, SIZE:].reshape(-1, 6)
+        weights = weight[inside].reshape(-1, 1)
+        cross = (weights * shared).T @ own
+        held = (weights * own).T @ own
+        held += np.diag(1e-6 + 1e-9 * np.diag(held))
+        gain = np.linalg.solve(held, cross.T).T
+        left = (weights * residual[inside].reshape(-1, 1)).ravel()
+        normal += (weights * shared).T @ shared - gain @ cross.T
+        gradient += shared.T @ left - gain @ (own.T @ left)
+    covariance: Array = np.linalg.inv(normal)
+    return covariance @ gradient, covariance
 
 
 def _descend(

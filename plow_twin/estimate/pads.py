@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.fit import HUBER, WALLS, Fit, Problem, fit
+from plow_twin.estimate.fit import WALLS, Fit, Problem, fit, joint_step
 from plow_twin.estimate.gaps import GROUPS
 from plow_twin.estimate.result import Interval
 from plow_twin.estimate.unknowns import GX, GY, SIZE
@@ -32,7 +32,6 @@ _MADE_OF: Final = {
 _TURN, _STEP = 4e-3, 2e-4
 #: Rounds of fits with turned walls, iterations of each; longest turn of a round, and one that ends them, in m.
 _ROUNDS, _ITERATIONS, _LONGEST_TURN, _NO_TURN = 4, 15, 2e-3, 1e-4
-_FEWEST_ROWS = 4
 assert list(_MADE_OF) == list(GROUPS)
 
 
@@ -92,29 +91,8 @@ def of_turns(problem: Problem, found: Fit) -> Array:
 
 def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
     """Return the linearised step of the shared unknowns and the turns together, shape (15,), and its covariance."""
-    turns = _columns(problem, found)
-    size = SIZE + len(WALLS)
-    normal = np.diag(np.concatenate([1.0 / problem.deviation**2, np.full(len(WALLS), 1.0 / _TURN**2)]))
-    gradient = np.concatenate([(problem.mean - found.shared) / problem.deviation**2, -problem.turns / _TURN**2])
-    z = np.abs(np.nan_to_num(found.point.residual)) / np.sqrt(found.variance)
-    weight = np.isfinite(found.point.residual) * np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / found.variance
-    residual = np.nan_to_num(found.point.residual)
-    for swing in range(problem.window.swings):
-        inside = found.point.swing == swing
-        if inside.sum() < _FEWEST_ROWS:
-            continue
-        shared = np.concatenate([found.linear.rows[inside][:, :, :SIZE], turns[inside]], axis=2).reshape(-1, size)
-        own = found.linear.rows[inside][:, :, SIZE:].reshape(-1, 6)
-        weights = weight[inside].reshape(-1, 1)
-        cross = (weights * shared).T @ own
-        held = (weights * own).T @ own
-        held += np.diag(1e-6 + 1e-9 * np.diag(held))
-        gain = np.linalg.solve(held, cross.T).T
-        left = (weights * residual[inside].reshape(-1, 1)).ravel()
-        normal += (weights * shared).T @ shared - gain @ cross.T
-        gradient += shared.T @ left - gain @ (own.T @ left)
-    covariance: Array = np.linalg.inv(normal)
-    return covariance @ gradient, covariance
+    precision = np.full(len(WALLS), 1.0 / _TURN**2)
+    return joint_step(problem, found, _columns(problem, found), precision, -problem.turns * precision)
 
 
 def _columns(problem: Problem, found: Fit) -> Array:

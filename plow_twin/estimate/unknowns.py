@@ -50,6 +50,9 @@ _SOFTEST = 0.12
 _LEAST_CLEARANCE = 5e-4
 
 
+#: The law that a linear contact may have instead of the one believed.
+OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
+
 #: Largest prior deviation of a load's gain.
 _MOST_GAIN = 1.0
 
@@ -134,6 +137,10 @@ class Unknowns:
         u = max(math.exp(psi) - _RESOLVED, _HARDEST)
         return float(self.force / u**self.scene.contact.exponent)
 
+    def critical_damping(self, stiffness: float) -> float:
+        """Return the damping in N s/m with which the head's mass on a spring of `stiffness` N/m just does not swing."""
+        return 2.0 * math.sqrt(stiffness * self.scene.head.mass_kg)
+
     @property
     def hardest_believed(self) -> float:
         """Stiffness up to which the prior reaches where the motion only tells that the contact is hard."""
@@ -168,3 +175,13 @@ class Unknowns:
             contact = replace(contact, impact_speed_floor_m_s=max(contact.impact_speed_floor_m_s, SLOWEST_IMPACT))
         clearance = Clearance(float(vector[GX]), float(vector[GY]))
         return replace(self.scene, clearance=clearance, contact=contact, loads=(), wear=None)
+
+
+def with_other_law(unknowns: Unknowns) -> Unknowns | None:
+    """Return the prior about a scene with the law that its contact may have instead, None where no such is known."""
+    contact = unknowns.scene.contact
+    law = OTHER_LAW.get(contact.law)
+    if law is None or contact.exponent != 1.0:
+        return None
+    other = replace(contact, law=law, damping=1.0, restitution=None)
+    return replace(unknowns, scene=replace(unknowns.scene, contact=other))

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.arrow import OWN
-from plow_twin.estimate.fit import Fit, Problem, pieces
+from plow_twin.estimate.fit import Fit, Problem, joint_step, pieces
 from plow_twin.estimate.measurements import FEWEST_POSES, Poses
 from plow_twin.estimate.start import noise_level
-from plow_twin.estimate.unknowns import BIAS, GAIN, GX, GY, SIZE
+from plow_twin.estimate.unknowns import BIAS, DAMPING, GAIN, GX, GY, SIZE, SOFTNESS, with_other_law
 
 Array = NDArray[np.float64]
 
@@ -38,6 +38,11 @@ STUCK_FOR_CERTAIN = 50
 CHANGE_CHI2, CHANGE_M = 200.0, 5e-4
 #: Moments of a window, about, at which a change is looked for.
 MOMENTS = 60
+#: Step from the law believed to another one in its standard deviations (at most 2.1 for 16 right models, seeds from
+#: 42200 on), and the share of the critical damping that the other one has.
+MOST_LAW_STEP, LAW_DAMPING = 5.0, 0.05
+#: Precision of an unknown of which nothing is known.
+_FREE = 1e-6
 #: Quick noise of one part of the window over that of the rest.
 MOST_NOISE_RATIO = 2.0
 
@@ -59,6 +64,7 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
     _change_within(problem, fit, verdict)
     _colour(fit, verdict)
     _repeated(problem, fit, period, verdict)
+    _other_law(problem, fit, verdict)
     for name, gain, deviation in zip(("fx", "fy", "m"), fit.shared[GAIN], fit.deviation[GAIN], strict=True):
         excess = (abs(gain - 1.0) - MOST_GAIN) / max(deviation, 1e-9)
         verdict.figures[f"gain_{name}"] = float(gain)
@@ -142,6 +148,35 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
     verdict.figures["repeated"] = ratio
     if ratio > MOST_REPEATED and not verdict.sensor:
         verdict.model.append(f"residuals repeat with the load: {ratio:.1f}, expected at most {MOST_REPEATED:g}")
+
+
+def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
+    """Tell how far toward another law the residuals would move the motion (score test, linearised).
+
+    One more unknown mixes the motion of the other law, from the same states, into that of the law believed; all others
+    are eliminated with it.
+    """
+    unknowns = with_other_law(problem.unknowns)
+    if unknowns is None or not fit.finished:
+        return
+    shared = fit.shared.copy()
+    stiffness = unknowns.stiffness_of(float(shared[SOFTNESS]))
+    shared[DAMPING] = math.log(LAW_DAMPING * unknowns.critical_damping(stiffness))
+    prior = problem.mean, problem.deviation
+    forward, window = problem.forward.of(unknowns.scene), problem.window
+    other = Problem(forward, unknowns, window, prior, problem.horizon, problem.turns, problem.drift)
+    point = other.evaluate(shared, fit.point.states)
+    problem.forward.work += forward.work
+    if point is None:
+        return
+    change = np.nan_to_num(fit.point.residual - point.residual)[:, :, None]
+    step, covariance = joint_step(problem, fit, change, np.full(1, _FREE), np.zeros(1))
+    moved = float(step[-1] / math.sqrt(covariance[-1, -1]))
+    verdict.figures["law"] = moved
+    if abs(moved) > MOST_LAW_STEP and not verdict.sensor:
+        verdict.model.append(
+            f"residuals like those of another contact law: {moved:.1f}, expected at most {MOST_LAW_STEP:g}"
+        )
 
 
 def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
