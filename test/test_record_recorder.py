@@ -26,6 +26,7 @@ from record_support import BASE_NS, STEP_NS, paper_sample
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record import ring
+from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import UnbufferedFile
@@ -495,3 +496,21 @@ def test_without_sync_the_disk_is_not_waited_for_and_with_it_a_closed_run_is_who
     folder = tmp_path / "True"
     assert waited[1][str(folder / "True_0.mcap")] == (folder / "True_0.mcap").stat().st_size
     assert {str(folder / "metadata.yaml.partial"), str(folder)} <= set(waited[1])
+
+
+def test_a_full_disk_beside_a_run_is_said_at_once_and_when_there_is_room_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    writer = BagWriter(tmp_path / "beside", said.append)
+    number = writer.topic(Topic("/level", "own/msg/Level", "float64 value", "RIHS01_" + 64 * "0", "[]"))
+    for index, free in enumerate([True, False, False, True, True]):
+        monkeypatch.setattr("plow_twin.record.bag.shortage", lambda folder, least, free=free: None if free else "full")
+        writer.add(number, index, index, index, bytes(12))
+        writer.flush()
+    assert [text.removeprefix(f"{writer.path}: ") for text in said] == [
+        "full: what comes is lost until there is room",
+        "goes on, 2 messages are lost",
+    ]
+    writer.close()
+    assert (writer.written["/level"], writer.lost["/level"]) == (3, 2)

@@ -62,7 +62,16 @@ def record(
             if not quiet:
                 click.echo(f"recording to {folder} until interrupted", err=True)
 
-        facts = record_topics(folder, topics, every=every, exclude=exclude, but=own, stopped=stopped, on_started=say)
+        facts = record_topics(
+            folder,
+            topics,
+            every=every,
+            exclude=exclude,
+            but=own,
+            stopped=stopped,
+            on_started=say,
+            on_trouble=lambda text: click.echo(f"plow-twin: {text}", err=True),
+        )
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:

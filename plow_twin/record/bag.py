@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -32,7 +32,8 @@ class Topic:
 class BagWriter:
     """Write messages to a new folder; `lost` counts by topic what had no room on the disk.
 
-    A killed process loses what came since the last `flush`.
+    A killed process loses what came since the last `flush`. `on_trouble` is told at once when the disk takes no more,
+    and when it does again.
 
     Raises
     ------
@@ -40,7 +41,7 @@ class BagWriter:
         The folder cannot be made.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, on_trouble: Callable[[str], object] = lambda text: None) -> None:
         make_folder(folder)
         self.folder = folder
         self.path = folder / f"{folder.name}_0.mcap"
@@ -51,6 +52,7 @@ class BagWriter:
         self.written: Counter[str] = Counter()
         self.lost: Counter[str] = Counter()
         self.error = ""
+        self._on_trouble, self._in_trouble = on_trouble, False
 
     def topic(self, topic: Topic) -> int:
         """Return the number of a new topic."""
@@ -79,7 +81,13 @@ class BagWriter:
             self._chunk.clear()
             self.lost.update(waiting)
             self.error = f"{self.path}: {error.strerror or error}"
+            if not self._in_trouble:
+                self._on_trouble(f"{self.error}: what comes is lost until there is room")
+            self._in_trouble = True
         else:
+            if waiting and self._in_trouble:
+                self._on_trouble(f"{self.path}: goes on, {sum(self.lost.values())} messages are lost")
+                self._in_trouble = False
             self.written.update(waiting)
 
     def close(self) -> None:

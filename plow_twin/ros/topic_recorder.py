@@ -169,6 +169,7 @@ def record_topics(
     but: Iterable[str],
     stopped: Callable[[], bool],
     on_started: Callable[[Path], object] = lambda folder: None,
+    on_trouble: Callable[[str], object] = lambda text: None,
 ) -> Mapping[str, Any]:
     """Record topics to a new folder until `stopped`; return what was written, lost and skipped by topic.
 
@@ -193,7 +194,7 @@ def record_topics(
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = WithoutEvents("plow_twin_record", start_parameter_services=False, enable_rosout=False)
-    writer = in_free_folder(folder, BagWriter)
+    writer = in_free_folder(folder, partial(BagWriter, on_trouble=on_trouble))
     try:
         recorder = TopicRecorder(node, writer, wanted)
         executor = make_executor()
