@@ -383,12 +383,7 @@ class Outputs:
         """
         # after each row: views instead of copies
         chosen: NDArray[np.int64] | slice = slice(None) if len(taken) == len(stamps) else taken
-        eight = (len(taken), PAIR_COUNT)
-        makes, impulse, peak = np.empty(eight, np.int64), np.empty(eight), np.empty(eight)
-        self._makes, self._impulse, self._peak = self._makes.copy(), self._impulse.copy(), self._peak.copy()
-        sum_windows(
-            (rows.makes, rows.impulse, rows.peak), taken, self._makes, self._impulse, self._peak, makes, impulse, peak
-        )
+        makes, impulse, peak = self._windows(rows, taken)
         slow_index, clearance, wear_rate = self._slow_rows(stamps[chosen], rows.wear_depth[chosen])
         measured_peak = self._measured_peak
         if measured_peak is not None:
@@ -416,6 +411,22 @@ class Outputs:
         if len(taken):
             self._corrected_ns = self._before = None
         return publications
+
+    def _windows(self, rows: AdvanceSeries, taken: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array, Array]:
+        """Return makes so far, impulse and peak of the window that ends with each of the rows `taken`."""
+        if len(taken) == len(rows) and not (self._impulse.any() or self._peak.any()):
+            # each row is a window
+            makes = rows.makes.cumsum(axis=0)
+            makes += self._makes
+            self._makes = makes[-1].copy()
+            return makes, rows.impulse, rows.peak
+        eight = (len(taken), PAIR_COUNT)
+        makes, impulse, peak = np.empty(eight, np.int64), np.empty(eight), np.empty(eight)
+        self._makes, self._impulse, self._peak = self._makes.copy(), self._impulse.copy(), self._peak.copy()
+        sum_windows(
+            (rows.makes, rows.impulse, rows.peak), taken, self._makes, self._impulse, self._peak, makes, impulse, peak
+        )
+        return makes, impulse, peak
 
     def _slow_rows(self, stamps: NDArray[np.int64], wear_depth: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Return which of some publications have a slow part, and the parts."""
