@@ -170,12 +170,13 @@ def test_what_was_recorded_beside_a_run_is_examined_and_repaired(tmp_path: Path)
     for index in range(100):
         writer.add(number, index, index, index, bytes(12))
         writer.flush()
+    writer.lost["/level"] = 7  # as a full disk does
     writer.close()
-    assert examine(run.folder).problems == []
+    lost = "beside: 7 lost on /level, as counted by the recorder"
+    assert examine(run.folder).problems == [lost]
     writer.path.write_bytes(writer.path.read_bytes()[:2000])  # its recorder was killed
-    (writer.folder / "metadata.yaml").unlink()
-    assert examine(run.folder).problems == ["beside/beside_0.mcap: cut off: it has no end"]
-    assert repair(run.folder) == [writer.path] and examine(run.folder).problems == []
+    assert examine(run.folder).problems == ["beside/beside_0.mcap: cut off: it has no end", lost]
+    assert repair(run.folder) == [writer.path] and examine(run.folder).problems == [lost]
     with writer.path.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None and summary.statistics is not None and summary.statistics.message_count > 5

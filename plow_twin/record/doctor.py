@@ -21,7 +21,16 @@ from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
-from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, listed_parts, qos_text, write_metadata
+from plow_twin.record.metadata_yaml import (
+    LOST,
+    PartFacts,
+    TopicCount,
+    bag_metadata,
+    listed_parts,
+    qos_text,
+    told_lost,
+    write_metadata,
+)
 from plow_twin.record.reader import FileStatus, RunReader, run_parts
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Loss, Sample, Snapshot
@@ -145,6 +154,8 @@ def examine(path: Path) -> RunReport:
     for folder in beside_folders(reader.path.parent) if path.is_dir() else ():
         for part in run_parts(folder):
             report.problems += [f"{folder.name}/{text}" for text in _part_problems(_part(part))]
+        for topic, count in told_lost(folder).items():
+            report.problems.append(f"{folder.name}: {count} lost on {topic}, as counted by the recorder")
     return report
 
 
@@ -299,7 +310,9 @@ def _put_aside(file: Path, ending: str) -> None:
 def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
     """Write `metadata.yaml` for those parts that can be read."""
     facts = [_facts(part) for part in parts if part.exists() and is_begun(part) and is_mcap(part)]
-    custom = {f"plow_twin_{REPAIRED_KEY}": ", ".join(repaired)} if repaired else {}
+    custom = {f"{LOST}{topic}": count for topic, count in told_lost(folder).items()}
+    if repaired:
+        custom[f"plow_twin_{REPAIRED_KEY}"] = ", ".join(repaired)
     if facts:
         write_metadata(folder, bag_metadata(facts, custom))
 

@@ -16,6 +16,8 @@ from plow_twin.scene_file.yaml_text import load_yaml as read_yaml
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
+#: Before the topic, a key under `custom_data` whose value counts what the recorder has lost.
+LOST: Final = "plow_twin_lost "
 
 
 @dataclass
@@ -151,6 +153,16 @@ def listed_parts(folder: Path) -> list[str]:
     except Exception as error:  # the library's own, for each kind of damage another
         raise RecordingError(f"{path}: cannot be read as the metadata of a bag") from error
     return [str(name) for name in found]
+
+
+def told_lost(folder: Path) -> dict[str, str]:
+    """Return by topic what `metadata.yaml` says that its recorder has lost; nothing where it cannot be read."""
+    try:
+        found = load_yaml((folder / "metadata.yaml").read_text(encoding="utf-8"))
+        custom = found["rosbag2_bagfile_information"]["custom_data"] or {}
+        return {key.removeprefix(LOST): str(count) for key, count in custom.items() if key.startswith(LOST)}
+    except Exception:
+        return {}
 
 
 def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
