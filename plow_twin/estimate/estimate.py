@@ -14,12 +14,12 @@ from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, Told, tell
 from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
 from plow_twin.estimate.pads import askew, by_group, of_turns, turned
-from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
+from plow_twin.estimate.result import CORRELATED, NORMAL_P95, Estimate, Interval, State
 from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, MOVING, SIZE, SOFTNESS, Spread, Unknowns
-from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, sandwich
+from plow_twin.estimate.verdict import COMPONENTS, Verdict, foretold, judge, judge_sensor, sandwich
 from plow_twin.model import geometry
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import inertias
@@ -44,6 +44,10 @@ _MOVES = 5.0
 _RESTS, _IDLE_LOAD, _STANDARD_GRAVITY = 1.3, 0.05, 9.81
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
+#: Share of what was measured of x, or y, that the model must foretell: the rest hardly counts in the fit.
+FORETOLD = 0.08
+#: Penetration of both walls at most, in that under the reference force: the paper's forces are up to twice as large.
+_GIVEN = 4.0
 #: Knots of the load in a period that are simulated, about.
 KNOTS = 120
 #: Beyond so many times that, the load is averaged instead: 9 ms at the period of the paper.
@@ -374,11 +378,18 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
         reasons = [
             f"the fit has not come to its end: {fit.gain_left:.0f} are left to gain, expected at most {MOST_LEFT:g}"
         ]
-    least, _ = range_of_motion(unknowns.scene, poses)
+    # walls give way: the head has been farther than they are, at most by so much
+    given = _GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * deviation[SOFTNESS]))
+    least = range_of_motion(unknowns.scene, poses)[0] - given
+    share = foretold(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
     clearances, states = [], []
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
+        # what cannot be foretold contradicts no clearance
+        tested = share[index] > FORETOLD or unknowns.is_hard(fit.shared)
+        if not tested and finished and not suspect:
+            reasons.append(f"{COMPONENTS[index]}: {share[index]:.0%} of it can be foretold, expected {FORETOLD:.0%}")
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
-        observed = finished and touched > TOUCHED and deviation[index] < OBSERVED
+        observed = finished and tested and touched > TOUCHED and deviation[index] < OBSERVED
         value = Interval.normal(shared[index], deviation[index])
         if not observed:
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
