@@ -68,3 +68,12 @@ def test_a_call_from_python_of_what_has_no_machine_code_says_so() -> None:
 def normal_force(*numbers: float) -> float:
     """Call the kernel of this name."""
     return contact.normal_force(*numbers)
+
+
+def test_a_disk_that_takes_no_cache_is_said_and_the_run_goes_on(tmp_path: Path) -> None:
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", full + LINKED], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "0\n"), done.stderr
+    said = [line for line in done.stderr.splitlines() if "RuntimeWarning:" in line]
+    assert len(said) == 1 and said[0].endswith(f"{tmp_path}: File too large"), done.stderr

@@ -7,17 +7,20 @@ there would go unseen. Here the stamp of each cached function stands for the tex
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numba
 
-from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, keep_from_python, save_later
+from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, background, keep_from_python
 from plow_twin.kernel.quick import load_numba
 
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
+
+_said: set[str] = set()
 
 load_numba()
 
@@ -68,13 +71,38 @@ def kernel(
             cache_file._source_stamp = SOURCE_DIGEST
             # read before the rest of an index, which cannot be read once a type that it names is gone
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
-            if inline != "source" and not entry:
+            linked = inline != "source" and not entry
+            if linked:
                 keep_from_python(dispatcher)
-                save_later(dispatcher)
+            _save_or_say(dispatcher, later=linked)
         compiled: Callable[..., Any] = dispatcher
         return compiled
 
     return decorate
+
+
+def _save_or_say(dispatcher: Any, *, later: bool) -> None:
+    """Let a disk that does not take the cache be said, and no error: what is compiled works without it.
+
+    `later` : written when LLVM is done with what goes into it.
+    """
+    cache = dispatcher._cache
+    save = cache.save_overload
+
+    def save_or_warn(signature: Any, result: Any) -> None:
+        try:
+            save(signature, result)
+        except OSError as error:
+            place = Path(cache.cache_path).parent
+            text = f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}"
+            if text not in _said:  # numba makes Python forget which warnings it has given
+                _said.add(text)
+                warnings.warn(text, RuntimeWarning, stacklevel=1)
+
+    if later:
+        cache.save_overload = lambda signature, result: background.do(save_or_warn, signature, result)
+    else:
+        cache.save_overload = save_or_warn
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:

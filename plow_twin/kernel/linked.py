@@ -169,10 +169,3 @@ def keep_from_python(dispatcher: Any) -> None:
         raise TypeError(f"{dispatcher.py_func.__qualname__} is for kernels to call: it would have to be an entry")
 
     dispatcher._insert, dispatcher._compile_for_args = lambda *overload, **options: None, refuse
-
-
-def save_later(dispatcher: Any) -> None:
-    """Write the cache when LLVM is done with what goes into it."""
-    cache = dispatcher._cache
-    save = cache.save_overload
-    cache.save_overload = lambda signature, result: background.do(save, signature, result)
