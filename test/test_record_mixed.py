@@ -223,6 +223,16 @@ def test_a_late_speed_at_the_edge_of_the_memory_acts_where_it_did(tmp_path: Path
     assert _same(live.replayed())
 
 
+def test_a_speed_before_the_first_sample_acts_from_there_on_however_often_it_is_run_again(tmp_path: Path) -> None:
+    live = Mixed(tmp_path, rollback_span=0.1)
+    live.driver.travel(T0 + 36 * MS, 2.8)
+    live.driver.travel(T0 + 13 * MS, 1.7)
+    live.send(*(_swinging(ms) for ms in (*range(50), *range(53, 59)) if ms != 8))
+    live.send(_swinging(51))
+    assert live.driver.rolled_back == 1 and live.driver.session._speed == 1.7
+    assert _same(live.replayed())
+
+
 def _drive(live: Mixed, random: Random, calls: int) -> None:
     """Call a live twin with whatever there is, in any mix."""
     index, skipped, fails = 0, [], random.random() < 0.4

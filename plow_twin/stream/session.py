@@ -494,7 +494,9 @@ class Session:
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
             self._speed = travel.speed_m_s
-        elif self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
+        elif self.stamp_ns is None:
+            self._take_speed(travel.speed_m_s)  # from the first sample on: nobody goes back to before it
+        elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
             # too old to be worked in at its place: it acts from the newest sample on, or from the one state kept
@@ -505,8 +507,11 @@ class Session:
             self._work_in(travel.stamp_ns, [], travel)
 
     def _set_speed(self, travel: Travel) -> None:
-        self._speed = travel.speed_m_s
         self.history.add_travel(travel)
+        self._take_speed(travel.speed_m_s)
+
+    def _take_speed(self, speed_m_s: float) -> None:
+        self._speed = speed_m_s
         if not self.held:
             self.twin.set_travel_speed(self._speed)
 
