@@ -18,7 +18,20 @@ from plow_twin.estimate.result import CORRELATED, NORMAL_P95, Estimate, Interval
 from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
-from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, GX, GY, MOVING, SIZE, SOFTNESS, Spread, Unknowns
+from plow_twin.estimate.unknowns import (
+    BIAS,
+    DAMPING,
+    DELAY,
+    GAIN,
+    GX,
+    GY,
+    MOVING,
+    SIZE,
+    SOFTNESS,
+    Spread,
+    Unknowns,
+    with_other_law,
+)
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, foretold, judge, judge_sensor, sandwich
 from plow_twin.model import geometry
 from plow_twin.model.scene import Scene
@@ -353,16 +366,18 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
 
 
 def warm_up(scene: Scene) -> None:
-    """Compile the kernel that a scene needs, or load it from the cache on disk."""
+    """Compile the kernels that a scene needs, or load them from the cache on disk."""
     load = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
-    Forward(scene, load).run(
-        replace(scene, loads=(), wear=None),
-        np.ones(3),
-        np.zeros(1),
-        np.zeros((1, 6)),
-        np.array([0, 1]),
-        np.array([1e-3]),
-    )
+    other = with_other_law(Unknowns(scene))
+    for one in (scene,) if other is None else (scene, other.scene):
+        Forward(one, load).run(
+            replace(one, loads=(), wear=None),
+            np.ones(3),
+            np.zeros(1),
+            np.zeros((1, 6)),
+            np.array([0, 1]),
+            np.array([1e-3]),
+        )
 
 
 def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estimate:
