@@ -118,9 +118,9 @@ def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
     """Return of `beside_folders` those of which something can be read; the files of the others count as lost."""
     found = []
     for folder in beside_folders(run):
-        unreadable = [part for part in folder.glob("*.mcap") if not (is_begun(part) and is_mcap(part))]
-        if len(unreadable) < len([*folder.glob("*.mcap")]):  # else its reader counts them
+        parts = [*folder.glob("*.mcap")]
+        if any(is_begun(part) and is_mcap(part) for part in parts):  # its reader counts the others
             found.append(folder)
         else:
-            lost.update("damaged_files" if is_begun(part) else "truncated_files" for part in unreadable)
+            lost.update("damaged_files" if is_begun(part) else "truncated_files" for part in parts)
     return found

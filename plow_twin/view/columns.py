@@ -90,6 +90,7 @@ class Curves:
         self._parts, self._ends, self._waiting = [], [], 0
         everywhere = np.arange(len(stamps))
         kept = extremes(self._spans(stamps, ends), values) if self.span_ns else None
+        every = self._axis.columns(stamps, steps) if kept is None else None
         for entity, number in zip(self.entities, range(values.shape[1]), strict=True):
             chosen = everywhere if kept is None else np.flatnonzero(kept[:, number])
             valued = chosen[~ends[chosen]]
@@ -97,7 +98,7 @@ class Curves:
             columns = rr.Scalars.columns(scalars=np.ascontiguousarray(values[valued, number]))
             if len(valued) < len(chosen):
                 columns = columns.partition((~ends[chosen]).astype(np.int64))
-            indexes = self._axis.columns(stamps[chosen], steps[chosen])
+            indexes = self._axis.columns(stamps[chosen], steps[chosen]) if every is None else every
             rr.send_columns(entity, indexes, columns, recording=self._stream)
 
     def _spans(self, stamps: Indexes, ends: NDArray[np.bool_]) -> Indexes:
