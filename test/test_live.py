@@ -39,9 +39,10 @@ from plow_twin.live.part import Part
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Preparation
 from plow_twin.record.doctor import examine
+from plow_twin.record.entries import EntryRecord
 from plow_twin.record.mapping import read_map
 from plow_twin.record.measured import read_recording
-from plow_twin.record.reader import EntryRecord, RunReader
+from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import Arrived, Columns
 from plow_twin.record.times import time_ns

@@ -14,7 +14,8 @@ from plow_twin.live.bridge.files import Files
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.load_model import LoadModel, read_load_model
 from plow_twin.live.solver_start import Preparation
-from plow_twin.record.reader import EntryRecord, RunReader
+from plow_twin.record.entries import EntryRecord
+from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import Sample, Spread
 

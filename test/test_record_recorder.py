@@ -27,11 +27,12 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record import ring
 from plow_twin.record.bag import BagWriter, Topic
+from plow_twin.record.entries import EntryRecord, OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import UnbufferedFile
 from plow_twin.record.messages import JointState
-from plow_twin.record.reader import EntryRecord, FileStatus, OutputRecord, RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.recorder import JOURNAL, Recorder
 from plow_twin.record.replay import replay
 from plow_twin.record.ring import RingWriter

@@ -28,10 +28,11 @@ from record_support import (
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode
+from plow_twin.record.entries import OutputRecord
 from plow_twin.record.header import HEADER_RECORD
 from plow_twin.record.messages import JointState, WrenchStamped
 from plow_twin.record.outputs import PUBLICATION_TOPICS
-from plow_twin.record.reader import FileStatus, OutputRecord, RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene

@@ -19,7 +19,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from plow_twin.live.parameters import SPECS, Effect
-from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.record.entries import EntryRecord
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import Mark
 

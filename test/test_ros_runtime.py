@@ -29,8 +29,9 @@ from sensor_msgs.msg import JointState
 
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
+from plow_twin.record.entries import EntryRecord
 from plow_twin.record.measured import read_recording
-from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns

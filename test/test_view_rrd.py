@@ -20,8 +20,9 @@ from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Wear
+from plow_twin.record.entries import EntryRecord
 from plow_twin.record.messages import JointState, Odometry
-from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from plow_twin.record.entries import EntryRecord
 from plow_twin.record.journal_codec import Dropped
-from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Loss
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.record.cdr import decode, encode
+from plow_twin.record.entries import OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
-from plow_twin.record.reader import OutputRecord
 from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.journal import Parameter, Pose
 from plow_twin.stream.outputs import Publication, Publications

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.record.entries import Entries, Holes
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mapping import Role, readings
-from plow_twin.record.reader import Entries, Holes
 from plow_twin.record.sources import Arrived
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.stream.intake import Intake, Verdict

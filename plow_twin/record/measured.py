@@ -22,9 +22,10 @@ from plow_twin.estimate.measurements import LONGEST_GAP, UNSTATED, Deviation, be
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import readable_beside
+from plow_twin.record.entries import Holes
 from plow_twin.record.estimated import stated
 from plow_twin.record.mapping import ROLES, UNFIT, messages_of, readings, roles_by_source
-from plow_twin.record.reader import Holes, RunReader, own_run
+from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source, read_table
 from plow_twin.record.times import EPOCH_S, time_ns
 from plow_twin.scene_file import load_scene

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.cdr import decode
 from plow_twin.record.chunks import ChunkReader, Messages, is_begun, is_mcap, metadata_records
+from plow_twin.record.entries import NO_ENTRIES, Batch, Entries, Outputs, Record, in_order, parted_at, unwrap
 from plow_twin.record.follow import Tail
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD, STOPPED_EARLY_KEY, RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests
 from plow_twin.record.messages import MESSAGE_TYPES, Message, WrenchStamped
 from plow_twin.record.metadata_yaml import missing_files
-from plow_twin.record.template import Indexes, Template, compiled, read_numbers
-from plow_twin.stream.journal import Digest, Entry, Sample
+from plow_twin.record.template import Indexes, Template, read_numbers
+from plow_twin.stream.journal import Entry, Sample
 
 #: Journal entries that may wait for the messages sent after them [entries]: bounds the memory.
 _PENDING: Final = 65_536
@@ -37,7 +38,6 @@ _LEAST: Final = 8192
 _LEAST_ALONE: Final = 32_768
 #: Size of a recording of all outputs at 1 kHz for each second [B].
 _BYTES_PER_S: Final = 400_000
-_HALF, _WHOLE = 2**31, 2**32
 #: Fx, Fy, M among the numbers of a sample.
 _WRENCH: Final = np.array([0, 1, 5])
 
@@ -50,203 +50,6 @@ class FileStatus(Enum):
     STOPPED_EARLY = "stopped early: the recorder closed it before the run ended"
     TRUNCATED = "truncated: the recorder did not close it"
     DAMAGED = "damaged: chunks could not be read"
-
-
-@dataclass(frozen=True, slots=True)
-class EntryRecord:
-    """A journal entry, or the recorder's note, at its place in the common order."""
-
-    sequence: int
-    log_time_ns: int
-    entry: Entry | Dropped
-
-
-@dataclass(frozen=True, slots=True)
-class OutputRecord:
-    """A message that was sent after journal entry number `sequence`; `data` are its CDR bytes."""
-
-    sequence: int
-    log_time_ns: int
-    publish_time_ns: int
-    topic: str
-    message_type: str
-    data: bytes
-
-    def message(self) -> Message:
-        """Decode the message."""
-        return decode(self.data, self.message_type)
-
-
-Record = EntryRecord | OutputRecord
-
-
-@dataclass(frozen=True)
-class Entries:
-    """Journal entries in order of use, shape (n,) each, by kind: `sample` is True for samples.
-
-    Digests stand at the indexes `digest_at` (m,), as numbers `digest` (m,), their stamps in `stamp_ns`; all else is in
-    `rest` by index. Sequence numbers are counted on beyond 2^32.
-    """
-
-    sequence: Indexes
-    log_time_ns: Indexes
-    sample: NDArray[np.bool_]
-    stamp_ns: Indexes
-    wrench: NDArray[np.float64]
-    digest_at: Indexes
-    digest: NDArray[np.uint64]
-    rest: Mapping[int, Entry | Dropped]
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    def __getitem__(self, chosen: slice) -> Entries:
-        first, last, _ = chosen.indices(len(self))
-        begin, end = np.searchsorted(self.digest_at, (first, last)).tolist()
-        return Entries(
-            self.sequence[chosen],
-            self.log_time_ns[chosen],
-            self.sample[chosen],
-            self.stamp_ns[chosen],
-            self.wrench[chosen],
-            self.digest_at[begin:end] - first,
-            self.digest[begin:end],
-            {index - first: entry for index, entry in self.rest.items() if first <= index < last},
-        )
-
-    def samples(self) -> tuple[Indexes, NDArray[np.float64]]:
-        """Return stamps and wrenches of the samples alone."""
-        places = np.flatnonzero(self.sample)
-        return self.stamp_ns[places], self.wrench.take(places, axis=0)  # a mask of rows takes five times as long
-
-    @cached_property
-    def others(self) -> Mapping[int, Entry | Dropped]:
-        """All entries that are no samples, by index."""
-        stamps = self.stamp_ns[self.digest_at].tolist()
-        found: dict[int, Entry | Dropped] = {
-            index: Digest(stamp_ns, f"{digest:016x}")
-            for index, stamp_ns, digest in zip(self.digest_at.tolist(), stamps, self.digest.tolist(), strict=True)
-        }
-        return found | dict(self.rest)
-
-    def record(self, index: int) -> EntryRecord:
-        """Return one entry with its place."""
-        entry: Entry | Dropped
-        if self.sample[index]:
-            fx, fy, moment = self.wrench[index].tolist()
-            entry = Sample(int(self.stamp_ns[index]), (fx, fy, moment))
-        else:
-            entry = self.others[index]
-        return EntryRecord(int(self.sequence[index]) % _WHOLE, int(self.log_time_ns[index]), entry)
-
-    @classmethod
-    def joined(cls, parts: list[Entries]) -> Entries:
-        """Return the entries of some parts, at least one, one after the other."""
-        if len(parts) == 1:
-            return parts[0]
-        begins = np.cumsum([0, *map(len, parts)]).tolist()
-        return cls(
-            np.concatenate([part.sequence for part in parts]),
-            np.concatenate([part.log_time_ns for part in parts]),
-            np.concatenate([part.sample for part in parts]),
-            np.concatenate([part.stamp_ns for part in parts]),
-            np.concatenate([part.wrench for part in parts]),
-            np.concatenate([begin + part.digest_at for begin, part in zip(begins, parts, strict=False)]),
-            np.concatenate([part.digest for part in parts]),
-            {
-                begin + index: entry
-                for begin, part in zip(begins, parts, strict=False)
-                for index, entry in part.rest.items()
-            },
-        )
-
-
-_NONE: Final = np.zeros(0, np.int64)
-_NO_ENTRIES: Final = Entries(
-    _NONE, _NONE, np.zeros(0, bool), _NONE, np.zeros((0, 3)), _NONE, np.zeros(0, np.uint64), {}
-)
-
-
-@dataclass(frozen=True)
-class Outputs:
-    """Messages that were sent, of one chunk; `sequence` is counted on beyond 2^32, `topics` names the channels."""
-
-    messages: Messages
-    sequence: Indexes
-    topics: Mapping[int, tuple[str, str]]
-
-    def __len__(self) -> int:
-        return len(self.sequence)
-
-    @cached_property
-    def newest(self) -> int:
-        """The highest number; there is at least one message."""
-        return int(self.sequence.max())
-
-    def __getitem__(self, chosen: slice) -> Outputs:
-        return Outputs(self.messages[chosen], self.sequence[chosen], self.topics)
-
-    def record(self, index: int) -> OutputRecord:
-        """Return one message with its place."""
-        messages = self.messages
-        topic, message_type = self.topics[int(messages.channel[index])]
-        return OutputRecord(
-            int(self.sequence[index]) % _WHOLE,
-            int(messages.log_time_ns[index]),
-            int(messages.publish_time_ns[index]),
-            topic,
-            message_type,
-            messages.data(index),
-        )
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Entries, and all messages that were sent after one of them and before the next batch.
-
-    `damaged` : chunks could not be read since the batch before; what they held may be missing anywhere in this one.
-    """
-
-    entries: Entries
-    outputs: list[Outputs]
-    damaged: bool = False
-
-    def parted(self, places: Sequence[int]) -> Iterator[Batch]:
-        """Yield the batch in pieces: the entries before each of these places, which rise, and the rest."""
-        outputs, begin = self.outputs, 0
-        for place in places:
-            now, outputs = _parted_at(outputs, int(self.entries.sequence[place]))
-            yield Batch(self.entries[begin:place], now, self.damaged)
-            begin = place
-        yield Batch(self.entries[begin:], outputs, self.damaged)
-
-
-class Holes:
-    """Where entries of a journal are not there, by their numbers, from batch to batch."""
-
-    def __init__(self) -> None:
-        self._next: int | None = None  # number of the next entry
-
-    def take(self, entries: Entries) -> dict[int, int]:
-        """Return the places before which entries are missing, in order, and how many."""
-        if not len(entries):
-            return {}
-        reached = np.maximum.accumulate(entries.sequence) + 1
-        start = int(entries.sequence[0]) if self._next is None else self._next
-        expected = np.maximum(np.concatenate(([start], reached[:-1])), start)
-        self._next = max(start, int(reached[-1]))
-        places = np.flatnonzero(entries.sequence > expected)
-        return dict(zip(places.tolist(), (entries.sequence - expected)[places].tolist(), strict=True))
-
-
-def _parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list[Outputs]]:
-    """Return the messages with a number below `end`, and the others."""
-    before, after = [], []
-    for part in outputs:
-        place = len(part) if part.newest < end else int((part.sequence >= end).argmax())
-        before += [part[:place]] if place else []
-        after += [part[place:]] if place < len(part) else []
-    return before, after
 
 
 @dataclass
@@ -355,7 +158,7 @@ class RunReader:
 
     def __iter__(self) -> Iterator[Record]:
         for batch in self.batches():
-            yield from _in_order(batch)
+            yield from in_order(batch)
 
     def batches(self, *, outputs: bool = True) -> Iterator[Batch]:
         """Yield the records in order, many at a time; without `outputs` the journal alone, as fast as can be."""
@@ -386,7 +189,7 @@ class RunReader:
                 yield from merger.add(messages)
                 if self.tail is not None and not len(messages):
                     yield from merger.finish()
-                    yield Batch(_NO_ENTRIES, [])
+                    yield Batch(NO_ENTRIES, [])
             before += reader.position
             finished, cut = finished and reader.finished, not reader.finished
             self.damaged_chunks += reader.damaged
@@ -450,7 +253,7 @@ class _Merger:
         header = reader.header
         self._journal = (header.samples_topic, header.entries_topic)
         self._template = sample_template(header.frame_id)
-        self._entries = [_NO_ENTRIES]
+        self._entries = [NO_ENTRIES]
         self._count = 0  # of these
         self._outputs: list[Outputs] = []
         self._base = 0
@@ -524,7 +327,7 @@ class _Merger:
         count = int(later[0]) if later.size else len(waiting)
         entries, self._entries = waiting[:count], [waiting[count:]]
         self._count = len(waiting) - count
-        outputs, self._outputs = _parted_at(self._outputs, end)
+        outputs, self._outputs = parted_at(self._outputs, end)
         if len(entries) or outputs:
             damaged = self._run.damaged_chunks + (self._chunks.damaged if self._chunks is not None else 0)
             yield Batch(entries, outputs, damaged > self._damaged)
@@ -563,37 +366,11 @@ class _Merger:
         return Entries(sequence, messages.log_time_ns, good, stamps, wrench, left[found], digests[found], rest)
 
 
-@compiled
-def unwrap(sequence: Indexes, base: int, out: Indexes) -> None:
-    """Write the numbers counted on beyond 2^32 that are nearest to `base`."""
-    for n in range(sequence.size):
-        out[n] = base + ((sequence[n] - base + _HALF) & (_WHOLE - 1)) - _HALF
-
-
 def _of(messages: Messages, channels: list[int]) -> Messages:
     wanted = np.zeros(int(messages.channel.max(initial=0)) + 1, bool)
     wanted[channels] = True
     chosen = wanted[messages.channel]
     return messages if chosen.all() else messages[np.flatnonzero(chosen)]
-
-
-def _in_order(batch: Batch) -> Iterator[Record]:
-    """Yield each entry and then the messages that were sent after it."""
-    sequences = [part.sequence for part in batch.outputs]
-    owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
-    places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # messages before an entry of a higher number; the running maximum keeps odd files in their own order
-    bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
-    slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
-    order = np.argsort(slots, kind="stable")
-    ends = np.searchsorted(slots[order], np.arange(len(batch.entries) + 1), side="right")
-    begin = 0
-    for slot in range(len(batch.entries) + 1):
-        if slot:
-            yield batch.entries.record(slot - 1)
-        for index in order[begin : ends[slot]].tolist():
-            yield batch.outputs[int(owners[index])].record(int(places[index]))
-        begin = int(ends[slot])
 
 
 def sample_template(frame_id: str) -> Template:

@@ -25,6 +25,7 @@ from plow_twin.record.alarms import ALARMS, AlarmCheck
 from plow_twin.record.cdr import decode, encode
 from plow_twin.record.chunks import Messages, scan
 from plow_twin.record.comparing import Sent
+from plow_twin.record.entries import Batch, Entries, EntryRecord, OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
@@ -33,15 +34,7 @@ from plow_twin.record.outputs import (
     publication_messages,
     publication_templates,
 )
-from plow_twin.record.reader import (
-    Batch,
-    Entries,
-    EntryRecord,
-    FileStatus,
-    OutputRecord,
-    RunReader,
-    sample_template,
-)
+from plow_twin.record.reader import FileStatus, RunReader, sample_template
 from plow_twin.record.replay_report import Divergence, ReplayReport
 from plow_twin.record.sent_messages import SentMessages
 from plow_twin.record.template import Indexes, Templates, read_numbers

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.record.entries import Outputs
 from plow_twin.record.messages import JointState, Message, Odometry
-from plow_twin.record.reader import Outputs
 from plow_twin.record.template import Indexes, Template, read_numbers
 
 Array = NDArray[np.float64]

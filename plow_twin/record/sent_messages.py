@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 
 from plow_twin.record.chunks import Messages
+from plow_twin.record.entries import OutputRecord, Outputs
 from plow_twin.record.outputs import PUBLICATION_TOPICS
-from plow_twin.record.reader import OutputRecord, Outputs
 from plow_twin.record.template import Indexes
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from plow_twin.record.entries import Entries
 from plow_twin.record.journal_codec import Dropped
-from plow_twin.record.reader import Entries, RunReader
+from plow_twin.record.reader import RunReader
 from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Travel, Unused
 
 

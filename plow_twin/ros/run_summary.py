@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKWISE, corner_of
 from plow_twin.model.scene import Scene
+from plow_twin.record.entries import EntryRecord, OutputRecord
 from plow_twin.record.messages import JointState
-from plow_twin.record.reader import EntryRecord, OutputRecord, RunReader
+from plow_twin.record.reader import RunReader
 from plow_twin.stream.journal import Estimated
 
 #: Mask of the pairs that belong to each sense of swing.

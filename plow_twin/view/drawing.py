@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
 from plow_twin.record.alarms import ALARMS
+from plow_twin.record.entries import Batch, Entries, Holes
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.outputs import publication_templates
-from plow_twin.record.reader import Batch, Entries, FileStatus, Holes, RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.rows import Rows, rows_by_topic
 from plow_twin.stream.journal import Hold, Loss, Pose, Reset, Travel, Unload
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.entries import EntryRecord
 from plow_twin.record.messages import JointState, Odometry
-from plow_twin.record.reader import EntryRecord, FileStatus, RunReader
+from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.stream.journal import Reset, Sample
 from plow_twin.view.section import PAIR_COLORS, Section
 

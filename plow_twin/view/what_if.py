@@ -9,9 +9,9 @@ import rerun as rr
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
+from plow_twin.record.entries import Entries
 from plow_twin.record.header import RunHeader
 from plow_twin.record.importing import JournalWalk, Walked, Walker
-from plow_twin.record.reader import Entries
 from plow_twin.run.twin import Twin
 from plow_twin.stream.session import Session
 from plow_twin.view import layout

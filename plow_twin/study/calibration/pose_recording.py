@@ -113,8 +113,9 @@ def _require(lacking: list[str], got: list[str]) -> None:
 
 def _read_mcap(path: Path) -> tuple[Array, Array, Table | None]:
     """Read the poses that the node published (`head_state`) and the load samples that it took in."""
+    from plow_twin.record.entries import EntryRecord, OutputRecord
     from plow_twin.record.messages import Odometry
-    from plow_twin.record.reader import EntryRecord, OutputRecord, RunReader
+    from plow_twin.record.reader import RunReader
     from plow_twin.stream.journal import Sample
 
     reader = RunReader(path)
