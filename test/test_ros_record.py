@@ -66,7 +66,7 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
     assert facts["messages"][f"{namespace}/camera/pose"] == COUNT and facts["messages"][f"{namespace}/notes"] == 1
     gauge = f"{namespace}/gauge"
     assert facts["messages"][gauge] + facts["lost"].pop(gauge, 0) == 2 * COUNT  # best effort
-    assert facts["lost"] == {} and facts["skipped_topics"] == {}
+    assert facts["lost"] == {} == facts["skipped_topics"] and facts["without_publisher"] == []
     # what the run holds itself is left out
     assert not facts["messages"].keys() & {*RunReader(run).header.topics.values()}
     with Reader(run / "beside") as reader:
@@ -78,3 +78,17 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
     (tmp_path / "map.yaml").write_text(MAP % namespace)
     found = analyse(run, mapping=tmp_path / "map.yaml")
     assert found.comparisons(found.predictions[0])["x"].n == COUNT
+
+
+def test_a_topic_that_was_named_and_never_had_a_publisher_is_said_and_is_no_success(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "plow_twin", "record", str(tmp_path / "run"), "never", "--wait", "0"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as recorder:
+        assert recorder.stderr is not None
+        try:
+            assert "recording to" in recorder.stderr.readline()
+            recorder.send_signal(signal.SIGTERM)
+            said = recorder.stderr.read()
+        finally:
+            recorder.kill()
+    assert "/never: not recorded: no publisher, expected one" in said
+    assert recorder.returncode == 3

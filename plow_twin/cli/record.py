@@ -20,7 +20,7 @@ from plow_twin.cli.console import (
 )
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with counted loss.")
+@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with loss or without a named topic.")
 @click.argument("run", type=click.Path(path_type=Path, file_okay=False))
 @click.argument("topics", metavar="[TOPIC]...", nargs=-1)
 @click.option("--all", "every", is_flag=True, help="All topics but hidden ones and those that the run holds itself.")
@@ -78,4 +78,6 @@ def record(
         show_facts(output_console(), facts)
     for name, reason in facts["skipped_topics"].items():
         click.echo(f"plow-twin: {name}: not recorded: {reason}", err=True)
-    return DONE_WITH_LOSS if facts["lost"] or facts["error"] else DONE
+    for name in facts["without_publisher"]:
+        click.echo(f"plow-twin: {name}: not recorded: no publisher, expected one", err=True)
+    return DONE if facts["complete"] else DONE_WITH_LOSS

@@ -310,7 +310,7 @@ def _put_aside(file: Path, ending: str) -> None:
 def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
     """Write `metadata.yaml` for those parts that can be read."""
     facts = [_facts(part) for part in parts if part.exists() and is_begun(part) and is_mcap(part)]
-    custom = {f"{LOST}{topic}": count for topic, count in told_lost(folder).items()}
+    custom = {f"{LOST}{topic}": str(count) for topic, count in told_lost(folder).items()}
     if repaired:
         custom[f"plow_twin_{REPAIRED_KEY}"] = ", ".join(repaired)
     if facts:

@@ -155,12 +155,12 @@ def listed_parts(folder: Path) -> list[str]:
     return [str(name) for name in found]
 
 
-def told_lost(folder: Path) -> dict[str, str]:
+def told_lost(folder: Path) -> dict[str, int]:
     """Return by topic what `metadata.yaml` says that its recorder has lost; nothing where it cannot be read."""
     try:
         found = load_yaml((folder / "metadata.yaml").read_text(encoding="utf-8"))
         custom = found["rosbag2_bagfile_information"]["custom_data"] or {}
-        return {key.removeprefix(LOST): str(count) for key, count in custom.items() if key.startswith(LOST)}
+        return {key.removeprefix(LOST): int(count) for key, count in custom.items() if key.startswith(LOST)}
     except Exception:
         return {}
 

@@ -173,6 +173,8 @@ def record_topics(
 ) -> Mapping[str, Any]:
     """Record topics to a new folder until `stopped`; return what was written, lost and skipped by topic.
 
+    `complete` is whether nothing was lost and all that was asked for by name has been recorded.
+
     Parameters
     ----------
     folder
@@ -209,13 +211,16 @@ def record_topics(
         node.destroy_node()
         rclpy.utilities.try_shutdown()
     lost = {name: writer.lost[name] + recorder.missed.get(name, 0) for name in {*writer.lost, *recorder.missed}}
+    counted = {name: count for name, count in sorted(lost.items()) if count}
+    silent = sorted(named - {*recorder.topics, *recorder.skipped})
     return {
         "file": str(writer.path),
         "messages": {name: writer.written[name] for name in recorder.topics},
-        "lost": {name: count for name, count in sorted(lost.items()) if count},
+        "lost": counted,
         "skipped_topics": recorder.skipped,
-        "without_publisher": sorted(named - {*recorder.topics, *recorder.skipped}),
+        "without_publisher": silent,
         "error": writer.error,
+        "complete": not (counted or silent or writer.error or named & recorder.skipped.keys()),
     }
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import CompiledScene
 from plow_twin.solve.energy_balance import FRICTION, LOAD_X, LOADS, NORMAL, SUPPORT, BalanceSums
@@ -69,7 +70,7 @@ def energy_balance_of(compiled: CompiledScene, last: State, summed: BalanceSums)
     """Return the balance of a motion from its initial state to `last`."""
     sums, scene, first = summed.sums, compiled.scene, compiled.initial_state()
     gravity = _potential(scene, first) - _potential(scene, last)
-    stored = _stored_energy(compiled, first), _stored_energy(compiled, last)
+    stored = _stored(compiled, first), _stored(compiled, last)
     contact = float(sums.work[NORMAL])
     return EnergyBalance(
         kinetic_j=(float(sums.energy[0]), float(sums.energy[1])),
@@ -97,9 +98,15 @@ def _potential(scene: Scene, state: State) -> float:
     return float(scene.head.mass_kg * scene.gravity.acceleration_m_s2 * (height + scene.gravity.arm_m * theta))
 
 
-def _stored_energy(compiled: CompiledScene, state: State) -> float:
-    """Return the elastic energy of all contacts in J."""
-    rows, contact = compiled.params.penetration_rows, compiled.scene.contact
+def _stored(compiled: CompiledScene, state: State) -> float:
+    rows = compiled.params.penetration_rows
     penetration = rows.T @ np.array([state.y[COS], state.y[SIN], state.y[X], state.y[Y], 1.0]) - state.wear_depth
-    inside = np.where(compiled.params.enabled == 1, np.maximum(penetration, 0.0), 0.0)
-    return float(contact.stiffness * (inside ** (contact.exponent + 1.0)).sum() / (contact.exponent + 1.0))
+    return float(elastic_energy(compiled.scene, penetration))
+
+
+def elastic_energy(scene: Scene, penetration: Array) -> Array:
+    """Return the elastic energy of all contacts in J, shape (...), for penetrations in m, shape (..., 8)."""
+    contact = scene.contact
+    inside = np.where(np.isin(PAIR_NAMES, scene.pairs), np.maximum(penetration, 0.0), 0.0)
+    energy = contact.stiffness * (inside ** (contact.exponent + 1.0)).sum(axis=-1) / (contact.exponent + 1.0)
+    return np.asarray(energy)

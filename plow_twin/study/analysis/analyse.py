@@ -350,7 +350,7 @@ def _walk_own(
     journalled = Measured()  # where the node estimates
 
     def so_far() -> Analysis:
-        losses = {topic: count for topic, count in reader.lost.items() if count} | reader.lost_parts
+        losses = Counter({topic: count for topic, count in reader.lost.items() if count} | reader.lost_parts)
         if walk.missing:
             losses["journal"] = max(walk.missing, losses.get("journal", 0))
         if walk.late:
@@ -359,8 +359,8 @@ def _walk_own(
             losses[reader.status.value] = 1
         measured, unknown, unused = _measured_beside(path, mapping, header.node)
         measured.signals = journalled.signals | measured.signals
-        losses |= unused
-        return Analysis(reader.path, "run", predictions, measured, {"samples_used": walk.used}, losses, unknown)
+        losses.update(unused)
+        return Analysis(reader.path, "run", predictions, measured, {"samples_used": walk.used}, dict(losses), unknown)
 
     for batch in reader.batches(outputs=False):
         stretch = predictions[0].resets

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.importing import Walked
+from plow_twin.run.energy_balance import elastic_energy
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,8 @@ class LoadTotals:
     #: wear depth of the slide by direction (0 forward, 1 backward) and piece of the face, of each pair [m]
     slide_wear: dict[tuple[int, int], Array] = field(default_factory=dict)
     _first_ns: int | None = None
-    _last: tuple[int, Array, Array, Array] | None = None
+    #: stamp [ns], load, pose, rates and penetrations of the last row
+    _last: tuple[int, Array, Array, Array, Array] | None = None
     #: depth of the pads after the last advance [m]
     _worn: Array | None = None
     _place_m: float = 0.0
@@ -118,26 +120,23 @@ class LoadTotals:
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
         self._face(walked, steps, loss)
-        self._last = (int(stamps[-1]), walked.wrench[-1].copy(), rows.q[-1].copy(), rows.v[-1].copy())
+        last = (walked.wrench, rows.q, rows.v, rows.penetration)
+        self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy that the contacts took between two rows [J]: work of load and gravity less kinetic gain.
+        """Return the energy that the contacts took between two rows [J]: work of load and gravity less what is gained.
 
-        The load's work is its mean times the way; what is stored in contacts is counted as taken until it comes back.
+        The load's work is its mean times the way; gained is kinetic energy and what is stored in the contacts.
         """
-        q, v, wrench = walked.rows.q, walked.rows.v, walked.wrench
-        if self._last is not None:
-            _, wrench_0, q_0, v_0 = self._last
-        else:
-            wrench_0, q_0, v_0 = wrench[0], q[0], v[0]
-        q_before, v_before = np.concatenate((q_0[None], q[:-1])), np.concatenate((v_0[None], v[:-1]))
-        wrench_before = np.concatenate((wrench_0[None], wrench[:-1]))
-        work: Array = (0.5 * (wrench + wrench_before) * (q - q_before)).sum(axis=1)
-        gain = self._energy(q, v) - self._energy(q_before, v_before)
+        now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
+        first = (column[0] for column in now) if self._last is None else self._last[1:]
+        before = [np.concatenate((one[None], column[:-1])) for one, column in zip(first, now, strict=True)]
+        work: Array = (0.5 * (now[0] + before[0]) * (now[1] - before[1])).sum(axis=1)
+        gain = self._energy(*now[1:]) - self._energy(*before[1:])
         return np.where(steps > 0.0, work - gain, 0.0)
 
-    def _energy(self, q: Array, v: Array) -> Array:
-        """Return the kinetic energy of the head and the potential one of its centre of mass in gravity [J]."""
+    def _energy(self, q: Array, v: Array, penetration: Array) -> Array:
+        """Return the kinetic energy of the head, its potential one in gravity and the elastic one of contacts [J]."""
         head, gravity = self.scene.head, self.scene.gravity
         theta, omega = q[:, 2], v[:, 2]
         # from the cavity's centre to that of mass, in world axes
@@ -146,7 +145,8 @@ class LoadTotals:
         speed_2 = (v[:, 0] - omega * up) ** 2 + (v[:, 1] + omega * along) ** 2
         height = q[:, 1] + up + gravity.arm_m * theta
         kinetic = 0.5 * (head.mass_kg * speed_2 + head.inertia_kg_m2 * omega**2)
-        return np.asarray(kinetic + head.mass_kg * gravity.acceleration_m_s2 * height)
+        potential = head.mass_kg * gravity.acceleration_m_s2 * height
+        return np.asarray(kinetic + potential + elastic_energy(self.scene, penetration))
 
     def _face(self, walked: Walked, steps: Array, loss: Array) -> None:
         """Assign impacts, energy and forces to the pass and the piece of the face."""
