@@ -66,6 +66,7 @@ def record_run(
     frame_every: int = 1,
     pause_every: int = 100,
     wear: Wear | None = None,
+    rollback_span_s: float = 0.0,
     **options: Any,
 ) -> Run:
     """Drive a twin of the paper's head by entries and record it as the node does."""
@@ -78,7 +79,7 @@ def record_run(
         run.entries.append(entry)
         recorder.journal(entry)
 
-    session = Session(Twin(scene, excitation="sampled"), on_entry=journal)
+    session = Session(Twin(scene, excitation="sampled"), on_entry=journal, rollback_span_s=rollback_span_s)
     session.start()
     for index, entry in enumerate(entries):
         session.apply(entry)

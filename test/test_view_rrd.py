@@ -27,6 +27,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry, Hold, Parameter, Pose, Reset, Sample, SetWear, Travel, Unload
+from plow_twin.study.analysis.analyse import analyse
 from plow_twin.view import ViewSummary, layout, to_rrd
 from plow_twin.view.columns import TimeAxis, extremes
 from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
@@ -207,6 +208,17 @@ def test_what_lies_along_the_face_what_was_measured_and_what_if(tmp_path: Path) 
             scalars(tables[f"/{group}/{part}"]) for part in ("band/vertical", "vertical/p05", "vertical/p95")
         )
         assert band.min() >= low.min() and high[-2] <= band.max() <= high.max()
+
+
+def test_samples_that_come_too_late_for_other_scenes_are_counted(tmp_path: Path) -> None:
+    entries: list[Entry] = [paper_sample(index) for index in range(60)]
+    entries[50:50] = [Travel(entries[49].stamp_ns, 2.0), replace(paper_sample(20), stamp_ns=entries[20].stamp_ns + 1)]
+    run = record_run(tmp_path / "run", entries, rollback_span_s=1.0)
+    lost = [
+        to_rrd(run.file, tmp_path / "run.rrd", others=others).lost
+        for others in ({}, {"the same": load_scene(scene_path("paper"))})
+    ]
+    assert lost == [{}, {"samples_too_late": 1}] and analyse(run.file).lost == lost[1]
 
 
 def test_each_change_of_the_corners_that_carry_force_is_drawn(

@@ -28,8 +28,9 @@ _BYTES_PER_ROW: Final = 400
 class ViewSummary:
     """What a .rrd holds: first stamp, rows of the curves, moments of the cross-section, events.
 
-    `status` is how the recording ended, `lost` what its recorder counted as lost, by topic, and parts that are not
-    there or of another run. `rows` were read of the force curves; fewer `curve_rows` were sent where they are thinned.
+    `status` is how the recording ended, `lost` what its recorder counted as lost, by topic, parts that are not there or
+    of another run, and samples that came too late for further scenes. `rows` were read of the force curves; fewer
+    `curve_rows` were sent where they are thinned.
     """
 
     path: Path
@@ -53,7 +54,7 @@ class ViewSummary:
             drawing.section_rows,
             drawing.events.count,
             reader.status,
-            {**reader.lost, **reader.lost_parts},
+            {**reader.lost, **reader.lost_parts, **drawing.what_if.lost},
         )
 
 

@@ -50,6 +50,11 @@ class WhatIf:
         twin = Twin(scene, tol=header.tol, excitation="sampled")
         return Walker(Session(twin, header.origin_ns), draw)
 
+    @property
+    def lost(self) -> dict[str, int]:
+        """Samples that came when the scenes had passed their stamps, under their name in `lost`, if any."""
+        return {"samples_too_late": self._walk.late} if self._walk.late else {}
+
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:
         """Go on by entries of the journal."""
         if self._curves:
