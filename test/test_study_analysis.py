@@ -20,6 +20,7 @@ from pyarrow import parquet
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from scenes import ROOT
 
 from plow_twin import Initial, Wear
 from plow_twin.errors import RecordingError
@@ -181,6 +182,8 @@ def test_other_scenes_are_predicted_beside_it_in_one_pass(motion: tuple[np.ndarr
     assert set(facts["signals"]["x"]) >= {"n", "bias", "rms", "correlation", "lag_s"}
     assert facts["with"][0]["scene"] == str(BEST_FIT)
     assert facts["with"][0]["signals"]["x"]["rms"] != facts["signals"]["x"]["rms"]
+    page = (ROOT / "docs" / "analysis.md").read_text()
+    assert all(f"`{key}`" in page for key in (*facts, *facts["loads"]))
     loads = facts["loads"]
     assert sum(loads["impacts"].values()) > 5 and loads["cycles"] and loads["contact_loss_j"] > 0.0
     names = {path.name for path in (tmp_path / "out").iterdir()}
