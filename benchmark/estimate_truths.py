@@ -118,7 +118,7 @@ def draw(group: Group, seed: int) -> Truth:
     fine = np.arange(0.0, end + _FINE, _FINE)
     believed = compile_loads(nominal.loads).at(fine)
     if group.stochastic:
-        believed = believed + _cutting(rng, fine) * np.array([8e3, 4e3, 1.1e4])
+        believed = believed + cutting(rng, fine) * np.array([8e3, 4e3, 1.1e4])
     gain = group.load_scale * (1.0 + group.load_error * rng.standard_normal(3))
     true_load = believed * gain
     if group.third_harmonic:
@@ -155,7 +155,7 @@ def _contact(group: Group, rng: np.random.Generator) -> Contact:
     return Contact(law=group.law, stiffness=stiffness, exponent=group.exponent, damping=damping)
 
 
-def _cutting(rng: np.random.Generator, t: Array) -> Array:
+def cutting(rng: np.random.Generator, t: Array) -> Array:
     """Return broad-band noise of unit variance, shape (n, 3): white noise through a low pass of 20 Hz, skewed."""
     decay = np.exp(-2.0 * np.pi * 20.0 * (t[1] - t[0]))
     drive = rng.gamma(4.0, 0.5, (len(t), 3)) - 2.0

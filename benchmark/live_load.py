@@ -5,6 +5,8 @@ in each of which every case runs once, and then the targets with what was reache
 recorder at 1 kHz (or `--rate`) for so long instead, prints a line each ten seconds, what has grown, and
 whether each message sent was used or counted. `--beside` runs the echo, the node and a recording node at once under
 the same samples: what else the machine does meets all of them, so that their ratios hold on a busy one too.
+`--estimate` runs the node without and with the estimate and its 256 twins in turn, under the paper's load and a
+synthetic pose at 100 Hz, `--repeats` times each, for `--seconds` after the first window has been formed.
 The machine is shared by publisher, node and subscriber: what is compared is the node and the echo in the same run.
 """
 
@@ -29,6 +31,8 @@ from typing import Any, NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 NS_PER_S = 1_000_000_000
 PERIOD_S = 10.0
+#: Length of the window of an estimate [s].
+FORMED_S = 34.0
 
 
 class Case(NamedTuple):
@@ -211,11 +215,60 @@ def _cpu_s(process_id: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _twin(mode: str, folder: str, namespace: str = "/live_load") -> list[str]:
-    given = {"publish_mode": mode, "excitation_timeout": 60.0, "record_path": folder}
-    settings = [word for name, value in given.items() if value != "" for word in ("-p", f"{name}:={value}")]
+def _twin(mode: str, folder: str, namespace: str = "/live_load", given: dict[str, str] | None = None) -> list[str]:
+    named = {"publish_mode": mode, "excitation_timeout": 60.0, "record_path": folder} | (given or {})
+    settings = [word for name, value in named.items() if value != "" for word in ("-p", f"{name}:={value}")]
     return [sys.executable, "-m", "plow_twin.ros.main", "--ros-args", "-r", f"__ns:={namespace}", "-r",
             "excitation:=/live_load/excitation", *settings]  # fmt: skip
+
+
+def estimating(seconds: float, repeats: int) -> None:
+    """Print CPU and age without and with the estimate in turn, then the medians."""
+    runs: dict[bool, list[dict[str, float]]] = {False: [], True: []}
+    for _ in range(repeats):
+        for on, found in runs.items():
+            found.append(_one_estimating(on, seconds))
+            print(json.dumps({"estimate": on, **found[-1]}), flush=True)
+    print("medians", flush=True)
+    for on, found in runs.items():
+        print(json.dumps({"estimate": on} | {key: median(run[key] for run in found) for key in found[0]}), flush=True)
+
+
+def _one_estimating(on: bool, seconds: float) -> dict[str, float]:
+    given = {"estimate": "true", "estimate_forces": "256"} if on else {}
+    command = _twin("on_sample", "", given=given)
+    publisher = [sys.executable, "-m", "plow_twin.ros.excitation_publisher", "--sensor", "3", "--seconds",
+                 str(seconds + FORMED_S + 10.0), "--ros-args", "-r", "__ns:=/live_load"]  # fmt: skip
+    with running(command) as (probe, process_id):
+        sender = subprocess.Popen(publisher, env=environment(), stdout=subprocess.DEVNULL)
+        try:
+            probe.spin(lambda: bool(probe.ages), 60.0)
+            probe.spin(lambda: False, FORMED_S)
+            probe.ages.clear()
+            beside = _children(process_id)
+            busy = [_exact_cpu_s(process_id), sum(map(_exact_cpu_s, beside))]
+            begin = time.monotonic()
+            probe.spin(lambda: False, seconds)
+            passed_s = time.monotonic() - begin
+            share = (_exact_cpu_s(process_id) - busy[0]) / passed_s
+            estimate_share = (sum(map(_exact_cpu_s, beside)) - busy[1]) / passed_s
+        finally:
+            sender.kill()
+            sender.wait()
+        ages = sorted(probe.ages)
+        return {
+            "messages": len(ages),
+            "core": round(share, 3),
+            "core_of_the_estimate": round(estimate_share, 3),
+            "estimates": int(probe.figures.get("estimates") or 0),
+            "age_p50_ms": round(ages[len(ages) // 2], 3),
+            "age_p99_ms": round(ages[len(ages) * 99 // 100], 3),
+        }
+
+
+def _children(process_id: int) -> list[int]:
+    tasks = Path(f"/proc/{process_id}/task").iterdir()
+    return [int(child) for task in tasks for child in (task / "children").read_text().split()]
 
 
 def compare(seconds: float, repeats: int) -> None:
@@ -391,6 +444,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=1000.0, help="samples a second of --minutes")
     parser.add_argument("--beside", action="store_true", help="all at once, for --seconds")
     parser.add_argument("--role", nargs="+", default=[])
+    parser.add_argument("--estimate", action="store_true", help="without and with the estimate, for --seconds each")
     options = parser.parse_args()
     if options.role:
         role, *numbers = options.role
@@ -402,6 +456,9 @@ def main() -> None:
     os.environ.setdefault("ROS_DOMAIN_ID", "91")
     if options.beside:
         beside(options.seconds)
+        return
+    if options.estimate:
+        estimating(options.seconds, options.repeats)
         return
     if options.minutes:
         sys.exit(0 if soak(options.minutes, options.rate) else 1)

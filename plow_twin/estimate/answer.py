@@ -100,12 +100,19 @@ def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dic
         For a withdrawn estimate; where the scene has no wear or does not travel.
     """
     now, deviation = with_estimate(scene, result.as_dict())
+    return forecast(under_load(now, result, load), plan, deviation).as_dict()
+
+
+def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
+    """Return the scene with the load of a window, times the gains that were estimated, in place of its own.
+
+    Its own stays where the window is too short to tell a period.
+    """
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     felt = load.thinned()
-    seen = replace(now, loads=(Table("window", felt.t - felt.t[0], felt.wrench * gains),))
+    seen = replace(scene, loads=(Table("window", felt.t - felt.t[0], felt.wrench * gains),))
     try:
         period_of(seen)
-        now = seen
     except LifeError:
-        pass
-    return forecast(now, plan, deviation).as_dict()
+        return scene
+    return seen

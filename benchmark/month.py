@@ -1,0 +1,166 @@
+"""The wear coefficient after a simulated month: `python benchmark/month.py --truths 20`.
+
+A head works a month under a broad-band load. On some days its pose is measured over ten load periods, by a noisy,
+biased and late sensor, beside a load that is off by 5 %; `estimate` tells the clearances from that, and what they have
+grown tells the coefficient. The truth follows the wear in steps a quarter as long as those of the estimate, with means
+over four times as many periods.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from estimate_truths import PERIOD, cutting
+from numpy.typing import NDArray
+
+from plow_twin import Clearance, Contact, Scene, Table, Wear, load_scene, simulate
+from plow_twin.estimate import life
+from plow_twin.estimate.answer import under_load
+from plow_twin.estimate.coefficient import History, coefficient
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.result import State
+from plow_twin.model.loads import compile_loads
+from plow_twin.stream.outputs import clearances
+
+Array = NDArray[np.float64]
+RESULTS = Path(__file__).resolve().parent / "results"
+#: Days on which the pose is measured.
+DAYS = np.linspace(0.0, 30.0, 7)
+SPEED_M_S, PAD_AREA_M2 = 2.0, 0.06
+#: 5 % and 95 % points of the prior, of which the truth is drawn [m^2/N].
+PRIOR = (3e-16, 3e-15)
+#: The coefficient is asked to be known within this factor.
+FACTOR = 1.3
+#: Samples of the load and of the pose [s]; the true load is finer.
+_FINE, _LOAD_STEP, _POSE_STEP = 1e-3, 2e-3, 1e-2
+_SPAN = 10.0 * PERIOD
+#: Standard deviation of the broad-band part of the load [N, N, N m], and of the sensor [m, m, rad].
+_BROAD, _NOISE = np.array([8e3, 4e3, 1.1e4]), np.array([5e-4, 5e-4, 2e-3])
+
+
+@dataclass(frozen=True, eq=False)
+class Machine:
+    """What is believed of a machine, and what is true of it."""
+
+    believed: Scene
+    scene: Scene
+    coefficient_m2_n: float
+    gain: Array
+    bias: Array
+    delay_s: float
+
+
+def machine(rng: np.random.Generator) -> Machine:
+    """Draw a machine."""
+    low, high = np.log(PRIOR)
+    known = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
+    believed = replace(load_scene("paper"), wear=Wear(1e-15, PAD_AREA_M2, SPEED_M_S, prior_m2_n=PRIOR))
+    contact = Contact("hunt_crossley", float(np.exp(rng.uniform(*np.log([5e6, 3e7])))), damping=0.72)
+    scene = replace(believed, clearance=Clearance(*rng.uniform(0.018, 0.034, 2)), contact=contact)
+    bias = 1e-3 * rng.standard_normal(3) * np.array([1.0, 1.0, 3.0])
+    return Machine(believed, scene, known, 1.0 + 0.05 * rng.standard_normal(3), bias, 0.05 * rng.uniform())
+
+
+def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array, Array]:
+    """Return times and the load believed."""
+    t = np.arange(0.0, span + _FINE, _FINE)
+    return t, compile_loads(one.believed.loads).at(t) + cutting(rng, t) * _BROAD
+
+
+def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
+    """Return what is measured of a worn machine: the load believed, and the poses that the sensor tells."""
+    t, believed = load_of(one, rng, _SPAN)
+    motion = simulate(replace(worn, loads=(Table("cutting", t, believed * one.gain),)), _SPAN, _FINE, 1e-6)
+    at = np.arange(0.0, _SPAN, _POSE_STEP)
+    q = np.stack([np.interp(np.maximum(at - one.delay_s, 0.0), motion.t, column) for column in motion.q.T], axis=1)
+    knots = np.arange(0.0, _SPAN + _LOAD_STEP, _LOAD_STEP)
+    load, _ = Load.of(knots, np.stack([np.interp(knots, t, column) for column in believed.T], axis=1))
+    poses, _ = Poses.of(at, q + one.bias + _NOISE * rng.standard_normal(q.shape))
+    return load, poses
+
+
+def one_month(seed: int, day_m: float) -> dict[str, Any]:
+    """Estimate on each of the days, of `day_m` along the face each, and the coefficient from that."""
+    rng = np.random.default_rng([20261123, seed])
+    one = machine(rng)
+    path = true_path(one, rng, day_m)
+    rows, under = [], one.believed
+    for day in DAYS:
+        exposure = one.coefficient_m2_n * day * day_m / PAD_AREA_M2
+        depth = np.array([np.interp(exposure, path.exposure, pad) for pad in path.depth.T])
+        worn = replace(one.scene, wear=Wear(0.0, PAD_AREA_M2, SPEED_M_S, initial_depth_m=tuple(depth.tolist())))
+        load, poses = visit(one, worn, rng)
+        found = estimate(one.believed, load, poses)
+        if State.ESTIMATED is found.horizontal_state is found.vertical_state:
+            told = [[value.mean, value.deviation] for value in (found.horizontal, found.vertical)]
+            rows.append((float(day), told, clearances(worn, depth)[:2]))
+            under = under_load(one.believed, found, load)
+    days, values, true = (np.array([row[i] for row in rows]) for i in range(3))
+    history = History((days - days[0]) * day_m, values[:, :, 0], values[:, :, 1])
+    known = coefficient(under, history)
+    quantiles = np.interp([0.05, 0.5, 0.9, 0.95], np.cumsum(known.weight), known.value) / one.coefficient_m2_n
+    error = (values[:, :, 0] - true) / values[:, :, 1]
+    return {
+        "seed": seed, "day_m": day_m, "coefficient_m2_n": one.coefficient_m2_n,
+        "grown_m": (true[-1] - true[0]).tolist(), "visits": len(rows),
+        "rmse_m": float(np.sqrt(np.mean((values[:, :, 0] - true) ** 2))),
+        "inside": float(np.mean(np.abs(error) <= 1.645)),
+        **dict(zip(("p05_ratio", "p50_ratio", "p90_ratio", "p95_ratio"), quantiles.tolist(), strict=True)),
+    }  # fmt: skip
+
+
+def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
+    """Return the path of the true wear over the month, in finer steps and with longer means than an estimate's."""
+    step, periods = life.LARGEST_CHANGE, life.MEAN_PERIODS
+    life.LARGEST_CHANGE, life.MEAN_PERIODS = step / 4.0, 4 * periods
+    try:
+        t, believed = load_of(one, rng, (life.SETTLE_PERIODS + life.MEAN_PERIODS + 1) * PERIOD)
+        scene = replace(one.scene, loads=(Table("cutting", t, believed * one.gain),), wear=one.believed.wear)
+        most = one.coefficient_m2_n * float(DAYS[-1]) * day_m / PAD_AREA_M2
+        return life.wear_path(scene, (np.inf, np.inf), most)
+    finally:
+        life.LARGEST_CHANGE, life.MEAN_PERIODS = step, periods
+
+
+def summary(rows: list[dict[str, Any]]) -> str:
+    """Return the table of the page."""
+    ratio = np.array([[row[key] for key in ("p05_ratio", "p50_ratio", "p90_ratio", "p95_ratio")] for row in rows])
+    near = (np.abs(np.log(ratio)) <= np.log(FACTOR)).sum(axis=0)
+    held = int(((ratio[:, 0] <= 1.0) & (ratio[:, 3] >= 1.0)).sum())
+    grown = 1e3 * np.array([row["grown_m"] for row in rows]).mean(axis=1)
+    used, ends = sum(row["visits"] for row in rows), np.median(ratio, axis=0)
+    return "\n".join([
+        f"| months | grown by [mm] | visits used | P50 within {FACTOR} | P90 within {FACTOR} | 90 % interval holds | "
+        "its ends over the truth, median |",
+        "|---|---|---|---|---|---|---|",
+        f"| {len(rows)} | {grown.min():.2f} to {grown.max():.2f} | {used} of {len(rows) * len(DAYS)} | {near[1]} | "
+        f"{near[2]} | {held} | {ends[0]:.2f}, {ends[3]:.2f} |",
+    ])  # fmt: skip
+
+
+@click.command()
+@click.option("--truths", default=12, show_default=True)
+@click.option("--seed", default=100, show_default=True, help="First seed.")
+@click.option("--day-km", default=75.0, show_default=True, help="Way along the face in a day: 300 passes of 250 m.")
+@click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "month.jsonl", show_default=True)
+def main(truths: int, seed: int, day_km: float, out: Path) -> None:
+    """Run the months; each is written as soon as it is done, and what is there is not run again."""
+    rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
+    rows = [row for row in rows if row["day_m"] == 1e3 * day_km]
+    for number in range(seed, seed + truths):
+        if any(row["seed"] == number for row in rows):
+            continue
+        rows.append(one_month(number, 1e3 * day_km))
+        with out.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(rows[-1]) + "\n")
+    click.echo(summary([row for row in rows if row["seed"] in range(seed, seed + truths)]))
+
+
+if __name__ == "__main__":
+    main()
