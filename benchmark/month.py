@@ -23,6 +23,7 @@ from plow_twin.estimate import life
 from plow_twin.estimate.answer import under_load
 from plow_twin.estimate.coefficient import History, coefficient
 from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.forecast import with_estimate
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import State
 from plow_twin.model.loads import compile_loads
@@ -100,7 +101,7 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
         if State.ESTIMATED is found.horizontal_state is found.vertical_state:
             told = [[value.mean, value.deviation] for value in (found.horizontal, found.vertical)]
             rows.append((float(day), told, clearances(worn, depth)[:2]))
-            under = under_load(one.believed, found, load)
+            under = under_load(with_estimate(one.believed, found.as_dict())[0], found, load)
     days, values, true = (np.array([row[i] for row in rows]) for i in range(3))
     history = History((days - days[0]) * day_m, values[:, :, 0], values[:, :, 1])
     known = coefficient(under, history)

@@ -222,6 +222,25 @@ def test_a_history_of_clearances_tells_the_coefficient(tmp_path: Path, capsys: p
     assert json.loads(capsys.readouterr().out)["coefficient_m2_n"]["mean"] == pytest.approx(found.mean)
 
 
+def test_a_forecast_wears_the_pads_by_the_contact_that_was_estimated() -> None:
+    """Another contact bears on other pads; the one believed went on wearing, whatever the estimate said of it."""
+    wear = Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14))
+    believed = replace(preset("paper"), wear=wear)
+    hard = replace(believed, contact=replace(believed.contact, stiffness=2.4 * believed.contact.stiffness))
+    facts = {
+        name: {"mean_m": mean, "p05_m": mean - 1e-4, "p95_m": mean + 1e-4, "state": "estimated"}
+        for name, mean in (("horizontal", 0.025), ("vertical", 0.030))
+    } | {name: {"mean": getattr(hard.contact, name)} for name in ("stiffness", "damping")}
+    plan, exact = Plan(0.026, 0.040, 1e6, draws=50), (6e-5, 6e-5)
+    hours = forecast(hard, plan, exact).quantile(0.5)
+    now, deviation = with_estimate(believed, facts)
+    assert now.contact == hard.contact
+    assert forecast(now, plan, deviation).quantile(0.5) == pytest.approx(hours, rel=0.01)
+    assert forecast(believed, plan, exact).quantile(0.5) != pytest.approx(hours, rel=0.05)
+    nothing = {name: told | {"state": "not_observable"} for name, told in facts.items() if "mean_m" in told}
+    assert with_estimate(believed, facts | nothing)[0].contact == believed.contact
+
+
 def test_a_path_that_does_not_come_to_its_end_is_no_limit_never_reached() -> None:
     """From a clearance of a micrometre 400 steps went nowhere, which was told as `not reached`."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
@@ -271,7 +290,7 @@ def test_a_history_that_shrinks_is_refused() -> None:
 def test_what_a_forecast_cannot_use_is_refused_and_not_left_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A stop beyond the horizon, an estimate beside a history, `null` for an estimate: all gave some forecast."""
+    """A stop beyond the horizon, an estimate of nothing, a contact of none: all gave some forecast."""
     scene = replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0, prior_m2_n=(5e-15, 2e-14)))
     file, found, history = (tmp_path / name for name in ("scene.yaml", "estimate.json", "history.csv"))
     file.write_text(dump_scene(scene))
@@ -298,7 +317,8 @@ def test_what_a_forecast_cannot_use_is_refused_and_not_left_out(
     ):
         found.write_text(text)
         assert expected in " ".join(said("--estimate", str(found)).split())
-    assert "cannot be combined" in said("--estimate", str(found), "--history", str(history))
+    found.write_text(json.dumps({"horizontal": whole, "vertical": whole, "stiffness": {"mean": -1e7}}))
+    assert "estimate: stiffness: got {'mean': -10000000.0}" in said("--estimate", str(found), "--history", str(history))
 
 
 def test_a_history_that_cannot_be_used_is_refused() -> None:

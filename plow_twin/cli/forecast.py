@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
     "--estimate",
     "estimated",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="estimate.json of `plow-twin estimate --out`: the clearances now, with their intervals.",
+    help="estimate.json of `plow-twin estimate --out`: the clearances now, with their intervals, and the contact.",
 )
 @click.option(
     "--history",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="CSV of clearances over time (km, horizontal_mm, horizontal_sd_mm, vertical_mm, vertical_sd_mm): they tell "
-    "the wear coefficient and the clearances now.",
+    "the wear coefficient and the clearances now; of --estimate beside it the contact is taken.",
 )
 @click.option(
     "--scenario",
@@ -77,8 +77,6 @@ def forecast(
     from plow_twin.estimate.forecast import forecast as run
     from plow_twin.estimate.life import LifeError
 
-    if estimated is not None and history is not None:
-        raise click.UsageError("--estimate cannot be combined with --history: a history tells the clearances now")
     if stop is not None and stop > horizon:
         raise click.UsageError(f"--stop: got {stop:g} h, expected at most the horizon, --horizon {horizon:g}")
     model, facts_now, lost = _scene(scene)
@@ -98,6 +96,8 @@ def forecast(
             found = run(model, plan, deviation)
             facts = found.as_dict()
         else:
+            if estimated is not None:
+                model = replace(model, contact=_now(model, facts_now)[0].contact)
             known = coefficient(model, _history(history))
             low, high = (float(value) for value in known.deviation)
             model = with_clearances(model, float(known.clearance[0]), float(known.clearance[1]), known.depth)

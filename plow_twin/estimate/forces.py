@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import PlowTwinError
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.result import NORMAL_P95, Estimate, Interval, State
+from plow_twin.estimate.unknowns import contact_with
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Clearance, Scene
 from plow_twin.run.batch import TwinBatch
@@ -185,10 +186,8 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
     ]
     scenes = []
     for index in range(members):
-        contact = replace(scene.contact, stiffness=float(stiffness[index]))
-        if found.damping is not None:
-            number = float(damping[index])
-            contact = replace(contact, restitution=number) if restitution else replace(contact, damping=number)
+        number = None if found.damping is None else float(damping[index])
+        contact = contact_with(scene.contact, float(stiffness[index]), number)
         clearance = Clearance(float(horizontal[index]), float(vertical[index]))
         scenes.append(replace(scene, clearance=clearance, contact=contact, loads=(), wear=None))
     return scenes, np.stack(gains, axis=1)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.coefficient import PATH_DEVIATION, Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, State
+from plow_twin.estimate.unknowns import contact_with
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
 from plow_twin.model.scene import Clearance, Scene, Table, Wear
 
@@ -296,7 +297,9 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
 
 
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
-    """Return the scene with the clearances of an estimate, as its JSON has them, and their standard deviations in m.
+    """Return the scene with what an estimate tells, as its JSON has it, and the clearances' standard deviations in m.
+
+    The contact is the estimated one where a clearance was estimated with it: a softer one bears on other pads.
 
     Raises
     ------
@@ -306,7 +309,22 @@ def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[
     if not isinstance(facts, Mapping):
         raise LifeError(f"estimate: got {type(facts).__name__}, expected what `plow-twin estimate --json` prints")
     horizontal, vertical = (_estimated(name, facts.get(name)) for name in ("horizontal", "vertical"))
+    told = State.ESTIMATED.value in (facts["horizontal"]["state"], facts["vertical"]["state"])
+    if told and "stiffness" in facts:
+        damping = _mean("damping", facts["damping"]) if "damping" in facts else None
+        scene = replace(scene, contact=contact_with(scene.contact, _mean("stiffness", facts["stiffness"]), damping))
     return with_clearances(scene, horizontal[0], vertical[0]), (horizontal[1], vertical[1])
+
+
+def _mean(name: str, facts: Any) -> float:
+    """Return the mean of a number of the contact, from its part of an estimate's JSON."""
+    try:
+        mean = float(facts["mean"])
+    except (KeyError, TypeError, ValueError):
+        mean = math.nan
+    if not 0.0 < mean < math.inf:
+        raise LifeError(f"estimate: {name}: got {reprlib.repr(facts)}, expected an interval with a mean above 0")
+    return mean
 
 
 def _estimated(name: str, facts: Any) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.measurements import Load, Poses
-from plow_twin.model.scene import Clearance, Scene
+from plow_twin.model.scene import Clearance, Contact, Scene
 
 Array = NDArray[np.float64]
 
@@ -167,14 +167,22 @@ class Unknowns:
 
     def scene_of(self, vector: Array) -> Scene:
         """Return the scene that a vector stands for."""
-        contact = replace(self.scene.contact, stiffness=self.stiffness_of(float(vector[SOFTNESS])))
-        if self.damped:
-            value = self.damping_of(float(vector[DAMPING]))
-            contact = replace(contact, restitution=value) if self._restitution else replace(contact, damping=value)
+        damping = self.damping_of(float(vector[DAMPING])) if self.damped else None
+        contact = contact_with(self.scene.contact, self.stiffness_of(float(vector[SOFTNESS])), damping)
         if self._restitution:
             contact = replace(contact, impact_speed_floor_m_s=max(contact.impact_speed_floor_m_s, SLOWEST_IMPACT))
         clearance = Clearance(float(vector[GX]), float(vector[GY]))
         return replace(self.scene, clearance=clearance, contact=contact, loads=(), wear=None)
+
+
+def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
+    """Return a contact with a stiffness and the number that its law takes for damping (None: its own)."""
+    contact = replace(contact, stiffness=stiffness)
+    if damping is None:
+        return contact
+    if contact.restitution is not None:
+        return replace(contact, restitution=damping)
+    return replace(contact, damping=damping)
 
 
 def with_other_law(unknowns: Unknowns) -> Unknowns | None:
