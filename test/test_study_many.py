@@ -24,6 +24,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry
+from plow_twin.study.analysis import many
 from plow_twin.study.analysis.analyse import expand, left_out
 from plow_twin.study.analysis.many import analyse_many
 from plow_twin.study.analysis.report import write_table_of_runs
@@ -53,6 +54,13 @@ def workers_of(process: subprocess.Popen[str]) -> list[str]:
     return [pid for pid in children if "spawn_main" in Path(f"/proc/{pid}/cmdline").read_text()]
 
 
+def is_running(pid: str) -> bool:
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+
+
 def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "plow_twin", "analyse", str(runs), "--scene", "paper", "--out", str(out)]
@@ -76,11 +84,12 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(run
     assert other.stored() is None
 
 
-def test_an_interrupt_ends_the_call_and_its_workers_at_once(tmp_path: Path) -> None:
-    for number in range(2):  # some minutes of work each
-        (tmp_path / "runs" / f"r{number}").mkdir(parents=True)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signals, tmp_path: Path) -> None:
+    for run in range(2):  # some minutes of work each
+        (tmp_path / "runs" / f"r{run}").mkdir(parents=True)
         rows = (f"{60 * i},{','.join(map(str, paper_sample(60_000 * i).wrench))}" for i in range(2000))
-        (tmp_path / "runs" / f"r{number}" / "load.csv").write_text("t,fx,fy,m\n" + "\n".join(rows))
+        (tmp_path / "runs" / f"r{run}" / "load.csv").write_text("t,fx,fy,m\n" + "\n".join(rows))
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "runs"), "--scene", "paper"]
     command += ["--out", str(tmp_path / "out"), "--workers", "2"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
@@ -88,13 +97,37 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(tmp_path: Path) -> N
             assert process.poll() is None
             time.sleep(0.05)
         workers = workers_of(process)
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        if number == signal.SIGINT:
+            os.killpg(process.pid, number)  # as a terminal does
+        else:
+            process.send_signal(number)
         said = process.communicate(timeout=20)[1]
-    assert process.returncode == 1 and "interrupted" in said and "Traceback" not in said
+    if number == signal.SIGINT:
+        assert process.returncode == 1 and "interrupted" in said and "Traceback" not in said
     assert len(workers) == 2
-    for pid in workers:  # gone, or dead and not yet taken note of
-        status = Path(f"/proc/{pid}/status")
-        assert not status.exists() or "State:\tZ" in status.read_text()
+    deadline = time.monotonic() + 20
+    while (left := [pid for pid in workers if is_running(pid)]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not left
+
+
+def test_the_others_go_on_together_when_a_worker_died_before_the_first_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounds: list[list[int]] = []
+
+    def one_dies(tasks: Any, waiting: list[int], workers: int, done: Any) -> list[int]:
+        rounds.append(list(waiting))
+        if len(rounds) == 1 or waiting == [1]:
+            return list(waiting)
+        for task in waiting:
+            done(task, {"run": str(task)})
+        return []
+
+    monkeypatch.setattr(many, "_round", one_dies)
+    found = analyse_many([Task(Path(str(n)), None, None, (), None) for n in range(5)], workers=2)
+    assert rounds == [[0, 1, 2, 3, 4], [0], [1], [2, 3, 4]]
+    assert ["error" in facts for facts in found] == [False, True, False, False, False]
 
 
 @pytest.mark.stress

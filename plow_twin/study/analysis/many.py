@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, parent_process
+from multiprocessing.connection import wait
 from typing import Any
 
 from plow_twin.study.analysis.task import Task, analyse_task
@@ -54,11 +57,11 @@ def analyse_many(
 def _here(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
-        if len(left) == len(waiting):  # one of them ends its worker each time
-            for number in left:
+        if len(left) == len(waiting):  # one of those that came first has ended its worker: each of them alone
+            left, first = left[workers:], left[:workers]
+            for number in first:
                 if _round(tasks, [number], 1, done):
                     done(number, {"run": str(tasks[number].path), "error": "the worker was killed, twice"})
-            return
         waiting = left
 
 
@@ -66,7 +69,7 @@ def _round(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDon
     """Run some tasks and return those that were lost: when a worker dies, with all that had not ended."""
     left = []
     others = active_children()
-    pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _leave_interrupts_to_the_caller)
+    pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _belong_to_the_caller)
     try:
         futures = {pool.submit(analyse_task, tasks[number]): number for number in waiting}
         for future in as_completed(futures):
@@ -80,11 +83,20 @@ def _round(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDon
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-    return left
+    return sorted(left)
 
 
-def _leave_interrupts_to_the_caller() -> None:
+def _belong_to_the_caller() -> None:
+    """Leave interrupts to the caller, and end with it, however it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True, name="plow_twin caller").start()
 
 
 def _on_cluster(tasks: Sequence[Task], waiting: list[int], address: str, done: _OnDone) -> None:
