@@ -304,6 +304,8 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
     assert found is not None
     assert found[1] == pytest.approx({"x": 7e-3, "y": 4e-2, "theta": np.pi})
     assert found[0] == 1_767_323_044_750_000_000
+    found = read(pose + "scale: 0, offset: {x: 1}}", a=3, b={"c": 4}, turn=180)
+    assert found is not None and found[1] == pytest.approx({"x": 1e-3, "y": 0.0, "theta": 0.0})
     assert read(pose + "stamp: at}", a="", b={"c": 4}, turn="x", at=1) is None
     for wrong in (True, [1], {}, None, 10**400):
         assert read(pose + "stamp: at}", a=wrong, b={"c": 4}, turn=1, at=1) is None
@@ -325,6 +327,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
         ("fields: {x: [1]}", "fields: got {'x': [1]}, expected names of columns"),
         ("fields: 5", "fields: got 5"),
         ("scale: {x: true}", "scale: got {'x': True}, expected numbers"),
+        ("scale: false", "scale: got False, expected a mapping"),
         ("limits: {x: [0, true]}", "expected numbers, or pairs"),
     ):
         path.write_text(f"head_pose: {{topic: p, {text}}}")

@@ -328,8 +328,8 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, TopicType] | N
         topic,
         kind,
         _named(path, role, "fields", fields, _text),
-        _named(path, role, "scale", entry.get("scale") or {}, _number),
-        _named(path, role, "offset", entry.get("offset") or {}, _number),
+        _named(path, role, "scale", _given(entry, "scale"), _number),
+        _named(path, role, "offset", _given(entry, "offset"), _number),
         stamp,
         _factors(path, role, entry.get("unit") or {}),
         _limits(path, role, entry.get("limits") or {}),
@@ -440,6 +440,12 @@ def _number(given: Any) -> float:
     if isinstance(given, bool):
         raise TypeError(given)
     return float(given)
+
+
+def _given(entry: Mapping[str, Any], key: str) -> Any:
+    """Return what stands under a key; a number of 0 is one."""
+    value = entry.get(key)
+    return {} if value is None else value
 
 
 def _clock_offset(path: Path, role: str, given: Any) -> float:
