@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from test_study_analysis import MAP, PAPER, STORE, wrench_message
 
@@ -22,7 +22,7 @@ from plow_twin.record.measured import read_measured, read_recording
 from plow_twin.record.reader import FileStatus
 from plow_twin.record.replay import replay
 from plow_twin.record.sources import open_source
-from plow_twin.study.analysis.analyse import Analysis, analyse
+from plow_twin.study.analysis.analyse import Analysis, analyse, expand
 from plow_twin.study.analysis.report import write_report
 
 COUNT = 300
@@ -57,6 +57,28 @@ def test_a_bag_without_its_metadata_and_with_an_open_log_is_read_to_its_end(tmp_
     assert not (killed / "metadata.yaml").exists() and list(killed.glob("*-wal"))
     found = [arrived.log_time_ns for arrived in open_source(killed).messages(lambda topic: True)]
     assert found == [BASE_NS + index * STEP_NS for index in range(COUNT)]
+
+
+def test_a_bag_is_read_with_messages_compressed_one_by_one_and_said_where_it_is_as_a_whole(tmp_path: Path) -> None:
+    for mode in (CompressionMode.MESSAGE, CompressionMode.FILE):
+        bag = BagWriter(tmp_path / mode.name, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        bag.set_compression(mode, CompressionFormat.ZSTD)
+        with bag as writer:
+            connection = writer.add_connection("/load", TYPE, typestore=STORE)
+            for time_ns in (BASE_NS, BASE_NS + STEP_NS):
+                writer.write(connection, time_ns, wrench_message(time_ns, paper_sample(1).wrench))
+            writer.write(connection, BASE_NS, b"")
+    file = next((tmp_path / "MESSAGE").glob("*.db3"))
+    live = sqlite3.connect(file)
+    live.execute("UPDATE messages SET data = ? WHERE id = 3", (b"\x28\xb5\x2f\xfd damaged",))
+    live.commit()
+    live.close()
+    source = open_source(tmp_path / "MESSAGE")
+    found = [arrived.content.wrench.force.x for arrived in source.messages(lambda topic: True)]
+    assert found == [paper_sample(1).wrench[0]] * 2 and source.losses.counts == {"undecodable": 1}
+    for read in (open_source, lambda path: expand([path])):
+        with pytest.raises(RecordingError, match=r"FILE\.db3\.zstd is compressed as a whole"):
+            read(tmp_path / "FILE")
 
 
 def mcap(path: Path, encoding: str, schema: tuple[str, str, bytes], messages: list[tuple[int, bytes]]) -> Path:

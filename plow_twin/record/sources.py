@@ -27,6 +27,9 @@ from plow_twin.scene_file.csv_rows import csv_rows, open_csv
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 _ROWS: Final = 1000
+_ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
+#: Largest message that is unpacked [B].
+_LARGEST_MESSAGE: Final = 2**26
 #: What a damaged file makes of sqlite3: its own errors, texts of them that are no UTF-8, cells of impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
@@ -103,7 +106,8 @@ def open_source(path: Path) -> Source:
         elif tables := sorted(path.glob("*.csv")):
             return CsvSource(tables)
         else:
-            raise RecordingError(f"{path}: got a folder without .mcap, .db3 or .csv, expected a recording")
+            found = f"a folder without .mcap, .db3 or .csv{packed(path)}"
+            raise RecordingError(f"{path}: got {found}, expected a recording")
         if missing:
             source.losses.counts["missing_parts"] = len(missing)
         return source
@@ -117,7 +121,25 @@ def open_source(path: Path) -> Source:
         return SqliteSource([path])
     if path.suffix.lower() == ".csv":
         return CsvSource([path])
-    raise RecordingError(f"{path}: got neither MCAP nor sqlite3 nor .csv, expected a recording")
+    raise RecordingError(f"{path}: got neither MCAP nor sqlite3 nor .csv, expected a recording{packed(path)}")
+
+
+def packed(path: Path) -> str:
+    """Return what to say about files that rosbag2 has compressed as a whole, if there are any."""
+    files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
+    return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
+
+
+def _decompressed(data: bytes) -> bytes:
+    """Return a message of a bag whose messages are compressed one by one; nothing where it is damaged."""
+    import zstandard
+
+    try:
+        if 0 <= zstandard.frame_content_size(data) <= _LARGEST_MESSAGE:
+            return zstandard.ZstdDecompressor().decompress(data)
+    except zstandard.ZstdError:
+        pass
+    return b""
 
 
 class Decoder:
@@ -153,6 +175,8 @@ class Decoder:
 
     def decode(self, data: bytes, message_type: str) -> Any | None:
         """Return a message, or None (counted) when the bytes do not hold one."""
+        if data.startswith(_ZSTD_MAGIC):
+            data = _decompressed(data)
         for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes behind a last empty float64[]
             try:
                 return self._store.deserialize_cdr(data[:end], message_type)
