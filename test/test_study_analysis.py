@@ -24,6 +24,7 @@ from scenes import ROOT
 
 from plow_twin import Initial, Wear
 from plow_twin.errors import RecordingError
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.cdr import schema_text, type_hash
 from plow_twin.record.measured import read_recording
@@ -33,7 +34,8 @@ from plow_twin.run.energy_balance import elastic_energy
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.journal import Entry, Pose
+from plow_twin.stream.journal import Entry, Pose, Restore, SetModel, Travel
+from plow_twin.stream.session import Session
 from plow_twin.study.analysis import loads, thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
 from plow_twin.study.analysis.loads import reversals
@@ -205,6 +207,45 @@ def test_poses_in_the_journal_are_measured_ones(tmp_path: Path) -> None:
     assert {name: one.n for name, one in found.comparisons(found.predictions[0]).items()} == dict.fromkeys(
         ("x", "y", "theta"), len(range(20, 500, 21))
     )
+
+
+def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp_path: Path) -> None:
+    """Other numbers, a motion restored, poses and speeds between the samples: the contacts bore what was recorded."""
+    samples = [*map(paper_sample, range(1500))]
+    session = Session(Twin(load_scene(PAPER), excitation="sampled"))
+    for sample in samples[:400]:
+        session.apply(sample)
+    changes = SetModel(samples[599].stamp_ns, json.dumps({"contact.stiffness": 3e7, "clearance.vertical_m": 0.02}))
+    again = Restore(samples[999].stamp_ns, session.snapshot().data)
+    poses = [Pose(sample.stamp_ns, (0.0, 0.0, 0.0)) for sample in samples]
+    entries = [entry for both in zip(samples, poses, strict=True) for entry in both]
+    speeds = [Travel(BASE_NS, 1.0), Travel(BASE_NS + 300 * STEP_NS, -1.0)]  # the second comes ahead of its time
+    entries = [*entries[:2], *speeds, *entries[2:1200], changes, *entries[1200:2000], again, *entries[2000:]]
+    run = record_run(tmp_path / "run", entries, frame_every=1)
+    peaks = [message for topic, message in run.outputs if topic.endswith("contact_peaks")]
+    (tmp_path / "other.yaml").write_text(dump_scene(load_scene(PAPER)))
+    mine, other = analyse(run.folder, others=[tmp_path / "other.yaml"]).predictions
+    force = np.array([message.effort for message in peaks])
+    assert force[:1200].any() and force[1200:].any()
+    assert mine.loads.impulse == pytest.approx(sum(message.velocity for message in peaks), rel=1e-9)
+    np.testing.assert_array_equal(mine.loads.largest, force.max(axis=0))
+    assert other.loads.impulse != pytest.approx(mine.loads.impulse, rel=0.01)
+    for name, counted in mine.loads.cycles().items():  # a row may stand alone between other entries
+        whole = rainflow.count_cycles(force[:, PAIR_NAMES.index(name)], nbins=loads.CYCLE_BINS)
+        assert [one["count"] for one in counted] == [count for _, count in whole]
+    assert [item.start_s for item in mine.loads.passes] == pytest.approx([0.0, 0.301], abs=1e-9)
+
+
+def test_a_gap_is_compared_with_what_is_left_to_the_wall(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+    load = np.column_stack(motion[:2])[:1000]
+    pair = PAIR_NAMES.index("top_right_right")
+    penetration = Twin(load_scene(PAPER), excitation="sampled").advance_samples(load[:, 0], load[:, 1:]).penetration
+    gap = np.column_stack([load[:, 0], 1e-3 - penetration[:, pair]])  # 1 mm too much
+    for name, rows, header in (("load", load, "t,fx,fy,m"), ("gaps", gap, "t,top_right_right")):
+        np.savetxt(tmp_path / f"{name}.csv", rows, delimiter=",", header=header, comments="")
+    found = analyse(tmp_path, scene=PAPER)
+    signal = found.comparisons(found.predictions[0])["gap_top_right_right"]
+    assert signal.bias == pytest.approx(-1e-3, abs=1e-6) and signal.correlation == pytest.approx(1.0, abs=1e-6)
 
 
 def test_messages_beside_a_run_that_do_not_fit_are_counted_by_topic(tmp_path: Path) -> None:

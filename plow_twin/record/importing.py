@@ -6,6 +6,7 @@ In a replay time is that of the stamps: nothing is held for want of samples, a l
 from __future__ import annotations
 
 import math
+from bisect import insort
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -15,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.model.scene import Scene
 from plow_twin.record.entries import Entries, Holes
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.stream.intake import Intake, Verdict
-from plow_twin.stream.journal import Digest, Entry, Loss, Reset, SetWear, Snapshot, Travel
+from plow_twin.stream.journal import Digest, Entry, Loss, Reset, Restore, SetModel, SetWear, Snapshot, Travel
 from plow_twin.stream.outputs import Publications
 from plow_twin.stream.session import DIGEST_INTERVAL, Session
 from plow_twin.stream.steps import Steps
@@ -45,6 +47,8 @@ class Walked:
     publications: Publications
     #: signed speed along the face [m/s]
     speed_m_s: float
+    #: with the changes of the model so far
+    scene: Scene
 
 
 class Walker:
@@ -95,7 +99,7 @@ class Walker:
         self._log_time_ns = log_time_ns or self._log_time_ns
         self._entry(entry)
         self.session.apply(entry)
-        if isinstance(entry, Reset | SetWear):
+        if isinstance(entry, Reset | SetWear | Restore):
             self.on_reset()
 
     def samples(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_time_ns: NDArray[np.int64]) -> None:
@@ -116,7 +120,7 @@ class Walker:
         publications = self.session.outputs.take_rows(stamp_ns, done.rows, np.arange(count))
         if self._writer is not None:
             self._write(stamp_ns, wrench, log_ns, marks, done.digests, publications, good)
-        self._on_walked(Walked(stamp_ns, wrench, done.rows, publications, self.speed_m_s))
+        self._on_walked(Walked(stamp_ns, wrench, done.rows, publications, self.speed_m_s, self.session.twin.scene))
         if count >= _FAILURE_LIMIT and done.status[-_FAILURE_LIMIT:].all():
             self.apply(Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
 
@@ -169,10 +173,17 @@ class JournalWalk:
         Walkers that go on from states of their own.
     whole
         Whether the journal begins with the run: else its first snapshot is taken over.
+    same_scene
+        Whether `own` are of the run's scene: they follow changes of the model and motions that were restored.
     """
 
-    def __init__(self, own: Sequence[Walker], others: Sequence[Walker], *, whole: bool = True) -> None:
+    def __init__(
+        self, own: Sequence[Walker], others: Sequence[Walker], *, whole: bool = True, same_scene: bool = True
+    ) -> None:
         self._own, self._all = own, (*own, *others)
+        self._same = own if same_scene else ()
+        #: speeds whose stamps have not been reached, by these
+        self._travels: list[Travel] = []
         self._lost = not whole
         self._reached_ns = -1
         self.used = self.late = self.missing = 0
@@ -205,21 +216,47 @@ class JournalWalk:
         order = np.argsort(stamps, kind="stable")
         order = order[stamps[order] > self._reached_ns]
         self.used, self.late = self.used + len(order), self.late + len(stamps) - len(order)
-        if len(order):
-            self._reached_ns = int(stamps[order[-1]])
-            for walker in self._all:
-                walker.samples(stamps[order], wrench[order], stamps[order])
+        stamps, wrench = stamps[order], wrench[order]
+        while len(stamps):
+            count = len(stamps)
+            if self._travels:  # what was sent ahead of its time acts from its stamp on
+                count = int(np.searchsorted(stamps, self._travels[0].stamp_ns, "right"))
+            if count:
+                self._reached_ns = int(stamps[count - 1])
+                for walker in self._all:
+                    walker.samples(stamps[:count], wrench[:count], stamps[:count])
+                stamps, wrench = stamps[count:], wrench[count:]
+            if len(stamps):
+                self._speed(self._travels.pop(0).speed_m_s)
+
+    def _speed(self, speed_m_s: float) -> None:
+        for walker in self._all:
+            walker.speed_m_s = speed_m_s
+            walker.apply(Travel(max(0, self._reached_ns), speed_m_s))  # at once
+
+    def _begin_anew(self) -> None:
+        """Forget the time reached: the next stamp may be any; speeds that were to come act from now on."""
+        for travel in self._travels:
+            self._speed(travel.speed_m_s)
+        self._travels, self._reached_ns = [], -1
 
     def _entry(self, entry: Entry | Dropped) -> None:
         match entry:
+            case Travel(stamp_ns, speed) if 0 <= self._reached_ns < stamp_ns:
+                insort(self._travels, entry, key=lambda travel: travel.stamp_ns)
             case Travel(_, speed):
-                for walker in self._all:
-                    walker.speed_m_s = speed
-                    walker.apply(Travel(max(0, self._reached_ns), speed))  # at once
+                self._speed(speed)
             case Reset() | Loss():
-                self._reached_ns = -1
+                self._begin_anew()
                 for walker in self._all:
                     walker.apply(Reset(0, "loss") if isinstance(entry, Loss) else entry)
+            case Restore():
+                self._begin_anew()
+                for walker in self._all:
+                    walker.apply(entry if walker in self._same else Reset(0, "restore"))
+            case SetModel():
+                for walker in self._same:
+                    walker.apply(entry)
             case Snapshot() if self._lost:
                 for walker in self._own:
                     walker.apply(entry)

@@ -338,7 +338,7 @@ class Drawing:
                 self.face.forces(rows.stamp_ns[begin:end], largest[begin:end])
                 begin = end
                 if isinstance(entry, Travel):
-                    self.face.travel(entry.speed_m_s)
+                    self.face.travel(entry)
                 else:
                     self.face.restart()
         self.face.forces(rows.stamp_ns[begin:], largest[begin:])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from bisect import insort
 from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from plow_twin.stream.journal import Travel
 from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
 #: Size of the chart in the units of its view.
@@ -42,9 +44,18 @@ class FaceChart:
         self._speed = self._place_m = 0.0
         self._direction = 0.0
         self._reached_ns: int | None = None
+        #: speeds whose stamps have not been reached, by these
+        self._coming: list[Travel] = []
         self.known = False
 
-    def travel(self, speed_m_s: float) -> None:
+    def travel(self, travel: Travel) -> None:
+        """Go on with another speed from its stamp on."""
+        if self._reached_ns is not None and travel.stamp_ns > self._reached_ns:
+            insort(self._coming, travel, key=lambda one: one.stamp_ns)
+        else:
+            self._set_speed(travel.speed_m_s)
+
+    def _set_speed(self, speed_m_s: float) -> None:
         """Go on with another speed; a change of direction begins a pass."""
         direction = math.copysign(1.0, speed_m_s) if speed_m_s else 0.0
         if direction and self._direction and direction != self._direction:
@@ -54,7 +65,16 @@ class FaceChart:
         self.known = self.known or bool(speed_m_s)
 
     def forces(self, stamps: Indexes, force: Array) -> None:
-        """Take in forces [N], shape (n,), under the present speed."""
+        """Take in forces [N], shape (n,), each under the speed at its time."""
+        while len(stamps) and self._coming and stamps[-1] > self._coming[0].stamp_ns:
+            count = int(np.searchsorted(stamps, self._coming[0].stamp_ns, "right"))
+            self._forces(stamps[:count], force[:count])
+            stamps, force = stamps[count:], force[count:]
+            self._set_speed(self._coming.pop(0).speed_m_s)
+        self._forces(stamps, force)
+
+    def _forces(self, stamps: Indexes, force: Array) -> None:
+        """Take in forces under the present speed."""
         if not len(stamps):
             return
         last = int(stamps[0]) if self._reached_ns is None else self._reached_ns
@@ -73,8 +93,10 @@ class FaceChart:
             here = self._passes[-1]
 
     def restart(self) -> None:
-        """Go on after a reset: the stamps may go back."""
-        self._reached_ns = None
+        """Go on after a reset: the stamps may go back, and speeds that were to come act."""
+        for travel in self._coming:
+            self._set_speed(travel.speed_m_s)
+        self._coming, self._reached_ns = [], None
 
     def draw(self, stamp_ns: int, step: int) -> None:
         """Draw what there is."""

@@ -21,12 +21,12 @@ from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed, JournalWalk, Walked, Walker
 from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
-from plow_twin.record.sources import open_source
+from plow_twin.record.sources import open_source, packed
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Intake
-from plow_twin.stream.journal import Loss, Pose, Reset, SetWear
+from plow_twin.stream.journal import Loss, Pose, Reset, Restore, SetWear
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis.loads import LoadTotals
@@ -47,6 +47,8 @@ _TOLERANCE: Final = 1e-9
 _STEP_NS: Final = 1_000_000_000
 #: Largest measured value, in any unit; the squares of larger ones leave the numbers there are.
 _LARGEST: Final = 1e15
+#: Name of the scene in the header of a run.
+_OF_THE_RUN: Final = "of the run"
 _MAP: Final = "map_"
 #: Among the parameters of each run that an analysis has made.
 MAPPED_LOAD: Final = f"{_MAP}excitation"
@@ -77,7 +79,7 @@ class Prediction:
         rows, published = part.rows, part.publications
         first, _ = self.spans.get(self.resets, (int(part.stamp_ns[0]), 0))
         self.spans[self.resets] = first, int(part.stamp_ns[-1])
-        self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, rows.penetration)))
+        self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, -rows.penetration)))
         self.clearance.add(published.stamp_ns[published.slow_index], published.clearance)
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
@@ -306,7 +308,7 @@ def analyse(
         raise RecordingError(f"{path}: expected a run of plow_twin: another recording cannot be followed")
     if reader is not None:
         own = reader.header.scene(reader.path)
-        chosen, name = (own, "of the run") if scene is None else (load_scene(scene_path(str(scene))), str(scene))
+        chosen, name = (own, _OF_THE_RUN) if scene is None else (load_scene(scene_path(str(scene))), str(scene))
     else:
         file = scene or (path / "scene.yaml" if path.is_dir() else path.with_name("scene.yaml"))
         if scene is None and not file.is_file():
@@ -346,7 +348,7 @@ def _walk_own(
     ]
     for walker, prediction in zip(walkers, predictions, strict=True):
         walker.on_reset = prediction.restart
-    walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part)
+    walk = JournalWalk(walkers[:1], walkers[1:], whole=not header.part, same_scene=predictions[0].name == _OF_THE_RUN)
     journalled = Measured()  # where the node estimates
 
     def so_far() -> Analysis:
@@ -366,7 +368,7 @@ def _walk_own(
         stretch = predictions[0].resets
         walk.add(batch.entries)
         for _, entry in sorted(batch.entries.others.items()):
-            stretch += isinstance(entry, Reset | Loss | SetWear)
+            stretch += isinstance(entry, Reset | Loss | SetWear | Restore)
             if isinstance(entry, Pose):
                 pose = dict(zip(("x", "y", "theta"), entry.pose, strict=True))
                 journalled.add("head_pose", entry.stamp_ns, pose, stretch)
@@ -424,7 +426,12 @@ def _walk_other(
         measured.add(role, stamp_ns, numbers, predictions[0].resets)
 
     feed = Feed(walkers, roles, add, Intake())
-    feed.run(messages_of(source, roles))
+    try:
+        feed.run(messages_of(source, roles))
+    except RecordingError as error:
+        unread = [f"{name} {count}" for name, count in source.losses.counts.items() if count]
+        unread += [f"{topic} is {kind}" for topic, kind in source.losses.unknown_types.items()]
+        raise RecordingError(f"{error} ({', '.join(unread)})" if unread else str(error)) from None
     intake = feed.intake
     dropped = {
         f"dropped_{verdict.value}": count for verdict, count in intake.counts.items() if not verdict.used and count
@@ -482,6 +489,6 @@ def expand(paths: Sequence[Path]) -> list[Path]:
             if item.suffix in (".mcap", ".db3") or _holds_recording(item) or (item / "metadata.yaml").is_file()
         ]
         if not inside:
-            raise RecordingError(f"{path}: got a folder without recordings, expected some")
+            raise RecordingError(f"{path}: got a folder without recordings, expected some{packed(path)}")
         found += inside
     return found

@@ -50,7 +50,7 @@ class Series:
     def __init__(self) -> None:
         self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 (goes with this object)
         weakref.finalize(self, self._file.close)
-        self.low, self.high = math.inf, -math.inf
+        self.low, self.high, self.last = math.inf, -math.inf, math.nan
 
     def __iter__(self) -> Iterator[float]:
         """Yield the numbers; nothing may be added meanwhile."""
@@ -63,6 +63,7 @@ class Series:
         self._file.seek(0, 2)
         self._file.write(values.astype(np.float64).tobytes())
         self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
+        self.last = float(values[-1])
 
 
 @dataclass
@@ -99,6 +100,7 @@ class LoadTotals:
 
     def add(self, walked: Walked) -> None:
         """Take in some advances."""
+        self.scene = walked.scene
         rows, stamps = walked.rows, walked.stamp_ns
         self._first_ns = int(stamps[0]) if self._first_ns is None else self._first_ns
         steps = np.zeros(len(stamps))
@@ -115,7 +117,7 @@ class LoadTotals:
             self.sets[int(mask)] += int(count)
         for pair, kept in enumerate(self._reversals):
             turning = reversals(rows.peak[:, pair])
-            if turning.size > 1 or turning.any():
+            if turning.any() or kept.last != 0.0:  # of a long time without contact one zero is enough
                 kept.add(turning)
         loss = self._contact_loss(walked, steps)
         self.contact_loss_j += float(loss.sum())
