@@ -18,6 +18,7 @@ from typing import Any
 import browser
 import numpy as np
 import pytest
+from commands import plow_twin, plow_twin_here
 from PIL import Image
 from record_support import Run, paper_sample, record_run, rewrite
 
@@ -50,18 +51,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return record_run(tmp_path_factory.mktemp("recording") / "run", map(paper_sample, range(SAMPLES)))
 
 
-def plow_twin(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "plow_twin", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=110, stdin=subprocess.DEVNULL)
-
-
 def test_replay_of_an_untouched_recording_ends_with_0(run: Run) -> None:
     done = plow_twin("replay", run.folder, "--json")
     assert (done.returncode, done.stderr) == (0, "")
     facts = json.loads(done.stdout)
     assert (facts["result"], facts["samples"], facts["divergences"]) == ("the same", SAMPLES, 0)
     assert facts["messages_compared"]["contact_forces"] == SAMPLES
-    quiet = plow_twin("replay", run.file, "--quiet")
+    quiet = plow_twin_here("replay", run.file, "--quiet")
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
 
 
@@ -92,7 +88,7 @@ def test_replay_of_another_build_warns(run: Run, tmp_path: Path) -> None:
             record["build"] = json.dumps(json.loads(record["build"]) | {"numba": "0.1"})
         return record
 
-    done = plow_twin("replay", rewrite(run.file, tmp_path / "other.mcap", metadata=other_build), "--quiet")
+    done = plow_twin_here("replay", rewrite(run.file, tmp_path / "other.mcap", metadata=other_build), "--quiet")
     assert (done.returncode, done.stdout) == (0, "")
     assert done.stderr.startswith(
         "plow-twin: warning: recorded by another build, which may round differently: numba 0.1"
@@ -103,7 +99,7 @@ def test_a_cut_recording_ends_with_3_in_every_verb(run: Run, tmp_path: Path) -> 
     data = run.file.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
     for verb in ("replay", "view", "info"):
-        done = plow_twin(verb, tmp_path / "cut.mcap")
+        done = plow_twin_here(verb, tmp_path / "cut.mcap")
         assert done.returncode == 3, f"{verb}: {done.stderr}"
         assert "truncated" in done.stdout + done.stderr
     assert (tmp_path / "cut.rrd").stat().st_size > 10_000
@@ -113,7 +109,7 @@ def test_a_recording_stopped_early_ends_with_3_in_every_verb(tmp_path: Path) -> 
     stopped = record_run(tmp_path / "run", map(paper_sample, range(100)), min_free_bytes=2**62)
     assert stopped.loss.closed and not stopped.loss.complete
     for verb in ("replay", "view", "info"):
-        done = plow_twin(verb, stopped.folder)
+        done = plow_twin_here(verb, stopped.folder)
         assert done.returncode == 3, f"{verb}: {done.stderr}"
         assert "stopped early" in done.stdout + done.stderr
         assert verb == "view" or f"expected at least {2**62} B" in done.stdout
@@ -123,13 +119,13 @@ def test_a_recording_with_counted_loss_ends_with_3_in_every_verb(tmp_path: Path)
     lossy = record_run(tmp_path / "run", map(paper_sample, range(400)), queue_size=40, pause_every=200)
     assert lossy.loss.closed and lossy.loss.lost and lossy.loss.error is None
     for verb in ("replay", "view", "info"):
-        done = plow_twin(verb, lossy.folder)
+        done = plow_twin_here(verb, lossy.folder)
         assert done.returncode == 3, f"{verb}: {done.stderr}"
         assert "lost" in done.stdout + done.stderr
 
 
 def test_info_counts_what_a_recording_holds(run: Run) -> None:
-    done = plow_twin("info", run.file, "--json")
+    done = plow_twin_here("info", run.file, "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["status"] == "complete"
@@ -139,7 +135,7 @@ def test_info_counts_what_a_recording_holds(run: Run) -> None:
 
 
 def test_view_writes_where_it_is_told(run: Run, tmp_path: Path) -> None:
-    done = plow_twin("view", run.folder, "--out", tmp_path / "picture.rrd")
+    done = plow_twin_here("view", run.folder, "--out", tmp_path / "picture.rrd")
     assert done.returncode == 0, done.stderr
     assert f"{SAMPLES} force rows" in done.stdout
     assert (tmp_path / "picture.rrd").read_bytes()[:4] == b"RRF2"
@@ -156,11 +152,11 @@ def answers(port: int) -> bool:
 
 
 def test_view_refuses_what_cannot_be_drawn(run: Run, tmp_path: Path) -> None:
-    refused = plow_twin("view", run.folder, "--out", tmp_path / "x.rrd", "--exaggerate", "1e+308")
+    refused = plow_twin_here("view", run.folder, "--out", tmp_path / "x.rrd", "--exaggerate", "1e+308")
     assert refused.returncode == 2 and "1e+308" in refused.stderr and "Traceback" not in refused.stderr
     # a run under its scene's own loads has none in its journal
     own = rewrite(run.file, tmp_path / "own.mcap", metadata=lambda record: {**record, "excitation_source": "scene"})
-    refused = plow_twin("view", own, "--out", tmp_path / "x.rrd", "--with", "paper")
+    refused = plow_twin_here("view", own, "--out", tmp_path / "x.rrd", "--with", "paper")
     assert refused.returncode == 1 and "excitation_source" in refused.stderr
 
 

@@ -1,4 +1,4 @@
-"""The command line, run as a user runs it: files, JSON, exit codes."""
+"""The command line: files, JSON, exit codes; as a program where that is the point, else in this process."""
 
 from __future__ import annotations
 
@@ -14,17 +14,13 @@ from pathlib import Path
 import mcap_bytes
 import numpy as np
 import pytest
+from commands import plow_twin, plow_twin_here
 
 from plow_twin import PAIR_NAMES, simulate
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 
 RUN = ["simulate", "paper", "--t-end", "2", "--output-dt", "0.01"]
-
-
-def plow_twin(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "plow_twin", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=110, stdin=subprocess.DEVNULL)
 
 
 def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
@@ -54,7 +50,7 @@ def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
 
 
 def test_npz_keeps_the_contract(tmp_path: Path) -> None:
-    done = plow_twin(*RUN, "--out", str(tmp_path / "run.npz"), "--quiet")
+    done = plow_twin_here(*RUN, "--out", str(tmp_path / "run.npz"), "--quiet")
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     result = simulate(load_scene(scene_path("paper")), 2.0, 0.01)
     with np.load(tmp_path / "run.npz") as run:
@@ -75,7 +71,7 @@ def test_npz_keeps_the_contract(tmp_path: Path) -> None:
 def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
     answers = {}
     for method, extra in (("events", []), ("rk4", ["--dt", "1e-4"]), ("euler", ["--dt", "1e-5"])):
-        done = plow_twin("simulate", "bench_kv", "--t-end", "1", "--method", method, *extra, "--json")
+        done = plow_twin_here("simulate", "bench_kv", "--t-end", "1", "--method", method, *extra, "--json")
         assert done.returncode == 0, done.stderr
         answers[method] = json.loads(done.stdout)
         assert answers[method]["solver"]["method"] == method
@@ -119,7 +115,7 @@ def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
 def test_wrong_usage_and_wrong_scenes_exit_with_2(arguments: list[str], said: str, tmp_path: Path) -> None:
     plain = dump_scene(replace(load_scene(scene_path("paper")), marks={}))
     (tmp_path / "bad.yaml").write_text(plain.replace("mass_kg", "mass"))
-    done = plow_twin(*arguments, cwd=tmp_path)
+    done = plow_twin_here(*arguments, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert said in done.stderr
     assert "Traceback" not in done.stderr
@@ -140,7 +136,7 @@ def test_what_cannot_be_done_exits_with_1(tmp_path: Path) -> None:
         (["replay", "no.mcap"], "no.mcap"),
         (["simulate", "paper", "--t-end", "0.1", "--out", "full.csv"], "full.csv: No space left on device"),
     ):
-        done = plow_twin(*arguments, cwd=tmp_path)
+        done = plow_twin_here(*arguments, cwd=tmp_path)
         assert done.returncode == 1, done.stderr
         assert said in done.stderr
         assert "Traceback" not in done.stderr
@@ -186,7 +182,7 @@ def test_a_missing_extra_is_named_with_its_pip_command(tmp_path: Path) -> None:
 
 
 def test_info_lists_marks_and_versions() -> None:
-    done = plow_twin("info", "paper", "--json")
+    done = plow_twin_here("info", "paper", "--json")
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     rows = {row["key"]: row for row in facts["numbers"]}
@@ -200,7 +196,7 @@ def test_info_lists_marks_and_versions() -> None:
     derived = {fact["quantity"]: fact["value"] for fact in facts["derived"]}
     assert derived["constant moment of gravity"] == pytest.approx(-2430 * 9.81 * 0.255)
     assert derived["fx1: amplitude of the moment"] == pytest.approx(-66240)
-    environment = plow_twin("info", "--json")
+    environment = plow_twin_here("info", "--json")
     assert environment.returncode == 0, environment.stderr
     versions = json.loads(environment.stdout)
     assert versions["numpy"] == np.__version__
@@ -208,7 +204,7 @@ def test_info_lists_marks_and_versions() -> None:
 
 
 def test_the_energy_balance_closes() -> None:
-    done = plow_twin(*RUN, "--energy-balance", "--json")
+    done = plow_twin_here(*RUN, "--energy-balance", "--json")
     assert done.returncode == 0, done.stderr
     balance = json.loads(done.stdout)["energy_balance"]
     start, end = balance["kinetic_j"]
@@ -218,7 +214,7 @@ def test_the_energy_balance_closes() -> None:
     assert end - start == pytest.approx(given - taken, abs=1e-6 * balance["turnover_j"])
     assert balance["dissipated_j"] > 1.0 and balance["friction_work_j"] == 0.0
     assert 0.0 <= balance["relative_imbalance"] < 1e-6 and len(balance["momentum_imbalance"]) == 3
-    shown = plow_twin(*RUN, "--audit").stdout
+    shown = plow_twin_here(*RUN, "--audit").stdout
     assert "balance of energy" in shown and "largest imbalance" in shown
 
 

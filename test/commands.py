@@ -1,0 +1,25 @@
+"""The command line as a user runs it, in a process of its own, and as quickly as can be, in this one."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from contextlib import chdir, redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+from plow_twin.cli.app import run
+
+
+def plow_twin(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a command as a program."""
+    command = [sys.executable, "-m", "plow_twin", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=110, stdin=subprocess.DEVNULL)
+
+
+def plow_twin_here(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a command in this process: what it says and its exit code are the same, a start costs a second."""
+    given, out, err = [*map(str, arguments)], StringIO(), StringIO()
+    with chdir(cwd or Path.cwd()), redirect_stdout(out), redirect_stderr(err):
+        code = run(given)
+    return subprocess.CompletedProcess(given, code, out.getvalue(), err.getvalue())
