@@ -198,7 +198,7 @@ def test_how_far_off_a_path_is_is_told_by_the_drawn_ones() -> None:
     assert np.mean(np.array(wrong) > estimating.MOST_PATH) > 0.9
 
 
-@pytest.mark.parametrize("seed", [56004, 56005])
+@pytest.mark.parametrize("seed", [56004, pytest.param(56005, marks=pytest.mark.stress)])
 def test_between_soft_and_hard_the_fit_comes_to_its_end_and_its_intervals_hold(seed: int) -> None:
     # the search took all the work of one, the other's error was three of its deviations
     truth = draw(GROUPS["middle"], seed)
@@ -333,6 +333,20 @@ def test_a_wall_never_touched_is_not_observable() -> None:
     assert result.horizontal.p95 - result.horizontal.p05 > 0.01
 
 
+def test_what_can_hardly_be_foretold_contradicts_no_clearance(
+    known: list[tuple[Truth, Estimate]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimating, "FORETOLD", 1.1)
+    truth, before = known[0]
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
+    assert (result.model, result.sensor) == ("ok", "ok") and before.horizontal_state is State.ESTIMATED
+    assert all("% of it can be foretold, expected 110%" in reason for reason in result.reasons)
+    assert [reason[:2] for reason in result.reasons] == ["x:", "y:"]
+    assert result.horizontal.deviation > 10.0 * before.horizontal.deviation
+
+
+@pytest.mark.stress
 def test_a_clearance_that_nothing_contradicts_is_not_estimated() -> None:
     """With theta locked the head stays at the top walls: 6.8 mm were told instead of 27.1, with a deviation of 0.4."""
     nominal = replace(preset("paper"), locked=("theta",))
