@@ -105,14 +105,14 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
     days, values, true = (np.array([row[i] for row in rows]) for i in range(3))
     history = History((days - days[0]) * day_m, values[:, :, 0], values[:, :, 1])
     known = coefficient(under, history)
-    quantiles = np.interp([0.05, 0.5, 0.9, 0.95], np.cumsum(known.weight), known.value) / one.coefficient_m2_n
+    quantiles = [known.quantile(share) / one.coefficient_m2_n for share in (0.05, 0.5, 0.9, 0.95)]
     error = (values[:, :, 0] - true) / values[:, :, 1]
     return {
         "seed": seed, "day_m": day_m, "coefficient_m2_n": one.coefficient_m2_n,
         "grown_m": (true[-1] - true[0]).tolist(), "visits": len(rows),
         "rmse_m": float(np.sqrt(np.mean((values[:, :, 0] - true) ** 2))),
         "inside": float(np.mean(np.abs(error) <= 1.645)),
-        **dict(zip(("p05_ratio", "p50_ratio", "p90_ratio", "p95_ratio"), quantiles.tolist(), strict=True)),
+        **dict(zip(("p05_ratio", "p50_ratio", "p90_ratio", "p95_ratio"), quantiles, strict=True)),
     }  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc
+from scipy.special import chdtrc, ndtri
 
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, Interval
@@ -77,8 +77,13 @@ class Coefficient:
 
     def interval(self) -> Interval:
         """Return median and 5 % and 95 % points in m^2/N."""
-        low, middle, high = np.interp([0.05, 0.5, 0.95], np.cumsum(self.weight), self.value)
-        return Interval(float(middle), float(low), float(high))
+        return Interval(self.quantile(0.5), self.quantile(0.05), self.quantile(0.95))
+
+    def quantile(self, share: float) -> float:
+        """Return a point of the distribution in m^2/N; the path that tells it is itself known to `PATH_DEVIATION`."""
+        middle, point = np.log(np.interp([0.5, share], np.cumsum(self.weight), self.value))
+        off = math.hypot(point - middle, PATH_DEVIATION * float(ndtri(share)))
+        return math.exp(float(middle) + math.copysign(off, share - 0.5))
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
         """Return coefficients drawn from the posterior, shape (count,)."""
