@@ -13,8 +13,8 @@ INSTALLED := $(VENV)/.installed
 SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
-# two processes, each with whole files: much of the time goes to compiling and to waiting for nodes
-PARALLEL ?= -n 2 --dist loadfile
+# three processes for two cores, each with whole files: some of them wait for nodes and viewers
+PARALLEL ?= -n 3 --dist loadfile
 BENCH_ARGS ?=
 SITE ?= out/site
 COVERED ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_stream_*.py test/test_record_file.py)

@@ -21,8 +21,10 @@ def _prepare_environment() -> None:
     """Set what child processes inherit; runs before rclpy is imported anywhere."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
-    # 1..101 keeps clear of the ephemeral ports; two runs at once get two domains
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 101)
+    # 1..101 keeps clear of the ephemeral ports; each process of a run has its own, two runs at once have others
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+    number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
+    os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs

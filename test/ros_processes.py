@@ -34,6 +34,8 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 100.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
+#: Four times what a stop may take on a machine that does nothing else [s].
+STOP_S = 20.0
 _numbers = itertools.count()
 
 
@@ -63,9 +65,9 @@ class Process:
         return self._process.wait(timeout_s)
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
-        """Ask for a stop; more than 5 s is a failure."""
+        """Ask for a stop; more than `STOP_S` is a failure."""
         self._process.send_signal(number)
-        return self._process.wait(5.0)
+        return self._process.wait(STOP_S)
 
     def stop_again_and_again(self, number: signal.Signals) -> int:
         """Ask for a stop until the process has ended."""
@@ -140,11 +142,14 @@ class Probe:
     def until_figure(self, part: str, key: str, *expected: str, timeout_s: float = WAIT_S) -> None:
         """Wait until a figure of the diagnostics has one of the values."""
         name = f"{self.node.get_namespace()}/plow_twin: {part}"
-        self.until(
-            lambda: self.reports and name in self.reports[-1] and value(self.reports[-1][name], key) in expected,
-            f"{part} {key} = {expected}",
-            timeout_s,
-        )
+        try:
+            self.until(
+                lambda: self.reports and name in self.reports[-1] and value(self.reports[-1][name], key) in expected,
+                f"{part} {key} = {expected}",
+                timeout_s,
+            )
+        except AssertionError as error:
+            raise AssertionError(f"{error}; last {part} {self.figures(part)}") from None
 
     def publisher(self, kind: type, topic: str, profile: QoSProfile | int = 1000) -> Any:
         """Return a publisher, once the twin says that it is connected to it."""
