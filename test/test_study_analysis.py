@@ -236,6 +236,17 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     assert [item.start_s for item in mine.loads.passes] == pytest.approx([0.0, 0.301], abs=1e-9)
 
 
+def test_late_samples_of_a_run_take_their_places_among_whatever_stands_between(tmp_path: Path) -> None:
+    samples = [*map(paper_sample, range(1000))]
+    entries: list[Entry] = sorted(samples, key=lambda one: (n := one.stamp_ns - BASE_NS) + 5.5 * STEP_NS * (n % 7 == 3))
+    entries[500:500] = [Pose(BASE_NS, (0.0, 0.0, 0.0))] * 3
+    found = analyse(record_run(tmp_path / "run", entries, frame_every=10**9, rollback_span_s=1.0).folder)
+    assert found.input == {"samples_used": 1000} and not found.lost
+    twin = Twin(load_scene(PAPER), excitation="sampled")
+    series = twin.advance_samples(1e-3 * np.arange(1000), np.array([sample.wrench for sample in samples]))
+    assert found.predictions[0].loads.impulse == pytest.approx(series.impulse.sum(axis=0), rel=1e-9)
+
+
 def test_a_gap_is_compared_with_what_is_left_to_the_wall(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
     load = np.column_stack(motion[:2])[:1000]
     pair = PAIR_NAMES.index("top_right_right")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import subprocess
 import sys
 from dataclasses import replace
@@ -170,6 +171,17 @@ def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary
         np.testing.assert_allclose(top, cavity[0] * np.array([np.cos(theta), -np.sin(theta)]), atol=1e-3)
     arrows = [len(row or []) for row in tables["/section/force"]["Arrows2D:vectors"].to_pylist()]
     assert max(arrows) >= 2 and len(arrows) == len(head)
+
+
+def test_what_does_not_fit_on_the_disk_is_said_and_no_half_of_it_stays(run: Run, tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, before[1]))
+    try:
+        with pytest.raises(RecordingError, match=r"run\.rrd: cannot be written"):
+            to_rrd(run.file, tmp_path / "run.rrd")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not (tmp_path / "run.rrd").exists()
 
 
 def test_what_lies_along_the_face_what_was_measured_and_what_if(tmp_path: Path) -> None:

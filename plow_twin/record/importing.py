@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 #: Samples advanced together.
 _BATCH: Final = 4096
+#: Entries that a walk of a journal acts on; across all others late samples are put in their places.
+_ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
 #: Failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10
 
@@ -204,12 +206,14 @@ class JournalWalk:
         self._entry(Loss(count))
 
     def _whole(self, entries: Entries) -> None:
-        begin = 0
-        for place in (*sorted(entries.others), len(entries)):
-            if place > begin:
-                self._samples(entries.stamp_ns[begin:place], entries.wrench[begin:place])
+        stamps, wrench, begin = entries.stamp_ns, entries.wrench, 0
+        acting = sorted(place for place, entry in entries.rest.items() if isinstance(entry, _ACTING))
+        for place in (*acting, len(entries)):
+            samples = begin + np.flatnonzero(entries.sample[begin:place])
+            if samples.size:
+                self._samples(stamps[samples], wrench[samples])
             if place < len(entries):
-                self._entry(entries.others[place])
+                self._entry(entries.rest[place])
             begin = place + 1
 
     def _samples(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:

@@ -120,7 +120,13 @@ def to_rrd(
     drawing.finish(reader)
     if on_progress is not None:
         on_progress(1.0)
-    stream.flush()
+    try:
+        stream.flush()
+    except Exception as error:
+        stream.disconnect()
+        if out.is_file():  # cut off, and no device
+            out.unlink()
+        raise RecordingError(f"{out}: cannot be written: {error}") from error
     stream.disconnect()
     return ViewSummary.of(out, drawing, reader)
 
