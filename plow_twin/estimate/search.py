@@ -22,7 +22,7 @@ _FIRST_PERIODS = 3.0
 _NOISE = np.array([1e-3, 1e-3, 4e-3])
 #: Penetration in m under the reference force below which a contact is hard: the head bounces long, and what it does
 #: after some bounces cannot be foretold.
-_HARD = 3e-3
+HARD = 3e-3
 
 
 @dataclass(frozen=True)
@@ -68,14 +68,16 @@ def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float)
 
 def refine(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, shared: Array, noise: Array, drift: Array | None,
-    turns: Array | None = None,
+    turns: Array | None = None, close: bool = False,
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
     """Fit all poses from a good start: the beginning of each swing first.
+
+    From a start `close` to the optimum long swings of a hard contact end in it too.
 
     `drift` (3,), in m2/s3 and rad2/s3, is what a broad-band load leaves open, None of another load; `turns` (4,) are
     those of the walls, in m.
     """
-    hard = bool(np.exp(shared[SOFTNESS]) < _HARD)
+    hard = not close and bool(np.exp(shared[SOFTNESS]) < HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
     shortest, horizon = _SHORT if hard else _LONG if drift is None else _BROAD
     if drift is not None and not hard:
