@@ -40,7 +40,7 @@ from plow_twin.study.analysis import loads, thinned
 from plow_twin.study.analysis.analyse import Analysis, analyse
 from plow_twin.study.analysis.loads import reversals
 from plow_twin.study.analysis.report import _write_tables, write_report
-from plow_twin.study.analysis.signals import compare
+from plow_twin.study.analysis.signals import LARGEST_LAG_S, compare
 
 COUNT = 8000
 LAG_S = 0.037
@@ -363,6 +363,16 @@ def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: in
     found = compare(t, signal(t), at, signal(at - lag_s))
     assert found is not None and found.lag_s == pytest.approx(lag_s, abs=2e-4)
     assert found.rms_aligned == pytest.approx(0.0, abs=1e-3)
+
+
+def test_no_lag_beyond_the_largest_and_no_correlation_beyond_1_is_told() -> None:
+    t = np.arange(0.0, 40.0, 0.01)
+    predicted = np.sin(2.0 * np.pi * t / 2.06)
+    for factor in (-1.0, 1.1, 1.3):
+        found = compare(t, predicted, t[::2], factor * predicted[::2])
+        assert found is not None and found.lag_s is not None and found.correlation is not None
+        assert abs(found.lag_s) <= LARGEST_LAG_S and abs(found.correlation) <= 1.0
+        assert found.coherence is not None and found.coherence <= 1.0
 
 
 def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: Path) -> None:

@@ -197,6 +197,8 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
     assert table.column("error").to_pylist()[1:] == [None, "left out: no recording"]
     assert cli(["analyse", str(tmp_path), "--json", "--quiet"]) == 1  # of the one without its parts
     assert json.loads(capsys.readouterr().out)["left_out"] == [str(tmp_path / "empty")]
+    shutil.copytree(tmp_path / "good", inner := tmp_path / "good" / "inner")
+    assert left_out(tmp_path) == [tmp_path / "empty", inner]
     shutil.copy(tmp_path / "good" / "good_0.mcap", tmp_path / "stray.mcap")
     assert left_out(tmp_path) == [tmp_path / "good"]
     assert cli(["analyse", str(tmp_path), "--json", "--quiet", "--out", str(out)]) == 0

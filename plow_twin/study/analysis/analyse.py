@@ -460,13 +460,14 @@ def _holds_recording(folder: Path) -> bool:
 
 
 def left_out(path: Path) -> list[Path]:
-    """Return what is in a folder and no part of what `expand` makes of it: empty folders, runs beside a file."""
+    """Return what is in a folder and no part of what `expand` makes of it: empty folders, runs beside or in others."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
     if _holds_recording(path):
         return [item for item in folders if _holds_recording(item) and item not in beside_folders(path)]
-    return [item for item in folders if not any(item.iterdir())]
+    empty = [item for item in folders if not any(item.iterdir())]
+    return empty + [one for item in folders if _holds_recording(item) for one in left_out(item)]
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:

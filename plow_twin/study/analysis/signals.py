@@ -77,7 +77,8 @@ def _correlation(one: Array, other: Array) -> float | None:
         return None
     one, other = one - one.mean(), other - other.mean()
     size = math.sqrt(float(one @ one) * float(other @ other))
-    return float(one @ other) / size if size > 1e-300 else None
+    # rounding may lead beyond 1
+    return min(1.0, max(-1.0, float(one @ other) / size)) if size > 1e-300 else None
 
 
 def _shifted(t: Array, predicted: Array, times: Array, lag_s: float) -> Array:
@@ -146,7 +147,8 @@ def _lag(t: Array, predicted: Array, times: Array, values: Array) -> float | Non
         found = _correlation(_shifted(t, predicted, times[::thin], lag_s), values[::thin])
         return 1.0 if found is None else -found
 
-    near = minimize_scalar(badness, bounds=(best - 1.5 * step, best + 1.5 * step), method="bounded")
+    bounds = max(best - 1.5 * step, -LARGEST_LAG_S), min(best + 1.5 * step, LARGEST_LAG_S)
+    near = minimize_scalar(badness, bounds=bounds, method="bounded")
     return float(near.x) if near.fun <= badness(best) else best
 
 
@@ -166,4 +168,4 @@ def _coherence(times: Array, predicted: Array, measured: Array) -> float | None:
     spectrum_at, spectrum = periodogram(one - one.mean(), fs=1.0 / step)
     strongest = spectrum_at[int(np.argmax(spectrum[1:])) + 1]
     found = float(shares[int(np.argmin(np.abs(frequencies - strongest)))])
-    return found if math.isfinite(found) else None
+    return min(1.0, found) if math.isfinite(found) else None
