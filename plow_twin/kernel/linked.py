@@ -33,6 +33,8 @@ class LinkedLibrary(JITCodeLibrary):
         super().__init__(codegen, name)
         self._texts: list[tuple[str, str]] = []
         self._exported: list[str] = []
+        #: whether sums may be reordered and fused: what it is inlined into may change its bits
+        self.fast = False
 
     def add_ir_module(self, ir_module: llvmlite.ir.Module) -> None:
         """Take functions as text."""
@@ -60,8 +62,8 @@ class LinkedLibrary(JITCodeLibrary):
             self._dynamic_globals += library._dynamic_globals
             environments |= _environments(library._final_module)
         for name in self._exported:
-            # as in numba: a caller holds it, or leaves it out
-            whole.get_function(name).linkage = "linkonce_odr"
+            # a caller holds it, or leaves it out
+            whole.get_function(name).linkage = "linkonce_odr" if self.fast else "weak_odr"
         self._shared_module = whole
         self._final_module = _variables(self._codegen._create_empty_module(self.name), environments)
         self._set_compiled_object(self._codegen._tm.emit_object(self._final_module))
@@ -88,13 +90,19 @@ class EntryLibrary(JITCodeLibrary):
     """The code of a kernel that Python calls, with all that it calls for itself alone.
 
     Otherwise the first entry loaded would lend its copies of them to the next: optimised for another caller, they may
-    differ in the last bit.
+    differ in the last bit. LLVM knows it before it optimises, and inlines what is called at one place, but for `fast`
+    code, which is left its size as the only reason: elsewhere its sums would be reordered in other ways.
     """
 
     def _optimize_final_module(self) -> None:
+        self._keep(llvm.Linkage.weak_odr)
         super()._optimize_final_module()
+        self._keep(llvm.Linkage.linkonce_odr)
+
+    def _keep(self, linkage: llvm.Linkage) -> None:
+        """Keep the functions of a linkage for this entry."""
         for function in self._final_module.functions:
-            if function.linkage == llvm.Linkage.linkonce_odr and not function.is_declaration:
+            if function.linkage == linkage and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
 
 
@@ -112,6 +120,7 @@ class _LowerForLinking(NativeLowering):
 
     def run_pass(self, state: Any) -> bool:
         state.library = _new_library(state, LinkedLibrary)
+        state.library.fast = bool(state.flags.fastmath)
         state.flags.no_compile = True
         super().run_pass(state)
         state.library.finalize()

@@ -354,8 +354,6 @@ class Twin:
         self._in_slices(self._entry(loop.advance_marked, arguments, out is None), arguments, times, wrench, out)
         self._wrench = wrench[-1].copy() if len(wrench) else self._wrench
         digests = self._digests(snapshots, wrench[marks - 1])
-        if out is not None:
-            out["status"] = status
         series = None if out is None else AdvanceSeries.of(t, out)
         return MarkedAdvance(series, status, digests, self._state.wear_depth.copy())
 

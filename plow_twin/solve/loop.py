@@ -280,6 +280,7 @@ def advance_marked(
             return False
         if rows is not None:
             _read_row(p, parts, state, w, sums, rows[i])
+            rows[i].status = status[i]
         while pace.mark < marks.size and marks[pace.mark] == i + 1:
             snapshots[pace.mark] = states[0]
             pace.mark += 1

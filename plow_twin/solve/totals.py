@@ -57,6 +57,15 @@ def sum_windows(rows, taken, makes, impulse, peak, all_makes, impulses, peaks) -
             window += 1
 
 
+@kernel(entry=True)
+def sum_makes(made, makes, all_makes) -> None:
+    """Sum the makes of advances, (n, 8), from those so far, (8,), on; write what they are after each, (n, 8)."""
+    for n in range(len(made)):
+        for pair in range(PAIR_COUNT):
+            makes[pair] += made[n, pair]
+            all_makes[n, pair] = makes[pair]
+
+
 @kernel(fast=True)
 def _sums(w, order, h) -> None:
     """Write a bound of each force over [0, h] and its integrals: sum f_k h^k / (k+1), sum f_k h^k / (k+2).

@@ -17,7 +17,7 @@ from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.running_in import with_running_in, without_running_in
 from plow_twin.model.scene import Scene
 from plow_twin.solve.state import ROW
-from plow_twin.solve.totals import add_up, sum_windows
+from plow_twin.solve.totals import add_up, sum_makes, sum_windows
 
 if TYPE_CHECKING:
     from plow_twin.run.advance import Advance, AdvanceSeries
@@ -416,9 +416,8 @@ class Outputs:
         """Return makes so far, impulse and peak of the window that ends with each of the rows `taken`."""
         if len(taken) == len(rows) and not (self._impulse.any() or self._peak.any()):
             # each row is a window
-            makes = rows.makes.cumsum(axis=0)
-            makes += self._makes
-            self._makes = makes[-1].copy()
+            makes, self._makes = np.empty((len(rows), PAIR_COUNT), np.int64), self._makes.copy()
+            sum_makes(rows.makes, self._makes, makes)
             return makes, rows.impulse, rows.peak
         eight = (len(taken), PAIR_COUNT)
         makes, impulse, peak = np.empty(eight, np.int64), np.empty(eight), np.empty(eight)
