@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,11 +11,12 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.chunks import Messages
 from plow_twin.record.outputs import PUBLICATION_TOPICS, SLOW_TOPICS, head_numbers
 from plow_twin.record.template import STAMP_AT, Indexes, Templates, compiled, stamp_word
-from plow_twin.record.words import bits, word
+from plow_twin.record.words import eight_differ, fetch, word, word_at
 from plow_twin.stream.outputs import Publications
 
 _KINDS = len(PUBLICATION_TOPICS)
-_FORCES, _PEAKS, _HEAD, _CLEARANCE, _WEAR_RATE = range(_KINDS)
+#: Messages ahead that are fetched, a cache line [B] after the other.
+_FETCHED, _LINE = 4, 64
 _IS_SLOW = np.array([name in SLOW_TOPICS for name in PUBLICATION_TOPICS])
 
 
@@ -51,18 +54,23 @@ class Sent:
         slow, motion = np.full(len(now), -1), np.empty((len(now), 7))
         slow[now.slow_index] = np.arange(len(now.slow_index))
         head_numbers(now.q, now.v, motion)
-        pairs = now.penetration, now.rate, now.force, now.makes, now.impulse, now.peak
+        numbers = (
+            (now.penetration, now.rate, now.force), (now.makes.astype(np.float64), now.impulse, now.peak),
+            (motion,), (now.clearance,), (now.wear_rate,),
+        )  # fmt: skip
+        #: kept alive: they are read by their addresses
+        self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
         self._expected = (
-            self.publication, slow, kinds, now.stamp_ns, pairs, motion, (now.clearance, now.wear_rate),
-            templates.data, templates.fixed, templates.ends, templates.places, templates.place_ends,
+            self.publication, slow, kinds, now.stamp_ns, *_pieces(self._numbers, templates),
+            templates.data, templates.fixed, templates.ends,
         )  # fmt: skip
 
-    def differing(self, messages: Messages, chosen: slice) -> NDArray[np.bool_]:
-        """Tell which of some of the messages, `chosen` among all, are not those of their publication."""
-        wrong = np.zeros(len(messages), bool)
+    def differing(self, messages: Messages, chosen: slice) -> list[int]:
+        """Return which of some of the messages, `chosen` among all, are not those of their publication."""
+        wrong = np.empty(len(messages), bool)
         places = messages.start, messages.length
-        compare(messages.buffer, *places, self.kind[chosen], self.after[chosen], *self._expected, wrong)
-        return wrong
+        count = compare(messages.buffer, *places, self.kind[chosen], self.after[chosen], *self._expected, wrong)
+        return np.flatnonzero(wrong).tolist() if count else []
 
 
 @compiled
@@ -77,10 +85,35 @@ def find_advances(sequence, kind, done, first, after, counts, numbers):  # type:
                 numbers[advance] = sequence[n]
 
 
+def _with_whole_rows(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return numbers whose rows have no gaps; they may have some between them."""
+    return numbers if numbers.strides[1] == numbers.itemsize else np.ascontiguousarray(numbers)
+
+
+def _pieces(numbers: list[list[NDArray[np.float64]]], templates: Templates) -> tuple[Indexes, Indexes]:
+    """Return where numbers stand side by side both in messages and in rows, and where those of each kind end.
+
+    A piece is its place in the message [B], how many they are, their address in the first row, and from row to row [B].
+    """
+    found, ends = [], [0]
+    for kind, parts in enumerate(numbers):
+        place = int(templates.place_ends[kind])
+        for part in parts:
+            count = part.shape[1]
+            places = templates.places[place : place + count]
+            begins = [0, *(np.flatnonzero(np.diff(places) != part.itemsize) + 1).tolist(), count]
+            for begin, end in pairwise(begins):
+                address = part.ctypes.data + begin * part.itemsize
+                found.append((int(places[begin]), end - begin, address, part.strides[0]))
+            place += count
+        ends.append(len(found))
+    return np.array(found, np.int64), np.array(ends, np.int64)
+
+
 @compiled
 def compare(  # type: ignore[no-untyped-def]
-    buffer, starts, lengths, kinds, after, publication, slow, compared, stamps, pairs, motion, slow_numbers,
-    data, fixed, ends, places, place_ends, different,
+    buffer, starts, lengths, kinds, after, publication, slow, compared, stamps, pieces, piece_ends,
+    data, fixed, ends, different,
 ):  # fmt: skip
     """Compare each message with its template filled with stamp and numbers of its publication, byte for byte.
 
@@ -92,53 +125,40 @@ def compare(  # type: ignore[no-untyped-def]
         Publication by advance, and by publication the row of its slow part, below 0 where there should be none.
     compared : ndarray of bool
         By kind.
-    pairs : tuple of ndarray, shape (m, 8)
-        Numbers of `contact_forces`, then of `contact_peaks`.
-    slow_numbers : tuple of ndarray
-        Numbers of `clearance` and of `wear_rate`.
-    data, fixed, ends, places, place_ends
+    pieces, piece_ends
+        As of `_pieces`.
+    data, fixed, ends
         As in `Templates`.
     different : ndarray of bool, shape (n,)
-        Receives what was found.
+        Receives what was found, of which the number is returned.
     """
-    penetration, rate, force, makes, impulse, peak = pairs
-    clearance, wear_rate = slow_numbers
+    count = 0
     for n in range(starts.size):
         k, start = kinds[n], starts[n]
-        if k < 0 or not compared[k]:
+        different[n] = k >= 0 and compared[k]
+        if not different[n]:
             continue
+        count += 1
+        if n + _FETCHED < starts.size:
+            for line in range(0, lengths[n + _FETCHED], _LINE):
+                fetch(buffer, starts[n + _FETCHED] + line)
         row, first, size = publication[after[n]], ends[k], ends[k + 1] - ends[k]
-        different[n] = True
-        missing = _IS_SLOW[k] and slow[row] < 0
-        if missing or lengths[n] != size or start < 0 or start + size > buffer.size:
+        place = slow[row] if _IS_SLOW[k] else row
+        if place < 0 or lengths[n] != size or start < 0 or start + size > buffer.size:
             continue
         last = size - 8
         wrong = (word(buffer, start + last) ^ word(data, first + last)) & word(fixed, first + last)
         for i in range(size >> 3):
             wrong |= (word(buffer, start + 8 * i) ^ word(data, first + 8 * i)) & word(fixed, first + 8 * i)
         wrong |= word(buffer, start + STAMP_AT) ^ stamp_word(stamps[row])
-        place = place_ends[k]
-        if k == _FORCES:
-            wrong |= _differ(buffer, start, places, place, penetration, row)
-            wrong |= _differ(buffer, start, places, place + PAIR_COUNT, rate, row)
-            wrong |= _differ(buffer, start, places, place + 2 * PAIR_COUNT, force, row)
-        elif k == _PEAKS:
-            wrong |= _differ(buffer, start, places, place, makes, row)
-            wrong |= _differ(buffer, start, places, place + PAIR_COUNT, impulse, row)
-            wrong |= _differ(buffer, start, places, place + 2 * PAIR_COUNT, peak, row)
-        elif k == _HEAD:
-            wrong |= _differ(buffer, start, places, place, motion, row)
-        elif k == _CLEARANCE:
-            wrong |= _differ(buffer, start, places, place, clearance, slow[row])
-        else:
-            wrong |= _differ(buffer, start, places, place, wear_rate, slow[row])
+        for piece in range(piece_ends[k], piece_ends[k + 1]):
+            begin, length = start + pieces[piece, 0], pieces[piece, 1]
+            address = pieces[piece, 2] + place * pieces[piece, 3]
+            if length == PAIR_COUNT:
+                wrong |= eight_differ(buffer, begin, address)
+            else:
+                for i in range(length):
+                    wrong |= word(buffer, begin + 8 * i) ^ word_at(address + 8 * i)
         different[n] = wrong != 0
-
-
-@compiled
-def _differ(buffer, start, places, first, numbers, row):  # type: ignore[no-untyped-def]
-    """Return 0 when a row of numbers stands at its places, from number `first` of all on."""
-    wrong = np.int64(0)
-    for i in range(numbers.shape[1]):
-        wrong |= word(buffer, start + places[first + i]) ^ bits(float(numbers[row, i]))
-    return wrong
+        count -= wrong == 0
+    return count

@@ -253,6 +253,7 @@ class _Merger:
         header = reader.header
         self._journal = (header.samples_topic, header.entries_topic)
         self._template = sample_template(header.frame_id)
+        self._places = self._template.places[_WRENCH]
         self._entries = [NO_ENTRIES]
         self._count = 0  # of these
         self._outputs: list[Outputs] = []
@@ -280,9 +281,9 @@ class _Merger:
         """Take in a chunk and yield what is complete with it."""
         assert self._chunks is not None
         counts = np.bincount(messages.channel)
+        there = counts.nonzero()[0]
         journal, sent, samples = [], [], -1
-        for number in np.flatnonzero(counts).tolist():
-            count = int(counts[number])
+        for number, count in zip(there.tolist(), counts[there].tolist(), strict=True):
             channel = self._chunks.channels.get(number)
             if channel is None:
                 continue
@@ -292,13 +293,15 @@ class _Merger:
                 samples = number if channel.topic == self._journal[0] else samples
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
-                self._topics[number] = (channel.topic, channel.message_type)
+                if number not in self._topics:  # made anew: parts share what is told of their channels
+                    self._topics = {**self._topics, number: (channel.topic, channel.message_type)}
         if journal:
-            self._entries.append(self._read(_of(messages, journal), samples))
-            self._count += len(self._entries[-1])
+            chosen = messages if len(journal) == len(there) else _of(messages, journal)
+            self._entries.append(self._read(chosen, samples))
+            self._count += len(chosen)
         if sent and self._with_outputs:
-            chosen = messages if len(sent) == np.count_nonzero(counts) else _of(messages, sent)
-            self._outputs.append(Outputs(chosen, self._unwrap(chosen.sequence), dict(self._topics)))
+            chosen = messages if len(sent) == len(there) else _of(messages, sent)
+            self._outputs.append(Outputs(chosen, self._unwrap(chosen.sequence), self._topics))
         if self._count < self._least and len(self._outputs) < _LEAST // 16:
             return
         newest = max((part.newest for part in self._outputs), default=-1)
@@ -341,18 +344,17 @@ class _Merger:
         count, template = len(messages), self._template
         is_sample = messages.channel == samples
         stamps, wrench, good = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros(count, bool)
-        read_numbers(
-            messages.buffer, messages.start, messages.length, template.data, template.fixed, template.places[_WRENCH],
-            stamps, wrench, good,
-        )  # fmt: skip
+        places = messages.buffer, messages.start, messages.length
+        read_numbers(*places, template.data, template.fixed, self._places, stamps, wrench, good)
         good &= is_sample
-        finite = np.isfinite(wrench)
-        if not finite.all():
-            good &= finite.all(axis=1)
-        left = np.flatnonzero(~good)
+        if not np.isfinite(wrench).all():
+            good &= np.isfinite(wrench).all(axis=1)
+        left = (~good).nonzero()[0]
         digests, found = np.zeros(len(left), np.uint64), np.zeros(len(left), bool)
-        read_digests(messages.buffer, messages.start, messages.length, is_sample, left, stamps, digests, found)
+        read_digests(*places, is_sample, left, stamps, digests, found)
         rest: dict[int, Entry | Dropped] = {}
+        if found.all():
+            return Entries(sequence, messages.log_time_ns, good, stamps, wrench, left, digests, rest)
         for index in left[~found].tolist():
             topic = self._journal[0 if is_sample[index] else 1]
             assert self._chunks is not None

@@ -337,8 +337,7 @@ class _Replay:
         differences = []
         for messages, from_, to in sent.pieces(begin, end):
             chosen = slice(from_ - begin, to - begin)
-            wrong = np.flatnonzero(found.differing(messages, chosen))
-            for index in wrong.tolist():
+            for index in found.differing(messages, chosen):
                 record, advance = sent.record(from_ + index), int(found.after[from_ - begin + index])
                 where = self._difference(record, publications[int(found.publication[advance])])
                 if where is not None:

@@ -29,7 +29,9 @@ class SentMessages:
     @classmethod
     def of(cls, outputs: list[Outputs], topics: Mapping[str, str]) -> Self:
         """Take messages; `topics` has the base names of those that follow from the motion."""
-        sequence, kind = _joined(part.sequence for part in outputs), _joined(_kinds(part, topics) for part in outputs)
+        tables = {id(part.topics): _kinds(part.topics, topics) for part in outputs}  # few: parts share their topics
+        sequence = _joined(part.sequence for part in outputs)
+        kind = _joined(tables[id(part.topics)][part.messages.channel] for part in outputs)
         begins = np.cumsum([0, *map(len, outputs)])
         if (sequence[1:] < sequence[:-1]).any():  # not as our recorder writes: each message is a part
             order = np.argsort(sequence, kind="stable")
@@ -55,8 +57,10 @@ class SentMessages:
         """Yield the messages from `begin` to before `end`, chunk by chunk, with the indexes of each chunk's."""
         first = int(np.searchsorted(self.begins, begin, side="right")) - 1
         while begin < end:
-            origin, stop = int(self.begins[first]), min(end, int(self.begins[first + 1]))
-            yield self.parts[first].messages[begin - origin : stop - origin], begin, stop
+            origin, behind = self.begins[first : first + 2].tolist()
+            stop, messages = min(end, behind), self.parts[first].messages
+            whole = begin == origin and stop == behind
+            yield messages if whole else messages[begin - origin : stop - origin], begin, stop
             begin, first = stop, first + 1
 
 
@@ -64,10 +68,10 @@ def _joined(arrays: Iterable[Indexes]) -> Indexes:
     return np.concatenate([np.zeros(0, np.int64), *arrays])
 
 
-def _kinds(part: Outputs, topics: Mapping[str, str]) -> Indexes:
-    lookup = np.full(int(part.messages.channel.max(initial=0)) + 1, -1)
-    for channel, (topic, _) in part.topics.items():
-        if topic in topics and channel < len(lookup):
+def _kinds(channels: Mapping[int, tuple[str, str]], topics: Mapping[str, str]) -> Indexes:
+    """Return the kinds of messages by channel."""
+    lookup = np.full(max(channels, default=-1) + 1, -1)
+    for channel, (topic, _) in channels.items():
+        if topic in topics:
             lookup[channel] = PUBLICATION_TOPICS.index(topics[topic])
-    kinds: Indexes = lookup[part.messages.channel]
-    return kinds
+    return lookup

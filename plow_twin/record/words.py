@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 _WORD = ir.IntType(64)
@@ -51,6 +51,52 @@ def _bits(typingctx: Any, number: Any) -> Any:
     return types.int64(types.float64), codegen
 
 
+def _fetch(typingctx: Any, data: Any, place: Any) -> Any:
+    """Have the cache line of byte `place` of a contiguous array fetched; it need not be there."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        pointer, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer, flag, flag, flag])
+        prefetch: Any = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module, kind, "llvm.prefetch.p0"
+        )
+        here = builder.bitcast(_place(context, builder, signature, arguments), pointer)
+        # to be read, into all caches, data
+        builder.call(prefetch, [here, flag(0), flag(3), flag(1)])
+        return context.get_dummy_value()
+
+    return types.void(data, place), codegen
+
+
+def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
+    """Return 0 when the 64 bytes from byte `place` of a contiguous array on are those at an address in memory."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        vector = ir.VectorType(_WORD, 8)
+        here = builder.bitcast(_place(context, builder, signature, arguments), vector.as_pointer())
+        there = builder.inttoptr(arguments[2], vector.as_pointer())
+        differing = builder.xor(builder.load(here, align=1), builder.load(there, align=8))
+        kind = ir.FunctionType(_WORD, [vector])
+        reduce: Any = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
+            builder.module, kind, "llvm.vector.reduce.or.v8i64"
+        )
+        return builder.call(reduce, [differing])
+
+    return types.int64(data, place, types.int64), codegen
+
+
+def _word_at(typingctx: Any, address: Any) -> Any:
+    """Return the eight bytes at an address in memory as an int64."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(builder.inttoptr(arguments[0], _WORD.as_pointer()), align=8)
+
+    return types.int64(types.int64), codegen
+
+
 word = cast("Callable[[Any, Any], Any]", intrinsic(_word))
 set_word = cast("Callable[[Any, Any, Any], None]", intrinsic(_set_word))
 bits = cast("Callable[[float], int]", intrinsic(_bits))
+fetch = cast("Callable[[Any, Any], None]", intrinsic(_fetch))
+eight_differ = cast("Callable[[Any, Any, int], int]", intrinsic(_eight_differ))
+word_at = cast("Callable[[int], int]", intrinsic(_word_at))

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from operator import lt
 from typing import Final
 
 import numpy as np
@@ -94,7 +95,9 @@ class Alarm:
 
     def stays(self, values: NDArray[np.float64]) -> bool:
         """Tell whether none of these values can change a level."""
-        return not self.level and float(values.max(initial=-math.inf)) < self.lowest
+        if self.level or self.lowest == math.inf:  # without a threshold there is no level
+            return not self.level
+        return float(values.max(initial=-math.inf)) < self.lowest
 
 
 class _Model:
@@ -191,8 +194,14 @@ class Alarms:
             yield from (index for index in range(len(publications)) if self.take(publications[index]))
             return
         rate, stamps_ns = 0.0, publications.stamp_ns[publications.slow_index].tolist()
-        for stamp_ns, clearance in zip(stamps_ns, values["clearance"].max(axis=1).tolist(), strict=True):
-            rate = self._growth(stamp_ns, clearance)
+        if stamps_ns:
+            *earlier, clearance = values["clearance"].max(axis=1).tolist()
+            if all(map(lt, stamps_ns, stamps_ns[1:])) and self._clearances and stamps_ns[0] > self._clearances[-1][0]:
+                self._clearances.extend(zip(stamps_ns, earlier, strict=False))
+            else:
+                for found in zip(stamps_ns, earlier, strict=False):
+                    self._growth(*found)
+            rate = self._growth(stamps_ns[-1], clearance)
         # of what changes nothing the newest is remembered
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
