@@ -9,12 +9,12 @@ each replay, and taken off in its last column: of an hour it is nothing, of 100 
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import click
 import numpy as np
 from mcap.reader import make_reader
 from numpy.typing import NDArray
@@ -106,9 +106,10 @@ def read_rosbags(folder: Path) -> None:
             pass
 
 
-def main() -> None:
-    """Print the table."""
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+@click.command()
+@click.argument("seconds", type=click.FloatRange(min=_SHORT_S), default=60.0)
+def main(seconds: float) -> None:
+    """Record SECONDS (60) of the paper's head, replay them, and print times real time."""
     with tempfile.TemporaryDirectory() as name:
         full, bare, short = (Path(name) / folder for folder in ("full", "bare", "short"))
         for folder, outputs in ((full, True), (bare, False)):
