@@ -293,8 +293,9 @@ class _Merger:
                 samples = number if channel.topic == self._journal[0] else samples
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
-                if number not in self._topics:  # made anew: parts share what is told of their channels
-                    self._topics = {**self._topics, number: (channel.topic, channel.message_type)}
+                named = channel.topic, channel.message_type
+                if self._topics.get(number) != named:  # made anew: parts share what is told of their channels
+                    self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)
             self._entries.append(self._read(chosen, samples))
