@@ -73,6 +73,10 @@ GROUPS = {
     "hard_sensor": Group("hard, with bias, delay, gaps", stiffness=(1e9, 1e11), bias_m=5e-3, delay_s=0.05, gaps=True),
     "kelvin_voigt": Group("truth: Kelvin-Voigt", law="kelvin_voigt", model="suspect"),
     "hard_kelvin_voigt": Group("hard, truth: Kelvin-Voigt", stiffness=(1e9, 1e11), law="kelvin_voigt", model="suspect"),
+    "hard_20": Group("K 1e9 .. 1e11, 20 periods", stiffness=(1e9, 1e11), periods=20.0),
+    "hard_kelvin_voigt_20": Group(
+        "hard, Kelvin-Voigt, 20 periods", stiffness=(1e9, 1e11), law="kelvin_voigt", periods=20.0, model="suspect"
+    ),
     "hard_shape": Group("hard, truth: third harmonic", stiffness=(1e9, 1e11), third_harmonic=0.15, model="suspect"),
     "exponent": Group("truth: exponent 1.5", exponent=1.5, stiffness=(5e7, 3e8), model="suspect"),
     "shape": Group("truth: third harmonic of 15 %", third_harmonic=0.15, model="suspect"),

@@ -26,6 +26,7 @@ from plow_twin.estimate.estimate import _with_bounced, _with_gaps, estimate, sum
 from plow_twin.estimate.fit import link_weights
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.gaps import Gaps, GapsError, tell
+from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.measurements import EstimateError, Load, Poses, believed
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.similar import Units
@@ -280,6 +281,24 @@ def test_another_law_is_told_by_what_classifies_draws_of_both() -> None:
     assert (wrong > estimating.MOST_OTHER_LAW).mean() > 0.8
 
 
+def test_another_law_is_told_among_motions_that_differ_more_by_what_they_are_drawn_with() -> None:
+    """What is drawn moves the motions along a curve, by some ten times what the law and the noise do."""
+    rng = np.random.default_rng(5)
+    slope, curve, apart = rng.standard_normal((3, 40))
+
+    def motions(count: int, law: float, spread: float = 1.0) -> Draws:
+        drawn = spread * rng.standard_normal((count, 7))
+        like = 2.0 * np.outer(drawn[:, 0], slope) + np.outer(drawn[:, 0] ** 2 + drawn[:, 1], curve)
+        return Draws(like + 0.1 * law * apart + 0.1 * rng.standard_normal(like.shape), drawn)
+
+    believed, other = motions(100, 0.0), motions(60, 1.0)
+    right, wrong = (
+        np.array([log_odds(believed, other, row) for row in motions(100, law, 0.6).like]) for law in (0.0, 1.0)
+    )
+    assert (right > estimating.MOST_ODDS).mean() < 0.03
+    assert (wrong > estimating.MOST_ODDS).mean() > 0.97
+
+
 def test_another_law_behind_a_soft_contact_is_told_where_residuals_hardly_repeat(
     known: list[tuple[Truth, Estimate]],
 ) -> None:
@@ -313,7 +332,7 @@ def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
     unknowns = Unknowns(preset("paper"))
     poses, _ = Poses.of(np.arange(100) * 0.01, np.zeros((100, 3)))
     two = np.full(2, 1e-2)
-    bounced = Bounced(two, two, np.zeros(3), np.ones(3), (-8.0, 500.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0)
+    bounced = Bounced(two, two, np.zeros(3), np.ones(3), (-8.0, 500.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf)
     text = json.dumps(summarise_bounced(unknowns, poses, bounced, 0, 0).as_dict(), allow_nan=False)
     assert json.loads(text)["stiffness"]["p95"] > 1e9
 

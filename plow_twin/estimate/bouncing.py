@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.forward import Forward
+from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches, smooth_width
 from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, OTHER_LAW, SOFTNESS, Unknowns, with_other_law
@@ -63,19 +64,21 @@ _DRAWS, _CLEARANCE = (30, 30, 40), (1.2e-3, 3e-4, 3e-4)
 _MORE_DRAWS, _NEARER = 100, 2.5e-4
 #: Distance of the first round from which on the contact is not hard (1.4 at most in six hard ones, 5 to 24 of others).
 _NOT_HARD = 3.0
-#: Draws of another law, and the steps after which no further one is made; median share of the critical damping that
-#: they have, and the deviation of its logarithm.
+#: Draws of another law, and the steps in ten load periods after which no further one is made; median share of the
+#: critical damping that they have, and the deviation of its logarithm.
 _OTHER_DRAWS, _OTHER_WORK = 60, 1_500_000
 _DAMPING_SHARE, _SHARE_DEVIATION = 0.2, 0.6
 #: Distances in rows over which the changes of pose and reaches are told, and what a coefficient is held to zero by in
 #: telling the law.
 _CHANGES, _LAW_RIDGE = (1, 2, 4, 8, 16, 32), 1.0
+#: The former by which the changes of the pose are told at each phase of the load.
+_CHANGES_BY_PHASE: Final = (1, 4)
 #: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
 _NEAR, _RIDGE = 0.7, 0.3
 #: The same for the regression of what is left over, and a square that counts as nothing.
 _SCATTER_RIDGE, _NO_SCATTER = 20.0, 1e-14
-#: Steps of the solver after which no further draw is made.
-_MOST_WORK = 3_500_000
+#: Steps of the solver in ten load periods after which no further draw is made; most that a longer motion takes of it.
+_MOST_WORK, _LONGER = 3_500_000, 2.0
 #: Drawn of a hard contact: logarithm of the penetration under the reference force [m] and its bounds; deviations of
 #: the damping's logarithm and of the gains.
 _LN_PENETRATION, _BOUNDS = (math.log(1.2e-5), 1.6), (2e-6, 6e-4)
@@ -115,6 +118,7 @@ class Bounced:
         normal deviate of how far the drawn ones are from what the others foretell
     law : how much more the motion is like those of another law of the contact, as a normal deviate of how much those
         of the law believed are; 0 where no other is known
+    odds : logarithm of how much likelier the motion is under that law; minus infinity where none is known
     """
 
     clearance: Array
@@ -127,6 +131,7 @@ class Bounced:
     distance: float
     path: float
     law: float
+    odds: float
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
@@ -217,7 +222,8 @@ def compare(
     measured = eye.features(eye.q)
     spread = _Spread.hard(unknowns) if near is None else _Spread.near(unknowns, near)
     drawn = _Drawn(forward, unknowns, eye, spread, np.random.default_rng(seed))
-    most_work = forward.work + _MOST_WORK
+    longer = float(np.clip((poses.t[-1] - poses.t[0]) / (10.0 * period), 1.0, _LONGER))
+    most_work = forward.work + int(longer * _MOST_WORK)
     centre = range_of_motion(unknowns.scene, poses)[0] - _OVERRATED
     if near is not None:
         centre = centre - math.exp(spread.mean[0])
@@ -233,6 +239,7 @@ def compare(
             delay = _delay(eye, features[:, 5:], drawn.q, measured[5:])
             # those of the first round were seen at other times: only their phase is set right
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
+            drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
             drawn.q.clear()
         found = _regress(features[:, 5:], np.array(drawn.targets), measured[5:])
         moved = measured[:2] + found.value[:2] - centre
@@ -248,6 +255,9 @@ def compare(
     # what still moves has not been found
     deviation = np.hypot(found.deviation[:2], moved) * (1.0 if near is None else _WIDENED_FIRM)
     deviation[np.abs(moved) > _ASTRAY] = np.inf
+    law, odds = 0.0, -math.inf
+    if found.value[5] < math.log(FITTED):
+        law, odds = _of_other_law(drawn, centre, delay, int(longer * _OTHER_WORK))
     return Bounced(
         centre,
         deviation,
@@ -258,7 +268,8 @@ def compare(
         eye.noise,
         found.distance,
         _off_path(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
-        _of_other_law(drawn, centre, delay) if found.value[5] < math.log(FITTED) else 0.0,
+        law,
+        odds if near is None else -math.inf,  # its limit was set with draws of hard contacts
     )
 
 
@@ -289,7 +300,7 @@ class _Spread:
 
 
 class _Drawn:
-    """Draws of one law: features, targets, changes and, until it is cleared, the motion as it is seen, one each."""
+    """Draws of one law: features, targets, changes and, until they are cleared, the motions as they are seen."""
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: _Eye, spread: _Spread, rng: np.random.Generator
@@ -298,6 +309,7 @@ class _Drawn:
         self.features: list[Array] = []
         self.targets: list[Array] = []
         self.changes: list[Array] = []
+        self.by_phase: list[Array] = []
         self.q: list[Array] = []
 
     def add(self, count: int, centre: Array, about: float, delay: float, most_work: int) -> None:
@@ -313,6 +325,7 @@ class _Drawn:
                 self.features.append(seen)
                 self.targets.append(np.concatenate([clearance - seen[:2], -seen[2:5], numbers]))
                 self.changes.append(self.eye.changes(q))
+                self.by_phase.append(self.eye.changes_by_phase(q))
                 self.q.append(q)
 
     def _numbers(self) -> Array:
@@ -336,6 +349,11 @@ class _Drawn:
         """Return what the motions are like, shape (n, m)."""
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
 
+    def told(self) -> Draws:
+        """Return what the motions are like, by phase of the load too, and what they were drawn with."""
+        of_draw = np.array(self.targets)[:, [5, 6, 7, 8, 9, 0, 1]]
+        return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
+
 
 def _delay(eye: _Eye, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the delay in s with which the measured path is nearest to that of motions drawn without one."""
@@ -350,21 +368,24 @@ def _delay(eye: _Eye, features: Array, drawn: list[Array], measured: Array) -> f
     return max(float(_LAGS_S[int(np.argmin(off))]), 0.0)
 
 
-def _of_other_law(drawn: _Drawn, centre: Array, delay: float) -> float:
-    """Return how much more the measured motion is like those of another law; 0 where no other is known.
+def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) -> tuple[float, float]:
+    """Return how much more the measured motion is like those of another law, and the logarithm of its odds.
 
     Goodness of fit alone does not tell laws apart whose motions are nearly alike; what classifies draws of both does
-    (choice of a model by classification: Pudlo et al., Bioinformatics 32 (2016) 859).
+    (choice of a model by classification: Pudlo et al., Bioinformatics 32 (2016) 859), and so does the likelihood under
+    each. Each tells motions that the other does not.
     """
-    other = drawn.of_other_law()
+    other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
-        return 0.0
-    other.add(_OTHER_DRAWS, centre, _CLEARANCE[-1], delay, _OTHER_WORK)
+        return nothing
+    other.add(_OTHER_DRAWS, centre, _CLEARANCE[-1], delay, most_work)
     drawn.forward.work += other.forward.work
     if len(other.features) < _FEWEST:
-        return 0.0
+        return nothing
     eye = drawn.eye
-    return _likelier(drawn.like(), other.like(), np.concatenate([eye.features(eye.q)[5:], eye.changes(eye.q)]))
+    measured = np.concatenate([eye.features(eye.q)[5:], eye.changes(eye.q)])
+    more = _likelier(drawn.like(), other.like(), measured)
+    return more, log_odds(drawn.told(), other.told(), np.concatenate([measured, eye.changes_by_phase(eye.q)]))
 
 
 def _likelier(believed: Array, other: Array, measured: Array) -> float:
@@ -611,9 +632,19 @@ class _Eye:
         parts = []
         for apart in _CHANGES:
             if len(rows) > 2 * apart + 1:
-                change = rows[2 * apart :] - 2.0 * rows[apart:-apart] + rows[: -2 * apart]
+                change = _second_difference(rows, apart)
                 parts += [change.std(axis=0), np.abs(change).mean(axis=0)]
         return np.log(np.concatenate(parts) + 1e-12)
+
+    def changes_by_phase(self, q: Array, lag_s: float = 0.0) -> Array:
+        """Return the same of the pose at each phase of the load, of a motion that is `lag_s` late: when it bounces."""
+        phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * _PHASES).astype(int) % _PHASES
+        count = np.maximum(np.bincount(phase, minlength=_PHASES), 1)
+        parts = []
+        for apart in _CHANGES_BY_PHASE:
+            squares = _second_difference(q, apart) ** 2
+            parts += [np.bincount(phase[apart:-apart], column, _PHASES) / count for column in squares.T]
+        return 0.5 * np.log(np.concatenate(parts) + _NO_SCATTER)
 
     def _averaged(self, q: Array) -> Array:
         """Return the reaches as `_reach` of the pose averaged over a few rows, in which noise counts less."""
@@ -631,6 +662,12 @@ class _Eye:
         means.sort(axis=0)
         parts = [means[-max(int(share * len(means)), 1) :].mean(axis=0) for share in _FARTHEST_PARTS]
         return np.stack(parts)
+
+
+def _second_difference(rows: Array, apart: int) -> Array:
+    """Return by how much rows are off those `apart` before and after, shape (n - 2 apart, k)."""
+    change: Array = rows[2 * apart :] - 2.0 * rows[apart:-apart] + rows[: -2 * apart]
+    return change
 
 
 def _reach(unknowns: Unknowns, q: Array) -> Array:

@@ -78,6 +78,9 @@ MOST_DISTANCE = 4.0
 #: How far the path over the load's period may be from theirs, and how much more like those of another law, as normal
 #: deviates.
 MOST_PATH, MOST_OTHER_LAW = 3.0, 2.33
+#: How much likelier it may be under another law, as a logarithm: of that fewer motions are drawn, which makes its
+#: likelihood too small. Right models (seeds from 42200 on) have -7 at most.
+MOST_ODDS = -3.0
 #: Largest standard deviation in m there: beyond it the wall was touched too seldom, and the answer is a wrong one.
 #: Set on seeds 40400 to 40409 of the benchmark; see docs/estimate.md.
 BOUNCED_MOST = 2e-4
@@ -338,6 +341,10 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
     ]
     if bounced.law > MOST_OTHER_LAW:
         model.append(f"motion like that of another contact law: {bounced.law:.1f}, expected at most {MOST_OTHER_LAW:g}")
+    if bounced.odds > MOST_ODDS:
+        model.append(
+            f"motion likely under another contact law: ln odds {bounced.odds:.1f}, expected at most {MOST_ODDS:g}"
+        )
     reasons = sensor or model
     clearances, states = [], []
     for index in (GX, GY):
@@ -372,7 +379,13 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         sensor="suspect" if sensor else "ok",
         reasons=tuple(reasons),
         lost=lost,
-        figures={"distance": bounced.distance, "path": bounced.path, "law": bounced.law, "work": float(work)},
+        figures={
+            "distance": bounced.distance,
+            "path": bounced.path,
+            "law": bounced.law,
+            **({"law_odds": bounced.odds} if math.isfinite(bounced.odds) else {}),
+            "work": float(work),
+        },
     )
 
 
