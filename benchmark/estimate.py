@@ -36,12 +36,13 @@ def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any
     except SolverError as error:  # a wall that jumps through the head: no such machine
         return {"group": name, "seed": seed, "not_drawn": str(error)}
     begin = time.process_time()
-    result = estimate(truth.nominal, truth.load, truth.poses)
+    result = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
     cpu_s = time.process_time() - begin
     simple, _ = range_of_motion(truth.nominal, truth.poses)
     row: dict[str, Any] = {
         "group": name, "seed": seed, "stiffness": truth.scene.contact.stiffness, "model": result.model,
-        "stiffness_p05": result.stiffness.p05, "stiffness_p95": result.stiffness.p95,
+        "stiffness_mean": result.stiffness.mean, "stiffness_p05": result.stiffness.p05,
+        "stiffness_p95": result.stiffness.p95,
         "sensor": result.sensor, "cpu_s": cpu_s, "work": result.figures.get("work", 0.0),
     }  # fmt: skip
     for index, (axis, value, state) in enumerate(
@@ -75,6 +76,13 @@ def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         out[f"{axis}_width_mm"] = 1e3 * float(np.median(widths)) if known else float("nan")
         simple = np.array([row[f"{axis}_range_error_m"] for row in rows])
         out[f"{axis}_range_rmse_mm"] = 1e3 * float(np.sqrt(np.mean(simple**2)))
+    known = [row for row in rows if row["h_state"] == State.ESTIMATED.value and "stiffness_mean" in row]
+    ratios = np.array([row["stiffness_mean"] / row["stiffness"] for row in known])
+    out["k_rmse"] = float(np.sqrt(np.mean((ratios - 1.0) ** 2))) if known else float("nan")
+    inside = [row["stiffness_p05"] <= row["stiffness"] <= row["stiffness_p95"] for row in known]
+    out["k_coverage"] = float(np.mean(inside)) if known else float("nan")
+    widths = [(row["stiffness_p95"] - row["stiffness_p05"]) / row["stiffness"] for row in known]
+    out["k_width"] = float(np.median(widths)) if known else float("nan")
     out["cpu_s"] = float(np.mean([row["cpu_s"] for row in rows]))
     out["cpu_s_most"] = float(np.max([row["cpu_s"] for row in rows]))
     return out
@@ -94,6 +102,11 @@ def as_markdown(groups: Sequence[dict[str, Any]]) -> str:
             f"{100 * one['as_expected']:.0f} % | {one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
             f"{one['cpu_s']:.1f} (most {one['cpu_s_most']:.1f}) |"
         )
+    lines += ["", "| group | stiffness: RMSE | coverage | median width |", "|---|---|---|---|"]
+    for one in groups:
+        title, widths = GROUPS[one["group"]].title, (one["k_rmse"], one["k_width"])
+        rmse, width = (f"{100 * value:.3f} %" for value in widths)
+        lines.append(f"| {title} | {rmse} | {one['k_coverage']:.2f} | {width} |")
     return "\n".join(lines).replace("nan, nan", "-")
 
 

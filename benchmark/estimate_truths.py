@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin import Clearance, Contact, Initial, Scene, Table, Wear, simulate
+from plow_twin.estimate.contact_forces import ContactForces
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.model.loads import compile_loads
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.stream.outputs import clearances
 
@@ -54,6 +56,11 @@ class Group:
     noisier: float = 1.0
     #: wear coefficient of the truth; the estimate knows of none
     wear_m2_n: float = 0.0
+    #: load cells at all pairs: rate, noise, deviation of each one's gain, largest delay of them all
+    forces_hz: float = 0.0
+    forces_noise_n: float = 1e3
+    forces_gain: float = 0.05
+    forces_delay_s: float = 0.05
     #: whether model, or sensor, are to be found suspect
     model: str = "ok"
     sensor: str = "ok"
@@ -71,6 +78,12 @@ GROUPS = {
     "middle": Group("K 3e7 .. 3e8", stiffness=(3e7, 3e8)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
     "hard_sensor": Group("hard, with bias, delay, gaps", stiffness=(1e9, 1e11), bias_m=5e-3, delay_s=0.05, gaps=True),
+    "forces": Group("with measured forces, 1 kHz", forces_hz=1e3),
+    "forces_slow": Group("with measured forces, 100 Hz", forces_hz=100.0),
+    "noisy_forces": Group("2 mm, with measured forces, 1 kHz", noise_m=2e-3, forces_hz=1e3),
+    "forces_kelvin_voigt": Group(
+        "truth: Kelvin-Voigt, with measured forces", law="kelvin_voigt", forces_hz=1e3, model="suspect"
+    ),
     "kelvin_voigt": Group("truth: Kelvin-Voigt", law="kelvin_voigt", model="suspect"),
     "hard_kelvin_voigt": Group("hard, truth: Kelvin-Voigt", stiffness=(1e9, 1e11), law="kelvin_voigt", model="suspect"),
     "hard_20": Group("K 1e9 .. 1e11, 20 periods", stiffness=(1e9, 1e11), periods=20.0),
@@ -101,15 +114,20 @@ class Truth:
     delay: float
     gain: Array
     clearance: Array
+    forces: ContactForces | None = None
 
     def write(self, folder: Path) -> None:
         """Write the folder that `plow-twin estimate` takes."""
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "scene.yaml").write_text(dump_scene(self.nominal), encoding="utf-8")
-        for name, header, table in (
+        tables = [
             ("load.csv", "t,fx,fy,m", np.column_stack([self.load.t, self.load.wrench])),
             ("pose.csv", "t,x,y,theta", np.column_stack([self.poses.t, self.poses.q])),
-        ):
+        ]
+        if self.forces is not None:
+            rows = np.column_stack([self.forces.t, self.forces.force])
+            tables.append(("contact_forces.csv", ",".join(("t", *PAIR_NAMES)), rows))
+        for name, header, table in tables:
             lines = [",".join("" if np.isnan(value) else repr(float(value)) for value in row) for row in table]
             (folder / name).write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
 
@@ -138,7 +156,7 @@ def draw(group: Group, seed: int) -> Truth:
     t = np.arange(0.0, end, 1.0 / group.rate_hz)
     delay = group.delay_s * rng.uniform()
     bias = group.bias_m * rng.standard_normal(3) * np.array([1.0, 1.0, 3.0])
-    motion, clearance = _motion(scene, group, np.maximum(t - delay, 0.0), end)
+    motion, clearance, force = _motion(scene, group, np.maximum(t - delay, 0.0), end)
     q = motion + bias
     measured = _sensor(group, rng, t, q)
     keep = _kept(group, rng, t, measured)
@@ -146,7 +164,8 @@ def draw(group: Group, seed: int) -> Truth:
     wrench = np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
     poses, _ = Poses.of(t[keep], measured[keep])
     load, _ = Load.of(knots, wrench)
-    return Truth(group, scene, nominal, load, poses, bias, delay, gain, clearance)
+    forces = _cells(group, rng, force, end) if group.forces_hz else None
+    return Truth(group, scene, nominal, load, poses, bias, delay, gain, clearance, forces)
 
 
 def _contact(group: Group, rng: np.random.Generator) -> Contact:
@@ -169,12 +188,12 @@ def cutting(rng: np.random.Generator, t: Array) -> Array:
     return out
 
 
-def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array]:
-    """Return the true poses at `times`, shape (n, 3), and the clearances at the end, shape (2,)."""
+def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array, Array, Array]:
+    """Return the true poses at `times`, (n, 3), the clearances at the end, (2,), and the forces each `_FINE` s."""
     if not group.jam_m:
         run = simulate(scene, end, _FINE, 1e-6)
         q = np.stack([np.interp(times, run.t, column) for column in run.q.T], axis=1)
-        return q, clearances(scene, run.wear_depth)[:2]
+        return q, clearances(scene, run.wear_depth)[:2], run.force
     first = simulate(scene, _FROM * end, _FINE, 1e-6)
     table = scene.loads[0]
     assert isinstance(table, Table)
@@ -189,7 +208,16 @@ def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array
     t = np.concatenate([first.t, second.t[1:] + _FROM * end])
     q = np.concatenate([first.q, second.q[1:]])
     moved = np.stack([np.interp(times, t, column) for column in q.T], axis=1)
-    return moved, clearances(scene, np.zeros(8))[:2]
+    return moved, clearances(scene, np.zeros(8))[:2], np.concatenate([first.force, second.force[1:]])
+
+
+def _cells(group: Group, rng: np.random.Generator, force: Array, end: float) -> ContactForces:
+    """Return what load cells make of the true forces, (n, 8) each `_FINE` s."""
+    t = np.arange(0.0, end, 1.0 / group.forces_hz)
+    late = np.maximum(t - group.forces_delay_s * rng.uniform(), 0.0)
+    true = np.stack([np.interp(late, _FINE * np.arange(len(column)), column) for column in force.T], axis=1)
+    gain = 1.0 + group.forces_gain * rng.standard_normal(8)
+    return ContactForces.of(t, gain * true + group.forces_noise_n * rng.standard_normal(true.shape))[0]
 
 
 def _sensor(group: Group, rng: np.random.Generator, t: Array, q: Array) -> Array:

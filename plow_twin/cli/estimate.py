@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     "--map",
     "mapping",
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
-    help="YAML that says which topic of a recording is the excitation, which the head_pose or the gaps.",
+    help="YAML that says which topic of a recording is the excitation, which the head_pose, the gaps or the forces.",
 )
 @json_option
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for estimate.json, forces.csv.")
@@ -55,9 +55,9 @@ def estimate(
 
     INPUT is a folder with scene.yaml (the nominal scene), load.csv (t, fx, fy, m: the load believed), pose.csv (t, x,
     y, theta: the measured pose, a cell left empty was not measured) and, beside or instead of that, gaps.csv (t and
-    columns named after pairs: measured gaps), a run of ours, or another recording (MCAP, rosbag2's sqlite3). Where the
-    node of a run estimated, its newest estimate is made again from the journal and compared, bit for bit; else the
-    measured pose is one recorded beside the run.
+    columns named after pairs: measured gaps) and contact_forces.csv (the same: measured forces), a run of ours, or
+    another recording (MCAP, rosbag2's sqlite3). Where the node of a run estimated, its newest estimate is made again
+    from the journal and compared, bit for bit; else the measured pose is one recorded beside the run.
     """
     import numpy as np
 
@@ -122,9 +122,14 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
     gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
     lost = measured.unreadable + lost_load + lost_poses + lost_gaps
-    told = gaps if len(gaps.t) else None
+    told, forces = gaps if len(gaps.t) else None, None
+    if len(measured.forces):
+        from plow_twin.estimate.contact_forces import ContactForces
+
+        forces, lost_forces = ContactForces.of(measured.forces[:, 0], measured.forces[:, 1:])
+        lost += lost_forces
     losses = {"losses": dict(measured.lost)}
-    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost, told), losses))
+    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost, told, forces), losses))
 
 
 def _repeated(source: Path) -> _Task | None:
@@ -200,5 +205,9 @@ def _show(result: Estimate) -> None:
     console = output_console()
     console.print(view)
     console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)
+    if result.forces_measured is not None:
+        told = result.forces_measured.as_dict()
+        why = told["unused"] and f": {told['unused']}"
+        console.print(f"measured forces: {told['rows']} rows used{why}", highlight=False)
     for reason in result.reasons:
         console.print(f"  {reason}", highlight=False)

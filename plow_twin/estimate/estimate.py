@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, Told, tell
 from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
 from plow_twin.estimate.pads import askew, by_group, of_turns, turned
-from plow_twin.estimate.result import CORRELATED, NORMAL_P95, Estimate, Interval, State
+from plow_twin.estimate.result import CORRELATED, NORMAL_P95, Estimate, ForcesUsed, Interval, State
 from plow_twin.estimate.search import HARD, candidate, refine
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
@@ -36,6 +37,9 @@ from plow_twin.estimate.verdict import COMPONENTS, Verdict, foretold, judge, jud
 from plow_twin.model import geometry
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import inertias
+
+if TYPE_CHECKING:
+    from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
 #: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: none.
@@ -99,7 +103,14 @@ _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
 
-def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0, gaps: Gaps | None = None) -> Estimate:
+def estimate(
+    scene: Scene,
+    load: Load,
+    poses: Poses,
+    lost: int = 0,
+    gaps: Gaps | None = None,
+    forces: ContactForces | None = None,
+) -> Estimate:
     """Estimate clearances, contact, load gains and the sensor's bias and delay from one window of measurements.
 
     Parameters
@@ -114,12 +125,20 @@ def estimate(scene: Scene, load: Load, poses: Poses, lost: int = 0, gaps: Gaps |
         Rows that were left out before.
     gaps : Gaps, optional
         Measured gaps: they tell the clearances directly, and the pose where that is not measured.
+    forces : ContactForces, optional
+        Measured contact forces: they tell the contact beside the motion.
     """
-    return estimate_window(scene, load, poses, lost, gaps=gaps)[0]
+    return estimate_window(scene, load, poses, lost, gaps=gaps, forces=forces)[0]
 
 
 def estimate_window(
-    scene: Scene, load: Load, poses: Poses, lost: int = 0, guess: Guess = (), gaps: Gaps | None = None
+    scene: Scene,
+    load: Load,
+    poses: Poses,
+    lost: int = 0,
+    guess: Guess = (),
+    gaps: Gaps | None = None,
+    forces: ContactForces | None = None,
 ) -> tuple[Estimate, Guess]:
     """Estimate as `estimate` does, from what the window before told; return the guess for the next one too.
 
@@ -127,14 +146,20 @@ def estimate_window(
     """
     units = Units.of(scene, load)
     if units == Units():
-        return _estimate(scene, load, poses, lost, guess, gaps)
+        return _estimate(scene, load, poses, lost, guess, gaps, forces)
     its = units.load(load), units.poses(poses)
-    found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps))
+    found, following = _estimate(units.scene(scene), *its, lost, guess, units.gaps(gaps), units.forces(forces))
     return units.in_si(found, scene), following
 
 
 def _estimate(
-    scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess, gaps: Gaps | None
+    scene: Scene,
+    load: Load,
+    poses: Poses,
+    lost: int,
+    guess: Guess,
+    gaps: Gaps | None,
+    forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
     """Estimate in the units that all is given in."""
     known, measured = len(load.t), len(poses.t)
@@ -153,14 +178,20 @@ def _estimate(
     told = None if gaps is None else tell(scene, gaps.between(span[0], span[1] + 1e-9), poses)
     if told is not None and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
         poses = told.poses
+    if forces is not None:
+        forces = forces.between(span[0], span[1] + 1e-9)
     try:
-        result, following = _from_motion(scene, load, poses, lost, guess)
+        result, following = _from_motion(scene, load, poses, lost, guess, forces)
     except (np.linalg.LinAlgError, OverflowError) as error:
         result, following = _without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
+    if forces is not None and result.forces_measured is None:
+        result = replace(result, forces_measured=ForcesUsed(unused="the motion is not known moment by moment"))
     return (result, following) if told is None else (_with_gaps(result, told), following)
 
 
-def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess) -> tuple[Estimate, Guess]:
+def _from_motion(
+    scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess, forces: ContactForces | None
+) -> tuple[Estimate, Guess]:
     """Estimate from the motion alone."""
     span = float(load.t[0]), float(load.t[-1])
     unknowns = Unknowns(scene, Spread.stated(load, poses))
@@ -191,21 +222,27 @@ def _from_motion(scene: Scene, load: Load, poses: Poses, lost: int, guess: Guess
         verdict = judge(*near, period) if near else None
         if near and verdict and not (verdict.model or verdict.sensor) and near[1].finished:
             near, verdict = _with_turns(near, verdict, period)
-            return summarise(*near, verdict, lost), _next_guess(*near)
+            return summarise(*near, verdict, lost, forces), _next_guess(*near)
         forward = Forward(scene, felt)
     bias = bias_of_hard(unknowns, poses)
     if bias.any():
-        result, following = _searched(forward, unknowns, poses.moved(-bias), period, drift, lost)
+        result, following = _searched(forward, unknowns, poses.moved(-bias), period, drift, lost, forces)
         if following:
             numbers = np.array(following)
             numbers[BIAS] += bias
             following = tuple(numbers.tolist())
         return _moved_back(result, bias), following
-    return _searched(forward, unknowns, poses, period, drift, lost)
+    return _searched(forward, unknowns, poses, period, drift, lost, forces)
 
 
 def _searched(
-    forward: Forward, unknowns: Unknowns, poses: Poses, period: float, drift: Array | None, lost: int
+    forward: Forward,
+    unknowns: Unknowns,
+    poses: Poses,
+    period: float,
+    drift: Array | None,
+    lost: int,
+    forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
     """Estimate from the motion without a guess."""
     bounced = compare(forward, unknowns, poses, period) if bounces(unknowns, poses) else None
@@ -229,7 +266,7 @@ def _searched(
     if found is None:
         return _without_fit(unknowns, poses, lost), ()
     found, verdict = _with_turns(found, judge(*found, period), period)
-    result = summarise(*found, verdict, lost)
+    result = summarise(*found, verdict, lost, forces if bounced is None else None)
     following = () if verdict.model or verdict.sensor else _next_guess(*found)
     return result if bounced is None else _with_bounced(result, bounced, spent), following
 
@@ -433,8 +470,8 @@ def warm_up(scene: Scene) -> None:
         )
 
 
-def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estimate:
-    """Turn a fit into values, intervals and states."""
+def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: ContactForces | None = None) -> Estimate:
+    """Turn a fit into values, intervals and states, with what measured contact forces tell beside it."""
     unknowns, poses = problem.unknowns, problem.window.poses
     plain = _plain(problem, fit)
     covariance = _covariance(problem, fit, verdict, plain)
@@ -466,7 +503,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
     normal = [Interval.normal(value, spread) for value, spread in zip(shared, deviation, strict=True)]
     gain_fx, gain_fy, gain_m = normal[GAIN]
     bias_x, bias_y, bias_theta = normal[BIAS]
-    return Estimate(
+    result = Estimate(
         t_start=float(poses.t[0]),
         t_end=float(poses.t[-1]),
         horizontal=clearances[0],
@@ -496,6 +533,52 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int) -> Estima
             "work": float(problem.forward.work),
         },
     )
+    if forces is None:
+        return result
+    return _with_forces(result, problem, fit, forces, _widened(problem, fit, verdict))
+
+
+def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactForces, widened: float) -> Estimate:
+    """Put what measured contact forces tell beside the fit; where they contradict it, nothing holds."""
+    from plow_twin.estimate.force_fit import tell
+
+    if "suspect" in (result.model, result.sensor) or not fit.finished:
+        return replace(result, forces_measured=ForcesUsed(unused="the fit of the poses does not hold"))
+    told = tell(problem, fit, forces, widened)
+    result = replace(result, forces_measured=told.used)
+    if told.model or told.sensor:
+        return replace(
+            result,
+            horizontal_state=State.WITHDRAWN,
+            vertical_state=State.WITHDRAWN,
+            model="suspect" if told.model else "ok",
+            sensor="suspect" if told.sensor else "ok",
+            reasons=(*result.reasons, *told.model, *told.sensor),
+        )
+    if told.shared is None or told.covariance is None:
+        return result
+    covariance = told.covariance
+    covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, told.shared) ** 2
+    deviation = np.sqrt(np.diag(covariance))
+    normal = [Interval.normal(value, spread) for value, spread in zip(told.shared, deviation, strict=True)]
+    gain_fx, gain_fy, gain_m = normal[GAIN]
+    bias_x, bias_y, bias_theta = normal[BIAS]
+    known = State.ESTIMATED
+    return replace(
+        result,
+        horizontal=normal[GX].above(0.0) if result.horizontal_state is known else result.horizontal,
+        vertical=normal[GY].above(0.0) if result.vertical_state is known else result.vertical,
+        stiffness=_stiffness(problem.unknowns, normal[SOFTNESS]),
+        damping=_damping(problem.unknowns, normal[DAMPING]),
+        gain_fx=gain_fx,
+        gain_fy=gain_fy,
+        gain_m=gain_m,
+        bias_x=bias_x,
+        bias_y=bias_y,
+        bias_theta=bias_theta,
+        delay=normal[DELAY],
+        correlation=_correlation(covariance),
+    )
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
@@ -512,17 +595,24 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
     size, not with its root. The step that a fit would still take is no part of what it knows.
     """
     size = len(fit.shared)
+    covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
+    covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, fit.shared) ** 2
+    return covariance
+
+
+def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
+    """Return the variance by the scatter of the swings and by the residuals' colour over that of the noise."""
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
     widened = max(1.0, colour) * (1.0 if fit.converged else UNFINISHED)
-    covariance: Array = plain * (widened**2 * ratio) + np.outer(fit.left[:size], fit.left[:size])
-    scatter = 0.0
-    if problem.unknowns.is_hard(fit.shared):
-        scatter = HARD_SCATTER
-    elif problem.unknowns.penetration_of(float(fit.shared[SOFTNESS])) < _FIRM:
-        scatter = FIRM_SCATTER
-    covariance[[GX, GY], [GX, GY]] += scatter**2
-    return covariance
+    return widened**2 * ratio
+
+
+def _between_optima(unknowns: Unknowns, shared: Array) -> float:
+    """Return what a contact that is hard, or not quite, adds to the standard deviation of a clearance, in m."""
+    if unknowns.is_hard(shared):
+        return HARD_SCATTER
+    return FIRM_SCATTER if unknowns.penetration_of(float(shared[SOFTNESS])) < _FIRM else 0.0
 
 
 def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:

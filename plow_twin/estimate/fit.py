@@ -41,7 +41,7 @@ MOST_WORK = 3_000_000
 #: Displacements of a starting state: m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 #: Prior standard deviations of a starting state about its guess.
-_START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
+START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
 #: Standard deviations of the displacements that probe what can be foretold.
 _PROBED_STATE = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
 _PROBED = np.array([5e-5, 5e-5, 2e-3, 5e-3, 2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0])
@@ -244,7 +244,7 @@ class Problem:
         loss = np.where(z <= HUBER, z * z, HUBER * (2.0 * z - HUBER))
         lacking = np.isnan(loss) & np.isfinite(self.window.poses.q)
         shift = (point.shared - self.mean) / self.deviation
-        moved = (point.states - self.window.states) / _START_SPREAD
+        moved = (point.states - self.window.states) / START_SPREAD
         linked = np.einsum("si,sij,sj->", point.defect, self.link, point.defect)
         return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum() + linked)
 
@@ -364,8 +364,8 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
         gradient[:SIZE] += right[:SIZE]
         gradient[piece.own] += right[SIZE:]
     gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2
-    gradient[SIZE:] += ((problem.window.states - point.states) / _START_SPREAD**2).ravel()
-    return normal.plus(np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / _START_SPREAD**2, swings)])), gradient
+    gradient[SIZE:] += ((problem.window.states - point.states) / START_SPREAD**2).ravel()
+    return normal.plus(np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / START_SPREAD**2, swings)])), gradient
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
@@ -403,7 +403,7 @@ def _descend(
 ) -> tuple[Point | None, float]:
     """Return the next point, or None where no step gains, and the damping for the next step."""
     scale = normal.diagonal()
-    deviations = np.concatenate([problem.deviation, np.tile(_START_SPREAD, problem.window.swings)])
+    deviations = np.concatenate([problem.deviation, np.tile(START_SPREAD, problem.window.swings)])
     for _ in range(6):
         step = normal.plus(damping * scale).factorised().solve(gradient)
         step *= min(1.0, _LONGEST_STEP / max(np.abs(step / deviations)[:SIZE].max(), 1e-12))

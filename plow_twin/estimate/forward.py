@@ -101,7 +101,7 @@ class Forward:
         """
         params, segments = self._compiled(scene, gain, depth)
         records = new_records(state_type(self._terms), len(starts))
-        records["y"] = _bodies(states, scene.head.com_offset_m)
+        records["y"] = bodies(states, scene.head.com_offset_m)
         if self._terms.hysteretic is not None:
             records["damping_factor"] = scene.contact.damping or 0.0
         records["step_start"] = starts
@@ -134,7 +134,7 @@ class Forward:
         return params, segments
 
 
-def _bodies(states: Array, offset: tuple[float, float]) -> Array:
+def bodies(states: Array, offset: tuple[float, float]) -> Array:
     """Convert poses and rates, shape (s, 6), to body coordinates, shape (s, 8) (`geometry.body_state`, row by row)."""
     x, y, theta, vx, vy, omega = states.T
     c, s = np.cos(theta), np.sin(theta)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from statistics import NormalDist
 from typing import Any, Final
@@ -51,6 +51,10 @@ class Interval:
         """Standard deviation of the normal distribution that has this interval."""
         return (self.p95 - self.p05) / (2.0 * NORMAL_P95)
 
+    def times(self, unit: float) -> Interval:
+        """Return the interval of the value times a unit."""
+        return Interval(self.mean * unit, self.p05 * unit, self.p95 * unit)
+
     def above(self, least: float) -> Interval:
         """Return the interval of the same normal distribution cut off below `least`."""
         deviation = self.deviation
@@ -70,6 +74,61 @@ def _tail(least: float) -> tuple[float, float, float]:
     share = 0.5 * math.erfc(least / math.sqrt(2.0))
     mean = math.exp(-0.5 * least * least) / (math.sqrt(2.0 * math.pi) * share)
     return mean, -_STANDARD.inv_cdf(0.95 * share), -_STANDARD.inv_cdf(0.05 * share)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What was found of a load cell.
+
+    rows : rows in or near contact behind it
+    gain : measured over true force
+    offset, noise : what it shows in flight, and its standard deviation there, in N
+    left_over : share of its force that is left over beyond the noise
+    """
+
+    rows: int
+    gain: Interval
+    offset: float
+    noise: float
+    left_over: float
+
+
+@dataclass(frozen=True)
+class ForcesUsed:
+    """How measured contact forces were used.
+
+    cells : by pair
+    delay : by which their stamps are later than the motion, in s
+    unused : why they make nothing better; empty where they do
+    """
+
+    cells: dict[str, Cell] = field(default_factory=dict)
+    delay: Interval | None = None
+    unused: str = ""
+
+    def in_units(self, force: float, time: float) -> ForcesUsed:
+        """Return it where forces and times were in these units."""
+        cells = {
+            name: replace(cell, offset=cell.offset * force, noise=cell.noise * force)
+            for name, cell in self.cells.items()
+        }
+        return replace(self, cells=cells, delay=None if self.delay is None else self.delay.times(time))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it for JSON."""
+        cells = {
+            name: {
+                "rows": cell.rows,
+                "gain": asdict(cell.gain),
+                "offset_n": cell.offset,
+                "noise_n": cell.noise,
+                "left_over": cell.left_over,
+            }
+            for name, cell in self.cells.items()
+        }
+        rows = 0 if self.unused else sum(cell.rows for cell in self.cells.values())
+        delay = None if self.delay is None else asdict(self.delay)
+        return {"rows": rows, "unused": self.unused, "delay": delay, "pairs": cells}
 
 
 @dataclass(frozen=True)
@@ -101,6 +160,8 @@ class Estimate:
     groups : dict of str to (Interval, State)
         Clearance between the pads that face each other: `horizontal_top`, `horizontal_bottom`, `vertical_left`,
         `vertical_right`, in m.
+    forces_measured : ForcesUsed, optional
+        How measured contact forces were used, where there were some.
     """
 
     t_start: float
@@ -126,6 +187,7 @@ class Estimate:
     correlation: tuple[tuple[float, ...], ...] | None = None
     figures: dict[str, float] = field(default_factory=dict)
     groups: dict[str, tuple[Interval, State]] = field(default_factory=dict)
+    forces_measured: ForcesUsed | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON, as `plow-twin estimate --json` prints it."""
@@ -151,4 +213,5 @@ class Estimate:
             else {"names": list(CORRELATED), "matrix": [list(row) for row in self.correlation]},
             "figures": self.figures,
             "groups": {name: clearance(value, state) for name, (value, state) in self.groups.items()},
+            **({} if self.forces_measured is None else {"forces_measured": self.forces_measured.as_dict()}),
         }

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from plow_twin.estimate.gaps import CONSTANT_ERROR, Gaps
 from plow_twin.estimate.measurements import Deviation, Load, Poses
-from plow_twin.estimate.result import Estimate, Interval
+from plow_twin.estimate.result import Estimate
 from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Scene
+
+if TYPE_CHECKING:
+    from plow_twin.estimate.contact_forces import ContactForces
 
 #: The machine of the paper: half of the frame's diagonal [m], mass [kg], period of the load [s].
 _LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
@@ -95,6 +98,12 @@ class Units:
             return None
         return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or CONSTANT_ERROR) / self.length)
 
+    def forces(self, forces: ContactForces | None) -> ContactForces | None:
+        """Return contact forces in these units."""
+        if forces is None:
+            return None
+        return replace(forces, t=forces.t / self.time, force=forces.force / self.force)
+
     def in_si(self, found: Estimate, scene: Scene) -> Estimate:
         """Return what was found in these units in those of SI, `scene` being that in SI."""
         contact = scene.contact
@@ -106,15 +115,18 @@ class Units:
             found,
             t_start=found.t_start * time,
             t_end=found.t_end * time,
-            horizontal=_times(found.horizontal, length),
-            vertical=_times(found.vertical, length),
-            stiffness=_times(found.stiffness, stiffness),
-            damping=None if found.damping is None else _times(found.damping, damping),
-            bias_x=None if found.bias_x is None else _times(found.bias_x, length),
-            bias_y=None if found.bias_y is None else _times(found.bias_y, length),
-            delay=None if found.delay is None else _times(found.delay, time),
+            horizontal=found.horizontal.times(length),
+            vertical=found.vertical.times(length),
+            stiffness=found.stiffness.times(stiffness),
+            damping=None if found.damping is None else found.damping.times(damping),
+            bias_x=None if found.bias_x is None else found.bias_x.times(length),
+            bias_y=None if found.bias_y is None else found.bias_y.times(length),
+            delay=None if found.delay is None else found.delay.times(time),
             noise=None if found.noise is None else (found.noise[0] * length, found.noise[1] * length, found.noise[2]),
-            groups={name: (_times(value, length), state) for name, (value, state) in found.groups.items()},
+            groups={name: (value.times(length), state) for name, (value, state) in found.groups.items()},
+            forces_measured=None
+            if found.forces_measured is None
+            else found.forces_measured.in_units(self.force, self.time),
             reasons=found.reasons + told if found.reasons else (),
         )
 
@@ -140,7 +152,3 @@ class Units:
             stick_stiffness_n_m=None if stiffness is None else stiffness * self.time**2 / self.mass,
             stick_damping_n_s_m=None if damping is None else damping * self.time / self.mass,
         )
-
-
-def _times(value: Interval, unit: float) -> Interval:
-    return Interval(value.mean * unit, value.p05 * unit, value.p95 * unit)

@@ -1,7 +1,7 @@
 """What was measured, for the estimate: from a folder, from a run of ours, or from any recording by a mapping.
 
 A folder holds scene.yaml, load.csv (t, fx, fy, m), pose.csv (t, x, y, theta) and, where gaps were measured, gaps.csv (t
-and columns named after pairs); with it pose.csv may be missing.
+and columns named after pairs); with it pose.csv may be missing. contact_forces.csv, if there is one, is like gaps.csv.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from plow_twin.stream.journal import Gaps, PartOfPose, Pose, Reset, SetWear, Spr
 Array = NDArray[np.float64]
 
 SCENE_FILE, LOAD_FILE, POSE_FILE, GAPS_FILE = "scene.yaml", "load.csv", "pose.csv", "gaps.csv"
+FORCES_FILE = "contact_forces.csv"
 _LOAD_COLUMNS: Final = ("t", "fx", "fy", "m")
 _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 
@@ -46,7 +47,8 @@ class Measured:
     load : (n, 4) t [s], Fx, Fy [N], M [N m] believed; poses : (k, 4) t [s], x, y [m], theta [rad], NaN where a cell is
     empty; unreadable : rows that are not numbers, and whatever else `lost` says, which could not be read or used of a
     recording; pose_deviation, load_deviation, gaps_deviation : stated standard
-    deviations, 0 where none is; gaps : (m, 9) t [s] and the gaps of the eight pairs [m], NaN where there is no sensor.
+    deviations, 0 where none is; gaps : (m, 9) t [s] and the gaps of the eight pairs [m], NaN where there is no sensor;
+    forces : (m, 9) the same of contact forces [N].
     """
 
     scene: Scene
@@ -58,6 +60,7 @@ class Measured:
     gaps: Array = field(default_factory=lambda: np.zeros((0, 1 + PAIR_COUNT)))
     gaps_deviation: float = 0.0
     lost: Mapping[str, int] = field(default_factory=dict)
+    forces: Array = field(default_factory=lambda: np.zeros((0, 1 + PAIR_COUNT)))
 
 
 def read_measured(folder: Path, scene: Path | None = None) -> Measured:
@@ -74,15 +77,18 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
     gaps, bad_gaps = np.zeros((0, 1 + PAIR_COUNT)), 0
     if (folder / GAPS_FILE).is_file():
         gaps, bad_gaps = _read(folder / GAPS_FILE, ("t",), PAIR_NAMES)
+    forces, bad_forces = np.zeros((0, 1 + PAIR_COUNT)), 0
+    if (folder / FORCES_FILE).is_file():
+        forces, bad_forces = _read(folder / FORCES_FILE, ("t",), PAIR_NAMES)
     poses, bad_poses = np.zeros((0, 4)), 0
     if not len(gaps) or (folder / POSE_FILE).is_file():
         poses, bad_poses = _read(folder / POSE_FILE, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
         # as in a recording: times of today's date count from the first sample of the load
-        for table in (poses, gaps, load):
+        for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
-    return Measured(model, load, poses, bad_load + bad_poses + bad_gaps, gaps=gaps)
+    return Measured(model, load, poses, bad_load + bad_poses + bad_gaps + bad_forces, gaps=gaps, forces=forces)
 
 
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
@@ -104,7 +110,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
         if scene is None and not file.is_file():
             raise RecordingError(f"{path}: not a run of plow_twin: a scene is needed, expected --scene or {file}")
         model = load_scene(scene_path(str(file)))
-        rows, begins, lost, why = _collect([path], mapping, ("excitation", "head_pose", "gaps"), "")
+        rows, begins, lost, why = _collect([path], mapping, ("excitation", "head_pose", "gaps", "forces"), "")
         loads, gaps, gaps_deviation = rows["excitation"], rows["gaps"], 0.0
     else:
         given = scene is not None
@@ -119,7 +125,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
             folder = path if path.is_dir() else path.parent
             unread = Counter[str]()
             places = [folder, *readable_beside(folder, unread)]
-            rows, _, lost, why = _collect(places, mapping, ("head_pose",), own.header.node)
+            rows, _, lost, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
             lost.pop("missing_parts", 0)  # counted by the run itself
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
@@ -130,10 +136,11 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
     origin, count = loads[0, 0], len(loads)
     loads = _longest(loads, begins)
     lost["samples_of_other_stretches"] = count - len(loads)
-    for table in (loads, poses, gaps):
+    forces = rows.get("forces", np.zeros((0, 1 + PAIR_COUNT)))
+    for table in (loads, poses, gaps, forces):
         table[:, 0] = (table[:, 0] - origin) * 1e-9
     counted = {name: count for name, count in lost.items() if count}
-    return Measured(model, loads, poses, sum(counted.values()), *deviations, gaps, gaps_deviation, counted)
+    return Measured(model, loads, poses, sum(counted.values()), *deviations, gaps, gaps_deviation, counted, forces)
 
 
 def _journal(reader: RunReader) -> tuple[Array, list[int], Array, Array, Array, Array]:

@@ -1,0 +1,243 @@
+"""What load cells at the guides tell: contact forces beside the motion, for stiffness, damping and clearances.
+
+After the fit the motion is known at every moment, and the law gives each pair's force from it. A cell that is not like
+its pair's force is named, and so is the law where all are unlike it; nothing is made better then. Else poses and forces
+are fitted together (`force_fit`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.estimate.fit import Fit, Problem, Window, depth_of
+from plow_twin.estimate.forward import TOLERANCE, bodies
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.unknowns import BIAS, DELAY
+from plow_twin.model.contact import free_force
+from plow_twin.model.geometry import penetration_rows
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.scene import Scene
+from plow_twin.solve.compiled_scene import compile_scene
+
+Array = NDArray[np.float64]
+
+#: Fewest messages from which anything is told.
+FEWEST_MESSAGES: Final = 50
+#: Beyond it a number is no force [N].
+_LARGEST = 1e12
+#: How far from 1 a cell's gain may be.
+MOST_GAIN = 0.25
+#: Delays at which the motion's forces are compared with those measured: the largest and their distance in s.
+_LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
+#: Head room in m from which on a pad is in flight for certain, and fewest rows that tell a cell's offset.
+_FLIGHT, _FEWEST_FLIGHT = 1e-3, 20
+#: Fewest rows in contact from which a cell tells anything.
+_FEWEST_CONTACT = 10
+#: Correlation with the motion's force below which a cell does not measure it.
+_LEAST_CORRELATION = 0.7
+#: Rows in a row with one value, and the force that the motion gives meanwhile, in its largest, of a cell that is stuck.
+_STUCK_ROWS, _STUCK_FORCE = 12, 0.2
+#: What a cell without contact may show, in the largest force of the motion.
+_MOST_IN_FLIGHT = 0.2
+#: The law as Python has it: kernels call it, Python cannot call what is compiled.
+_LAW = getattr(free_force, "py_func", free_force)
+
+
+class ContactForcesError(PlowTwinError):
+    """The contact forces have the wrong shape."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactForces:
+    """Measured contact forces: `t` (n,) stamps in s, rising; `force` (n, 8) in N, NaN where there is no cell."""
+
+    t: Array
+    force: Array
+
+    @staticmethod
+    def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
+        """Put rows in order of time; return them and how many had to be left out.
+
+        Those are the ones without a finite stamp or any force, with one beyond 1e12 N, or with a stamp that is there.
+
+        Raises
+        ------
+        ContactForcesError
+            For arrays of the wrong shape.
+        """
+        times, rows = np.asarray(t, dtype=np.float64), np.array(force, dtype=np.float64)
+        if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):
+            raise ContactForcesError(
+                f"contact forces: got t {times.shape} and force {rows.shape}, expected (n,) and (n, {PAIR_COUNT})"
+            )
+        rows[~np.isfinite(rows)] = np.nan
+        absurd = (np.abs(rows) > _LARGEST).any(axis=1)
+        usable = np.flatnonzero(np.isfinite(times) & np.isfinite(rows).any(axis=1) & ~absurd)
+        _, first = np.unique(times[usable], return_index=True)
+        index = usable[first]
+        return ContactForces(times[index], rows[index]), len(times) - len(index)
+
+    def between(self, start: float, end: float) -> ContactForces:
+        """Return the rows stamped in [start, end)."""
+        inside = (self.t >= start) & (self.t < end)
+        return ContactForces(self.t[inside], self.force[inside])
+
+    def thinned(self, most: int) -> ContactForces:
+        """Return each second, third, ... row, so many that at most `most` are left."""
+        apart = max(1, -(-len(self.t) // most))
+        return ContactForces(self.t[::apart], self.force[::apart])
+
+
+@dataclass(frozen=True, eq=False)
+class Felt:
+    """What the motion gives at the measured times.
+
+    swing : (n,) swing of each row, -1 where it lies in none
+    penetration, force : (n, 8) in m and N; NaN outside the swings
+    """
+
+    swing: NDArray[np.int64]
+    penetration: Array
+    force: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Cells that tell something.
+
+    pairs : (k,) numbers of their pairs
+    force : (n, 8) what they measured in N, less `offset`, (8,), what they show in flight
+    noise : (8,) standard deviation in N
+    delay : by which their stamps are later than the motion, in s
+    """
+
+    pairs: NDArray[np.int64]
+    force: Array
+    offset: Array
+    noise: Array
+    delay: float
+
+
+class Feeling:
+    """The forces that motions of a fit's swings give at the times of measured ones."""
+
+    def __init__(self, problem: Problem, t: Array) -> None:
+        window = Window(Poses(t, np.zeros((len(t), 3))), problem.window.starts, problem.window.states)
+        self._problem = Problem(
+            problem.forward, problem.unknowns, window, horizon=problem.horizon, turns=problem.turns
+        )  # fmt: skip
+        self._depth = depth_of(problem.turns)
+
+    def at(self, shared: Array, states: Array, delay: float) -> Felt | None:
+        """Return what is felt with these unknowns; None where the model cannot be run."""
+        own = shared.copy()
+        own[BIAS], own[DELAY] = 0.0, delay
+        point = self._problem.evaluate(own, states)
+        if point is None:
+            return None
+        penetration, force = forces_at(
+            self._problem.unknowns.scene_of(shared), -point.residual, point.rate, self._depth
+        )
+        force[point.swing < 0] = np.nan
+        return Felt(point.swing, penetration, force)
+
+
+def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
+    """Return penetrations in m and forces in N of the pairs, (n, 8) each, from poses and rates, (n, 3) each.
+
+    `depth`, shape (8,), is by how much each pad lies further out, in m. The law's damping must be the scene's own, not
+    one that a restitution and the speed of the touch give.
+    """
+    x, y, vx, vy, omega, c, s, _ = bodies(np.hstack((q, v)), scene.head.com_offset_m).T
+    rows = penetration_rows(scene)
+    penetration = np.stack([c, s, x, y], axis=1) @ rows[:4] + rows[4] - (0.0 if depth is None else depth)
+    rate = np.stack([-omega * s, omega * c, vx + omega * y, vy - omega * x], axis=1) @ rows[:4]
+    params = compile_scene(scene, TOLERANCE, sampled=True).params
+    viscous = float(params["viscous"])
+    factor = 0.0 if viscous else float(scene.contact.damping or 0.0)
+    numbers = float(params["stiffness"]), float(params["exponent"]), factor, viscous, float(params["ramp"])
+    force, inside = np.zeros(penetration.shape), penetration > 0.0
+    linear = numbers[1] == 1.0 and not numbers[-1]  # the law takes arrays then
+    law = _LAW if linear else np.vectorize(_LAW, otypes=[np.float64])
+    force[inside] = np.maximum(law(penetration[inside], rate[inside], *numbers), 0.0)
+    return penetration, force
+
+
+def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
+    """Return the cells that tell something, None without any, and what they say against themselves."""
+    felt = feeling.at(found.shared, found.point.states, 0.0)
+    if felt is None:
+        return None, []
+    delay = _delay(forces, felt)
+    felt = feeling.at(found.shared, found.point.states, delay)
+    if felt is None:
+        return None, []
+    offset, noise = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
+    for i in range(PAIR_COUNT):
+        column = forces.force[:, i]
+        flight = column[(felt.penetration[:, i] < -_FLIGHT) & np.isfinite(column)]
+        if len(flight) >= _FEWEST_FLIGHT:
+            offset[i] = np.median(flight)
+            noise[i] = 1.4826 * np.median(np.abs(flight - offset[i]))
+    measured = forces.force - offset
+    found_out, pairs = [], []
+    largest = float(np.nanmax(felt.force))
+    # digits of a cell that shows nothing in flight
+    noise = np.maximum(noise, 1e-4 * largest)
+    for i, name in enumerate(PAIR_NAMES):
+        there = np.isfinite(measured[:, i]) & (felt.swing >= 0)
+        if not there.any():
+            continue
+        why = _contradiction(measured[there], felt.force[there], i, largest, float(noise[i]))
+        if why:
+            found_out.append(f"contact forces: {name}: {why}")
+        elif (felt.force[there, i] > 0.0).sum() >= _FEWEST_CONTACT:
+            pairs.append(i)
+    if not (found_out or pairs):
+        return None, []
+    return Cells(np.array(pairs, np.int64), measured, offset, noise, delay), found_out
+
+
+def _contradiction(measured: Array, felt: Array, pair: int, largest: float, noise: float) -> str:
+    """Return what a cell has against it, from (n, 8) measured and felt at its times; empty for nothing."""
+    own = felt[:, pair]
+    if (own > 0.0).sum() < _FEWEST_CONTACT:
+        most = float(np.abs(measured[:, pair]).max())
+        return f"{most:.3g} N where the motion gives no contact" if most > _MOST_IN_FLIGHT * largest + 6 * noise else ""
+    value = measured[:, pair]
+    ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
+    for first, end in zip(np.append(0, ends[:-1] + 1), ends + 1, strict=True):
+        if end - first >= _STUCK_ROWS and np.ptp(own[first:end]) > max(_STUCK_FORCE * own.max(), 6.0 * noise):
+            return f"the same value {end - first} times in a row, while the motion gives {np.ptp(own[first:end]):.3g} N"
+    if own.max() < 6.0 * noise:
+        return ""
+    like = np.array([correlation(value, felt[:, other]) for other in range(PAIR_COUNT)])
+    if like[pair] < _LEAST_CORRELATION:
+        best = int(np.argmax(like))
+        other = f", {like[best]:.2f} with {PAIR_NAMES[best]}" if like[best] > _LEAST_CORRELATION else ""
+        return f"correlation of {like[pair]:.2f} with what the motion gives{other}, expected {_LEAST_CORRELATION:g}"
+    gain = float(value @ own / (own @ own))
+    if abs(gain - 1.0) > MOST_GAIN:
+        return f"{gain:.3g} times what the motion gives, expected {1.0 - MOST_GAIN:g} to {1.0 + MOST_GAIN:g}"
+    return ""
+
+
+def _delay(forces: ContactForces, felt: Felt) -> float:
+    """Return the delay at which the measured forces are most like those of the motion."""
+    t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(felt.force)
+    pairs = np.flatnonzero(given.any(axis=0) & measured.any(axis=0))
+    lags = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)
+    alike = [sum(correlation(measured[:, i], np.interp(t - lag, t, given[:, i])) for i in pairs) for lag in lags]
+    return float(lags[int(np.argmax(alike))])
+
+
+def correlation(one: Array, other: Array) -> float:
+    """Return the correlation of two series; 0 where one does not change."""
+    one, other = one - one.mean(), other - other.mean()
+    size = float(np.sqrt((one @ one) * (other @ other)))
+    return float(one @ other) / size if size > 0.0 else 0.0
