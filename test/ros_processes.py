@@ -34,8 +34,8 @@ ROOT = Path(__file__).resolve().parent.parent
 START_S = 100.0
 #: Long enough for discovery on a machine that does other work [s].
 WAIT_S = 60.0
-#: Four times what a stop may take on a machine that does nothing else [s].
-STOP_S = 20.0
+#: Twice what a stop may take: three processes share two cores [s].
+STOP_S = 10.0
 _numbers = itertools.count()
 
 

@@ -193,7 +193,7 @@ def test_how_far_off_a_path_is_is_told_by_the_drawn_ones() -> None:
         drawn = [np.tile(path, (9, 1)) for path in paths]
         (measured,), (path,) = run(1, 0.5)
         right.append(_off_path(np.tile(path, (11, 1)), features, drawn, measured))
-        wrong.append(_off_path(np.tile(path + across, (11, 1)), features, drawn, measured))
+        wrong.append(_off_path(np.tile(path + 2.5 * across, (11, 1)), features, drawn, measured))
     assert np.mean(np.array(right) > estimating.MOST_PATH) < 0.06
     assert abs(np.mean(right)) < 0.8 and np.std(right) < 1.6
     assert np.mean(np.array(wrong) > estimating.MOST_PATH) > 0.9

@@ -81,7 +81,7 @@ _SCATTER_RIDGE, _NO_SCATTER = 20.0, 1e-14
 _MOST_WORK, _LONGER = 3_500_000, 2.0
 #: Drawn of a hard contact: logarithm of the penetration under the reference force [m] and its bounds; deviations of
 #: the damping's logarithm and of the gains.
-_LN_PENETRATION, _BOUNDS = (math.log(1.2e-5), 1.6), (2e-6, 6e-4)
+_LN_PENETRATION, _BOUNDS = (math.log(1.2e-5), 1.6), (8e-7, 6e-4)
 _DAMPING, _GAIN = 0.7, 0.06
 #: A firm contact is drawn about what is known of it, both logarithms so far apart at first, then as the round before
 #: left them times a factor, and no nearer than the last. Set on seeds 43200 to 43215 of the benchmark.

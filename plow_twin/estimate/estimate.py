@@ -81,7 +81,7 @@ FIRM_SCATTER, _FIRM = 4.5e-5, 3.5e-3
 MOST_DISTANCE = 4.0
 #: How far the path over the load's period may be from theirs, and how much more like those of another law, as normal
 #: deviates.
-MOST_PATH, MOST_OTHER_LAW = 3.0, 2.33
+MOST_PATH, MOST_OTHER_LAW = 4.5, 2.33
 #: How much likelier it may be under another law, as a logarithm: of that fewer motions are drawn, which makes its
 #: likelihood too small. Right models (seeds from 42200 on) have -7 at most.
 MOST_ODDS = -3.0
