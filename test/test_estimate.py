@@ -123,7 +123,7 @@ def test_what_is_left_out_of_a_load_changes_no_force(known: list[tuple[Truth, Es
     each = [forces_of(truth.nominal, result, one, 20, 3.1, over_time=False) for one in (load, few)]
     assert each[0].start == each[1].start == pytest.approx(3.1)
     for one, other in ((each[0].peak, each[1].peak), (each[0].impulse, each[1].impulse)):
-        assert other == pytest.approx(one, rel=0.02, abs=1e-3 * float(one.max()))
+        assert other == pytest.approx(one, rel=0.03, abs=1e-3 * float(one.max()))
 
 
 def test_members_are_drawn_with_the_estimate_s_correlation(known: list[tuple[Truth, Estimate]]) -> None:
@@ -217,7 +217,7 @@ def test_between_soft_and_hard_there_is_an_estimate_and_its_intervals_hold(seed:
 def test_a_method_that_disagrees_widens_the_interval(known: list[tuple[Truth, Estimate]]) -> None:
     fitted = replace(known[0][1], horizontal=Interval.normal(0.03, 3e-5), vertical=Interval.normal(0.02, 3e-5))
     told, zero, deviation = np.array([0.03003, 0.0204]), np.zeros(3), np.full(2, 4e-5)
-    bounced = Bounced(told, deviation, zero, zero, (-7.0, 0.1), (0.0, 0.1), zero, 0.2, 0.0, 0.0)
+    bounced = Bounced(told, deviation, zero, zero, (-7.0, 0.1), (0.0, 0.1), zero, 0.2, 0.0, 0.0, -np.inf)
     both = _with_bounced(fitted, bounced, 0)
     assert both.horizontal.deviation == pytest.approx(2.4e-5)
     assert both.horizontal.mean == pytest.approx(0.0300108)

@@ -245,10 +245,14 @@ def _searched(
     forces: ContactForces | None,
 ) -> tuple[Estimate, Guess]:
     """Estimate from the motion without a guess."""
-    bounced = compare(forward, unknowns, poses, period) if bounces(unknowns, poses) else None
+    narrow = bounces(unknowns, poses)
+    bounced = compare(forward, unknowns, poses, period) if narrow else None
     first = candidate(forward, unknowns, poses, period) if bounced is None else None
     if first is not None:
         penetration = unknowns.penetration_of(float(first.shared[SOFTNESS]))
+        if narrow and penetration > HARD:
+            # a head that is held to one side reaches as narrowly as a hard wall lets it
+            return _without_fit(unknowns, poses, lost, "the head reaches one place, and no hard wall is there"), ()
         if penetration < SURE:
             bounced = compare(forward, unknowns, poses, period)
         if bounced is None and penetration < HARD:
