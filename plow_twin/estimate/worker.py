@@ -7,8 +7,11 @@ became due while another one was computed gives way to a newer one.
 
 from __future__ import annotations
 
+import ctypes
 import os
+import platform
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -34,6 +37,8 @@ _HAND_ON_S: Final = 0.05
 _MOST_WAITING: Final = 1_000_000
 #: How much the far side gives way to all others (`nice`).
 _NICE: Final = 10
+#: The shortest slice that Linux gives, and the number of the call that asks for it.
+_SLICE_NS, _SCHED_SETATTR = 100_000, 314
 _STOP_S: Final = 5.0
 _ESTIMATE_ALONE: Final = Asked()
 
@@ -204,11 +209,20 @@ def take(windows: Windows, item: tuple[Any, ...]) -> Window | None:
     return None
 
 
+def _take_short_slices() -> None:
+    """Ask for slices of 0.1 ms: who is due gets its core at their end (Linux 6.12, x86-64; others give longer ones)."""
+    if platform.machine() == "x86_64" and sys.platform == "linux":
+        # struct sched_attr: size, policy, flags, nice, priority, runtime [ns], deadline, period
+        attributes = struct.pack("IIQiIQQQ", 48, os.SCHED_OTHER, 0, _NICE, 0, _SLICE_NS, 0, 0)
+        ctypes.CDLL(None).syscall(_SCHED_SETATTR, 0, attributes, 0)
+
+
 def main() -> None:
     """Run the far side; the argument is the descriptor of its end."""
     # Ctrl-C goes to the whole group: the near side decides when this one ends
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
+    _take_short_slices()
     try:
         serve(Connection(int(sys.argv[1])))
     except (EOFError, ConnectionError):
