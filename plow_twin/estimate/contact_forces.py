@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from plow_twin.errors import PlowTwinError
 from plow_twin.estimate.fit import Fit, Problem, Window, depth_of
 from plow_twin.estimate.forward import TOLERANCE, bodies
-from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.measurements import Poses, usable_rows
 from plow_twin.estimate.unknowns import BIAS, DELAY
 from plow_twin.model.contact import free_force
 from plow_twin.model.geometry import penetration_rows
@@ -75,11 +75,7 @@ class ContactForces:
             raise ContactForcesError(
                 f"contact forces: got t {times.shape} and force {rows.shape}, expected (n,) and (n, {PAIR_COUNT})"
             )
-        rows[~np.isfinite(rows)] = np.nan
-        absurd = (np.abs(rows) > _LARGEST).any(axis=1)
-        usable = np.flatnonzero(np.isfinite(times) & np.isfinite(rows).any(axis=1) & ~absurd)
-        _, first = np.unique(times[usable], return_index=True)
-        index = usable[first]
+        index = usable_rows(times, rows, _LARGEST)
         return ContactForces(times[index], rows[index]), len(times) - len(index)
 
     def between(self, start: float, end: float) -> ContactForces:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -505,8 +505,6 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         clearances.append(value.above(0.0))
         states.append(_state(suspect, observed))
     normal = [Interval.normal(value, spread) for value, spread in zip(shared, deviation, strict=True)]
-    gain_fx, gain_fy, gain_m = normal[GAIN]
-    bias_x, bias_y, bias_theta = normal[BIAS]
     result = Estimate(
         t_start=float(poses.t[0]),
         t_end=float(poses.t[-1]),
@@ -514,15 +512,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
         vertical=clearances[1],
         horizontal_state=states[0],
         vertical_state=states[1],
-        stiffness=_stiffness(unknowns, normal[SOFTNESS]),
-        damping=_damping(unknowns, normal[DAMPING]),
-        gain_fx=gain_fx,
-        gain_fy=gain_fy,
-        gain_m=gain_m,
-        bias_x=bias_x,
-        bias_y=bias_y,
-        bias_theta=bias_theta,
-        delay=normal[DELAY],
+        **_numbers(unknowns, normal),
         noise=(float(fit.noise[0]), float(fit.noise[1]), float(fit.noise[2])),
         model="suspect" if verdict.model else "ok",
         sensor="suspect" if verdict.sensor else "ok",
@@ -565,24 +555,31 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
     covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, told.shared) ** 2
     deviation = np.sqrt(np.diag(covariance))
     normal = [Interval.normal(value, spread) for value, spread in zip(told.shared, deviation, strict=True)]
-    gain_fx, gain_fy, gain_m = normal[GAIN]
-    bias_x, bias_y, bias_theta = normal[BIAS]
     known = State.ESTIMATED
     return replace(
         result,
         horizontal=normal[GX].above(0.0) if result.horizontal_state is known else result.horizontal,
         vertical=normal[GY].above(0.0) if result.vertical_state is known else result.vertical,
-        stiffness=_stiffness(problem.unknowns, normal[SOFTNESS]),
-        damping=_damping(problem.unknowns, normal[DAMPING]),
-        gain_fx=gain_fx,
-        gain_fy=gain_fy,
-        gain_m=gain_m,
-        bias_x=bias_x,
-        bias_y=bias_y,
-        bias_theta=bias_theta,
-        delay=normal[DELAY],
+        **_numbers(problem.unknowns, normal),
         correlation=_correlation(covariance),
     )
+
+
+def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
+    """Return what an estimate tells beside the clearances, by its names, from the intervals of the shared unknowns."""
+    gain_fx, gain_fy, gain_m = normal[GAIN]
+    bias_x, bias_y, bias_theta = normal[BIAS]
+    return {
+        "stiffness": _stiffness(unknowns, normal[SOFTNESS]),
+        "damping": _damping(unknowns, normal[DAMPING]),
+        "gain_fx": gain_fx,
+        "gain_fy": gain_fy,
+        "gain_m": gain_m,
+        "bias_x": bias_x,
+        "bias_y": bias_y,
+        "bias_theta": bias_theta,
+        "delay": normal[DELAY],
+    }
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import PlowTwinError
-from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.measurements import Poses, usable_rows
 from plow_twin.estimate.result import Interval
 from plow_twin.model.geometry import penetration_rows
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
@@ -69,11 +69,7 @@ class Gaps:
         times, rows = np.asarray(t, dtype=np.float64), np.array(gap, dtype=np.float64)
         if times.ndim != 1 or rows.shape != (len(times), PAIR_COUNT):
             raise GapsError(f"gaps: got t {times.shape} and gap {rows.shape}, expected (n,) and (n, {PAIR_COUNT})")
-        rows[~np.isfinite(rows)] = np.nan
-        absurd = (np.abs(rows) > _LARGEST).any(axis=1)
-        usable = np.flatnonzero(np.isfinite(times) & np.isfinite(rows).any(axis=1) & ~absurd)
-        _, first = np.unique(times[usable], return_index=True)
-        index = usable[first]
+        index = usable_rows(times, rows, _LARGEST)
         return Gaps(times[index], rows[index], deviation), len(times) - len(index)
 
     def between(self, start: float, end: float) -> Gaps:

@@ -345,3 +345,13 @@ def _in_order(times: Array, usable: Any) -> NDArray[np.int64]:
     _, first = np.unique(times[candidates], return_index=True)
     index: NDArray[np.int64] = candidates[first]
     return index
+
+
+def usable_rows(times: Array, rows: Array, largest: float) -> NDArray[np.int64]:
+    """Return which rows of numbers by pair can be used, in order of time; those without a number are blanked in place.
+
+    Left out are rows without a finite stamp or any number, with one beyond `largest`, or with a stamp that is there.
+    """
+    rows[~np.isfinite(rows)] = np.nan
+    absurd = (np.abs(rows) > largest).any(axis=1)
+    return _in_order(times, np.isfinite(rows).any(axis=1) & ~absurd)
