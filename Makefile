@@ -14,7 +14,7 @@ SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
 # three processes for two cores, each with whole files: some of them wait for nodes and viewers
-PARALLEL ?= -n 3 --dist loadfile
+PARALLEL ?= -n 3 --dist loadfile --max-worker-restart 0
 BENCH_ARGS ?=
 SITE ?= out/site
 COVERED ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_stream_*.py test/test_record_file.py)
@@ -32,7 +32,7 @@ test: $(INSTALLED)
 # other examples each time; a failure is had again by the seed that is printed: make stress SEED=...
 stress: $(INSTALLED)
 	@seed=$${SEED:-$$(od -An -N4 -tu4 /dev/urandom | tr -d " ")}; echo "SEED=$$seed"; \
-	"$(VENV)/bin/python" -m pytest -m stress --hypothesis-profile=stress --hypothesis-seed=$$seed $(PARALLEL) $(PYTEST_ARGS)
+	"$(VENV)/bin/python" -m pytest -m stress -o faulthandler_timeout=0 --hypothesis-profile=stress --hypothesis-seed=$$seed $(PARALLEL) $(PYTEST_ARGS)
 
 lint: $(INSTALLED)
 	"$(VENV)/bin/ruff" check .

@@ -23,7 +23,7 @@ EXTRAS = {
     "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9", "heyoka>=7", "filterpy>=2.0"],
     "docs": ["mkdocs>=1.6,<2", "mkdocstrings[python]>=0.26"],
     "test": [
-        "pytest>=8",
+        "pytest>=9",
         "pytest-cov",
         "pytest-timeout",
         "pytest-xdist",

@@ -173,15 +173,21 @@ def test_the_cross_section_moves_with_the_head(run: Run, view: tuple[ViewSummary
     assert max(arrows) >= 2 and len(arrows) == len(head)
 
 
-def test_what_does_not_fit_on_the_disk_is_said_and_no_half_of_it_stays(run: Run, tmp_path: Path) -> None:
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, before[1]))
-    try:
-        with pytest.raises(RecordingError, match=r"run\.rrd: cannot be written"):
-            to_rrd(run.file, tmp_path / "run.rrd")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert not (tmp_path / "run.rrd").exists()
+@pytest.mark.parametrize("follow", [(), ("--follow", "--wait", "0")])
+def test_what_does_not_fit_on_the_disk_is_said_and_no_half_of_it_stays(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str], follow: tuple[str, ...]
+) -> None:
+    out, before = tmp_path / "run.rrd", resource.getrlimit(resource.RLIMIT_FSIZE)
+    command = ["view", str(run.file), "--out", str(out), "--quiet", *follow]
+    assert cli(command) == 0  # its kernels are kept from now on
+    for room in (0, 1000, 10_000, out.stat().st_size // 2):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, before[1]))
+        try:
+            assert cli(command) == 1
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert not out.exists()
+        assert capsys.readouterr().err == f"plow-twin: {out}: cannot be written: File too large\n"
 
 
 def test_what_lies_along_the_face_what_was_measured_and_what_if(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,6 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, progress, quie
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
     from plow_twin.record.reader import FileStatus
-    from plow_twin.view.live import Sink
     from plow_twin.view.rrd import ViewSummary
 
 
@@ -160,25 +160,24 @@ def _follow(
     from plow_twin.cli.interruption import interruptible
     from plow_twin.record.running import find_run
     from plow_twin.view.live import follow
+    from plow_twin.view.rrd_file import RrdFile
     from plow_twin.view.viewer import start_viewer
 
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as opened:
         viewer = None if out is not None else start_viewer(web_port=web_port)
         if viewer is not None:
             opened.callback(viewer.close)
-        stopped = opened.enter_context(interruptible(opened.close if viewer is None else viewer.close))
+        stopped = opened.enter_context(interruptible(viewer.close if viewer is not None else lambda: None))
         run = find_run(recording, wait, stopped)
         if not quiet:
             click.echo(f"following {run}" + (f" on {viewer.page}" if viewer is not None and viewer.page else ""))
             sys.stdout.flush()
-        sink: Sink = (
-            (lambda stream, blueprint: stream.connect_grpc(viewer.url, default_blueprint=blueprint))
-            if viewer is not None
-            else (lambda stream, blueprint: stream.save(str(out), default_blueprint=blueprint))
-        )
-        summary = follow(run, sink, stopped, exaggerate=exaggerate, others=others)
+        show = partial(follow, run, exaggerate=exaggerate, others=others)
+        if viewer is not None:
+            summary = show(viewer.take, stopped)
+        elif out is not None:
+            with RrdFile(out) as file:
+                summary = show(file.take, lambda: stopped() or file.failed)
         code = _show(run, out or run, summary, quiet)
         sys.stdout.flush()
         while viewer is not None and viewer.process.poll() is None and not stopped():  # the run has ended: look on

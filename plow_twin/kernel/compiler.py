@@ -74,22 +74,22 @@ def kernel(
             linked = inline != "source" and not entry
             if linked:
                 keep_from_python(dispatcher)
-            _save_or_say(dispatcher, later=linked)
+            save_or_warn(dispatcher, later=linked)
         compiled: Callable[..., Any] = dispatcher
         return compiled
 
     return decorate
 
 
-def _save_or_say(dispatcher: Any, *, later: bool) -> None:
-    """Let a disk that does not take the cache be said, and no error: what is compiled works without it.
+def save_or_warn(dispatcher: Any, *, later: bool = False) -> None:
+    """Let a disk that does not take the cache be a warning, and no error: what is compiled works without it.
 
     `later` : written when LLVM is done with what goes into it.
     """
     cache = dispatcher._cache
     save = cache.save_overload
 
-    def save_or_warn(signature: Any, result: Any) -> None:
+    def attempt(signature: Any, result: Any) -> None:
         try:
             save(signature, result)
         except OSError as error:
@@ -100,9 +100,9 @@ def _save_or_say(dispatcher: Any, *, later: bool) -> None:
                 warnings.warn(text, RuntimeWarning, stacklevel=1)
 
     if later:
-        cache.save_overload = lambda signature, result: background.do(save_or_warn, signature, result)
+        cache.save_overload = lambda signature, result: background.do(attempt, signature, result)
     else:
-        cache.save_overload = save_or_warn
+        cache.save_overload = attempt
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
+from plow_twin.kernel.compiler import save_or_warn
 from plow_twin.record.cdr import encode
 from plow_twin.record.messages import Message
 from plow_twin.record.words import set_word, word
@@ -26,9 +27,14 @@ Indexes = NDArray[np.int64]
 STAMP_AT: Final = 4
 _SECOND_NS: Final = 1_000_000_000
 
-compiled: Final[Callable[[Callable[..., Any]], Callable[..., Any]]] = numba.njit(
-    cache=True, nogil=True, error_model="numpy"
-)
+
+def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function that works on bytes."""
+    dispatcher: Callable[..., Any] = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    if hasattr(dispatcher, "_cache"):  # else numba is told not to compile
+        save_or_warn(dispatcher)
+    return dispatcher
+
 
 
 @dataclass(frozen=True)

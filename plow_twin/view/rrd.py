@@ -9,11 +9,11 @@ from typing import Final
 
 import rerun as rr
 
-from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.view import layout
 from plow_twin.view.drawing import Drawing
+from plow_twin.view.rrd_file import RrdFile
 from plow_twin.view.section import Section
 
 #: A curve with more rows is thinned.
@@ -97,37 +97,27 @@ def to_rrd(
     scene = reader.header.scene(reader.path)
     wide = exaggerate or Section.of(scene).exaggeration()
     stream = rr.RecordingStream("plow_twin")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        stream.save(out, default_blueprint=layout.blueprint(Section.of(scene), wide, bool(others)))
-    except Exception as error:  # the SDK raises RuntimeError and OSError alike
-        raise RecordingError(f"{out}: cannot be written: {error}") from error
     duration_s = reader.duration_s()
-    drawing = Drawing(
-        stream,
-        reader.header,
-        scene,
-        reader.path,
-        section_hz=min(section_hz, max(1.0, 0.05 * most_rows / max(duration_s, 1e-9))),
-        exaggerate=wide,
-        span_ns=_span_ns(reader, duration_s, most_rows),
-        others=others,
-    )
-    for batch in reader.batches():
-        drawing.add(batch)
+    with RrdFile(out) as file:
+        file.take(stream, layout.blueprint(Section.of(scene), wide, bool(others)))
+        drawing = Drawing(
+            stream,
+            reader.header,
+            scene,
+            reader.path,
+            section_hz=min(section_hz, max(1.0, 0.05 * most_rows / max(duration_s, 1e-9))),
+            exaggerate=wide,
+            span_ns=_span_ns(reader, duration_s, most_rows),
+            others=others,
+        )
+        for batch in reader.batches():
+            drawing.add(batch)
+            file.check()
+            if on_progress is not None:
+                on_progress(reader.position)
+        drawing.finish(reader)
         if on_progress is not None:
-            on_progress(reader.position)
-    drawing.finish(reader)
-    if on_progress is not None:
-        on_progress(1.0)
-    try:
-        stream.flush()
-    except Exception as error:
-        stream.disconnect()
-        if out.is_file():  # cut off, and no device
-            out.unlink()
-        raise RecordingError(f"{out}: cannot be written: {error}") from error
-    stream.disconnect()
+            on_progress(1.0)
     return ViewSummary.of(out, drawing, reader)
 
 

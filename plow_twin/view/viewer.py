@@ -14,6 +14,9 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
+import rerun as rr
+import rerun.blueprint as rrb
+
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
@@ -45,6 +48,10 @@ class Viewer:
     process: subprocess.Popen[bytes]
     url: str
     page: str
+
+    def take(self, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+        """Show a stream in its arrangement."""
+        stream.connect_grpc(self.url, default_blueprint=blueprint)
 
     def close(self) -> None:
         """End it; one that is stopped too."""

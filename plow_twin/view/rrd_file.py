@@ -1,0 +1,91 @@
+"""A .rrd file whose bytes are written here: what does not fit on the disk is an error, and nothing waits for it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from threading import Thread
+from types import TracebackType
+from typing import Final, Self
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from plow_twin.errors import RecordingError
+
+#: What is copied at once [B]; a pipe holds less.
+_CHUNK: Final = 1 << 20
+
+
+class RrdFile:
+    """Receives a stream through a pipe and writes it to a file, which stays only if it is whole.
+
+    The SDK's own file sink (0.41) waits forever for a disk that is full: in `save`, `flush` or `disconnect`.
+
+    Parameters
+    ----------
+    path
+        The file to write, with its folder.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be opened; by `check` and at the end: it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("wb")
+        except OSError as error:
+            raise self._refused(error) from error
+        self._error: OSError | None = None
+        self._stream: rr.RecordingStream | None = None
+        self._outlet, self._inlet = os.pipe()
+        self._writer = Thread(target=self._write, name="rrd file", daemon=True)
+        self._writer.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._stream is not None:
+            self._stream.disconnect()
+        os.close(self._inlet)
+        self._writer.join()
+        if (error is not None or self.failed) and self.path.is_file():  # no device
+            self.path.unlink()
+        if error is None:
+            self.check()
+
+    def take(self, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+        """Receive a stream and its arrangement, all of it that comes before the end."""
+        self._stream = stream
+        stream.save(f"/dev/fd/{self._inlet}", default_blueprint=blueprint)
+
+    @property
+    def failed(self) -> bool:
+        """Whether something could not be written."""
+        return self._error is not None
+
+    def check(self) -> None:
+        """Raise RecordingError if something could not be written."""
+        if self._error is not None:
+            raise self._refused(self._error) from self._error
+
+    def _refused(self, error: OSError) -> RecordingError:
+        return RecordingError(f"{self.path}: cannot be written: {error.strerror}")
+
+    def _write(self) -> None:
+        with open(self._outlet, "rb", buffering=0) as outlet:
+            try:
+                with self._file:
+                    shutil.copyfileobj(outlet, self._file, _CHUNK)
+            except OSError as error:
+                self._error = error
+                while outlet.read(_CHUNK):  # else the stream waits
+                    pass
