@@ -14,7 +14,8 @@ SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
 # three processes for two cores, each with whole files: some of them wait for nodes and viewers
-PARALLEL ?= -n 3 --dist loadfile --max-worker-restart 0
+# a process that a test ended is not replaced: it would begin with that test again
+PARALLEL ?= -n 3 --dist loadfile --max-worker-restart=0
 BENCH_ARGS ?=
 SITE ?= out/site
 COVERED ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_stream_*.py test/test_record_file.py)

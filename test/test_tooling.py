@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 import runpy
 import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -60,6 +62,30 @@ def test_the_lowest_versions_are_those_that_setup_names(metadata: dict[str, Any]
         # `6` is the first release of 6, `1.26` the last patch of 1.26
         assert lowest[name].removesuffix(".*").split(".")[: len(version.split("."))] == version.split("."), name
     assert "1.26" in lowest["numpy"]
+
+
+#: Holds the interpreter's lock: no signal's handler runs, and no thread.
+HANGING = """
+import ctypes
+
+def test_before():
+    pass
+
+def test_that_hangs():
+    ctypes.PyDLL(None).sleep(100)
+"""
+
+
+def test_a_test_that_hangs_is_named_and_ends_the_run(tmp_path: Path) -> None:
+    (tmp_path / "test_hanging.py").write_text(HANGING)
+    options = f"-n 1 -p no:cacheprovider -c {ROOT}/pyproject.toml --rootdir={tmp_path} {tmp_path}"
+    options += " -o faulthandler_timeout=1"
+    venv = Path(sys.prefix)
+    command = ["make", f"--old-file={venv}/.installed", "test", f"VENV={venv}", f"PYTEST_ARGS={options}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode != 0 and "1 failed, 1 passed" in done.stdout
+    assert re.search("crashed while running '.*test_that_hangs'", done.stdout)
+    assert "in test_that_hangs" in done.stderr  # where it stands
 
 
 def test_ci_is_bounded_and_runs_every_check() -> None:
