@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from contextlib import chdir, redirect_stderr, redirect_stdout
+from collections.abc import Iterator, Sequence
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
 from pathlib import Path
+from typing import Any
 
 from plow_twin.cli.app import run
 
@@ -15,6 +17,17 @@ def plow_twin(*arguments: str | Path, cwd: Path | None = None) -> subprocess.Com
     """Run a command as a program."""
     command = [sys.executable, "-m", "plow_twin", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=110, stdin=subprocess.DEVNULL)
+
+
+@contextmanager
+def started(command: Sequence[str], **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """Run a program beside the test; it has ended by itself or is killed, for `Popen` alone would wait for ever."""
+    with subprocess.Popen(command, text=True, **options) as process:
+        try:
+            yield process
+            process.wait(60)
+        finally:
+            process.kill()
 
 
 def plow_twin_here(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import sys
 import textwrap
 import threading
 from pathlib import Path
 
 import pytest
+from commands import started
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 
 from plow_twin.errors import RecordingError
@@ -66,7 +66,7 @@ WRITER = """
 
 def test_a_follower_ends_when_the_writer_is_killed(tmp_path: Path) -> None:
     command = [sys.executable, "-c", textwrap.dedent(WRITER), str(tmp_path / "run"), str(Path(__file__).parent)]
-    with subprocess.Popen(command) as process:
+    with started(command) as process:
         reader = RunReader(find_run(tmp_path / "run", 60.0), Tail())
         samples = 0
         for batch in reader.batches():

@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from commands import started
 from record_support import BASE_NS, STEP_NS, paper_sample
 
 from plow_twin.errors import RecordingError
@@ -115,7 +116,7 @@ def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, lo
     )
     writer = writer.replace("int(sys.argv[2]), int(sys.argv[3])", "0, 10**9")
     command = [sys.executable, "-c", textwrap.dedent(FORKS) + writer]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+    with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stdout is not None
         for folder in folders:
             process.stdin.write(f"{folder} {flush_s}\n")
@@ -463,7 +464,7 @@ def test_with_sync_what_was_flushed_survives_a_loss_of_power(tmp_path: Path) -> 
     file = folder / "run_0.mcap"
     synced: list[tuple[str, int]] = []
     index, before, flushes = -1, -1, 0
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with started(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         for line in process.stdout:
             what, *rest = line.split()

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from commands import started
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -82,13 +83,10 @@ def test_other_topics_come_into_the_run_s_folder_with_their_types(tmp_path: Path
 
 def test_a_topic_that_was_named_and_never_had_a_publisher_is_said_and_is_no_success(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "plow_twin", "record", str(tmp_path / "run"), "never", "--wait", "0"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as recorder:
+    with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as recorder:
         assert recorder.stderr is not None
-        try:
-            assert "recording to" in recorder.stderr.readline()
-            recorder.send_signal(signal.SIGTERM)
-            said = recorder.stderr.read()
-        finally:
-            recorder.kill()
+        assert "recording to" in recorder.stderr.readline()
+        recorder.send_signal(signal.SIGTERM)
+        said = recorder.stderr.read()
     assert "/never: not recorded: no publisher, expected one" in said
     assert recorder.returncode == 3

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import started
 from scenes import preset
 
 from plow_twin import (
@@ -214,7 +215,7 @@ print(json.dumps(told))
 
 
 def test_a_process_that_gets_sigint_returns_within_a_slice_of_work() -> None:
-    with subprocess.Popen([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE, text=True) as process:
+    with started([sys.executable, "-c", INTERRUPTED], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == "under way\n"
         process.send_signal(signal.SIGINT)
         told = json.loads(process.communicate(timeout=60)[0])
@@ -245,9 +246,8 @@ sys.exit(run(["simulate", "paper", "--t-end", "1e7", "--output-dt", "1e3", "--js
 
 def test_the_command_that_gets_sigint_writes_what_has_been_computed(tmp_path: Path) -> None:
     out = tmp_path / "part.npz"
-    with subprocess.Popen(
-        [sys.executable, "-c", COMMAND, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+    command = [sys.executable, "-c", COMMAND, str(out)]
+    with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stderr is not None and process.stderr.readline() == "under way\n"
         time.sleep(0.1)
         process.send_signal(signal.SIGINT)

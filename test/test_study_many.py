@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import started
 from pyarrow import parquet
 from record_support import paper_sample, record_run
 
@@ -64,7 +65,7 @@ def is_running(pid: str) -> bool:
 def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "plow_twin", "analyse", str(runs), "--scene", "paper", "--out", str(out)]
-    with subprocess.Popen([*command, "--workers", "2", "--json"], stdout=subprocess.PIPE, text=True) as process:
+    with started([*command, "--workers", "2", "--json"], stdout=subprocess.PIPE) as process:
         deadline = time.monotonic() + 120
         while not list(out.glob("*/asked.json")) and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -92,7 +93,7 @@ def test_an_interrupt_ends_the_call_and_its_workers_at_once(number: signal.Signa
         (tmp_path / "runs" / f"r{run}" / "load.csv").write_text("t,fx,fy,m\n" + "\n".join(rows))
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "runs"), "--scene", "paper"]
     command += ["--out", str(tmp_path / "out"), "--workers", "2"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+    with started(command, stderr=subprocess.PIPE, start_new_session=True) as process:
         while len(list(tmp_path.glob("out/*/run/run_0.mcap"))) < 2:
             assert process.poll() is None
             time.sleep(0.05)
@@ -159,7 +160,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
         (out / name).write_text("{}")
     command = [sys.executable, "-m", "plow_twin", "analyse", str(tmp_path / "run"), "--watch", "0.1", "--json"]
     command += ["--out", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with started(command, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         first = json.loads(process.stdout.readline())
         reported.set()
