@@ -13,8 +13,8 @@ INSTALLED := $(VENV)/.installed
 SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
-# three processes for two cores, each with whole files: some of them wait for nodes and viewers
-# a process that a test ended is not replaced: it would begin with that test again
+# three processes for two cores, each with whole files: some of them wait for nodes and viewers; one that a test has ended
+# is not replaced, for the next one would begin with that test again
 PARALLEL ?= -n 3 --dist loadfile --max-worker-restart=0
 BENCH_ARGS ?=
 SITE ?= out/site
