@@ -9,15 +9,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from commands import plow_twin_here
 from record_support import paper_sample, record_run
 from rich.console import Console
 
+from plow_twin.cli import analyse as analyse_verb
+from plow_twin.cli import doctor as doctor_verb
+from plow_twin.cli import estimate as estimate_verb
 from plow_twin.cli import info as info_verb
 from plow_twin.cli import replay as replay_verb
 from plow_twin.cli import simulate as simulate_verb
 from plow_twin.cli import study_paper as paper_verb
 from plow_twin.cli.app import run
 from plow_twin.cli.console import progress
+from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.journal import Pose
 from plow_twin.study.paper.rows import Row, Verdict
 
 WIDTH = 80
@@ -26,7 +34,7 @@ WIDTH = 80
 @pytest.fixture
 def printed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     text = io.StringIO()
-    for module in (info_verb, replay_verb, simulate_verb, paper_verb):
+    for module in (analyse_verb, doctor_verb, estimate_verb, info_verb, replay_verb, simulate_verb, paper_verb):
         monkeypatch.setattr(module, "output_console", lambda: Console(file=text, width=WIDTH))
 
     def lines(*arguments: object, code: int = 0) -> list[str]:
@@ -59,13 +67,45 @@ def test_the_statistics_of_a_run_stand_in_one_line_each(printed: Callable[..., l
 
 def test_a_recording_and_its_replay_are_shown_as_words(printed: Callable[..., list[str]], tmp_path: Path) -> None:
     made = record_run(tmp_path / "run", map(paper_sample, range(50)))
-    lines = printed("info", made.folder) + printed("replay", made.folder)
+    lines = printed("info", made.folder) + printed("replay", made.folder) + printed("doctor", made.folder)
     text = "\n".join(lines)
     assert not re.search(r"[{}\[\]']", text.replace(str(tmp_path), "")) and "None" not in text
     for line in ("messages", "build", "messages_compared", "  contact_forces         50", "lost                     -"):
         assert line in lines
     long = [line for line in lines if len(line) > WIDTH]
     assert all(str(tmp_path) in line for line in long)  # what is copied stays in one piece
+
+
+def test_numbers_that_are_estimated_or_compared_have_their_units_and_are_whole(
+    printed: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    entries = [
+        entry
+        for index in range(200)
+        for entry in (paper_sample(index), Pose(paper_sample(index).stamp_ns, (0.0, 0.0, 0.0)))
+    ]
+    lines = printed("analyse", record_run(tmp_path / "run", entries).folder)
+    for head in ("lag [s]", "x [m]", "theta [rad]"):
+        assert any(head in line for line in lines)
+
+    scene = load_scene(scene_path("paper"))
+    small = Interval(-5.300854e-06, -4.592612e-05, 3.532441e-05)
+    found = Estimate(
+        *(0.0, 13.99, Interval(0.025, 0.0249, 0.0251), Interval(0.03, 0.0299, 0.0301)),
+        *(State.NOT_OBSERVABLE, State.WITHDRAWN, Interval(9.695005e10, 9.6750615e10, 9.714991e10)),
+        *(Interval(0.72597344, 0.71644036, 0.73563338), small, small, small, small, small, small, small),
+        groups={"horizontal_bottom": (small, State.NOT_OBSERVABLE)},
+    )
+    estimate_verb._show(found, scene)
+    lines = printed()
+    assert max(map(len, lines)) <= WIDTH and not any("…" in line for line in lines)
+    for head in ("stiffness [MN/m^n]", "damping [s/m]", "horizontal, bottom [mm]"):
+        assert any(head in line for line in lines)
+
+
+def test_no_verb_s_summary_is_cut() -> None:
+    for arguments in (["--help"], ["study", "--help"]):
+        assert "..." not in plow_twin_here(*arguments).stdout.replace("[ARGS]...", "")
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -449,7 +449,7 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
     assert lines[-1] == "recording: 1 missing parts" and sum("are not there after this" in line for line in lines) == 1
     figures = kept_figures(monkeypatch)
     assert cli(["view", str(run.folder), "--png", str(tmp_path / "run.png")]) == 3
-    assert "lost {'missing_parts': 1}" in capsys.readouterr().err
+    assert "lost missing_parts: 1" in capsys.readouterr().err
     for axis in figures[0].axes[2:]:
         for line in axis.lines:
             times = np.asarray(line.get_xdata(), float)

@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
 
 from plow_twin.cli.console import (
     DONE,
     DONE_WITH_LOSS,
     FAILED,
     POSITIVE,
+    counts,
     json_option,
     output_console,
     progress,
@@ -24,7 +26,10 @@ from plow_twin.cli.console import (
 )
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.")
+@click.command(
+    short_help="Compare recordings with what the model predicts.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
+)
 @click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path), nargs=-1, required=True)
 @click.option("--scene", help="Scene file or preset; needed for a recording that is no run of ours.")
 @click.option(
@@ -164,12 +169,16 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
     return {**found.facts(), "lossy": found.lossy}
 
 
+def _unit(signal: str) -> str:
+    return "N" if signal.startswith("force_") else "rad" if signal == "theta" else "m"
+
+
 def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool, left_out: Sequence[str] = ()) -> None:
     for facts in results:
         if "error" in facts:
             click.echo(f"plow-twin: {facts['error']}", err=True)
         elif facts["lost"]:
-            click.echo(f"plow-twin: {facts['run']}: lost {facts['lost']}", err=True)
+            click.echo(f"plow-twin: {facts['run']}: lost {counts(facts['lost'])}", err=True)
     if as_json:
         facts = {"runs": results, "left_out": left_out} if many else results[0]
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
@@ -185,7 +194,11 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         )
         for name, signal in facts["signals"].items():
             numbers = (signal[key] for key in ("bias", "rms", "correlation", "lag_s"))
-            shown.add_row(name, str(signal["n"]), *("" if value is None else f"{value:.4g}" for value in numbers))
+            shown.add_row(
+                escape(f"{name} [{_unit(name)}]"),
+                str(signal["n"]),
+                *("" if value is None else f"{value:.4g}" for value in numbers),
+            )
         console.print(shown)
         if "stretches" in facts:
             left = ", ".join(f"{name} {count}" for name, count in facts["not_compared"].items()) or "none"

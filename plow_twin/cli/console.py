@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import click
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     Progress,
@@ -130,17 +131,17 @@ def busy(title: str, quiet: bool) -> Iterator[None]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return a table whose first column is text and whose others are numbers."""
-    result = Table(title=title, title_justify="left")
+    """Return a table whose first column is text and whose others are numbers; a unit in brackets is no markup."""
+    result = Table(title=escape(title), title_justify="left")
     for index, name in enumerate(columns):
-        result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
+        result.add_column(escape(name), justify="left" if index == 0 else "right", no_wrap=index == 0)
     return result
 
 
-def show_facts(console: Console, facts: Mapping[str, Any], indent: int = 0) -> None:
+def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
     """Print one fact a line, those of a mapping indented below its name; long texts stay in one piece."""
     for key, value in facts.items():
-        name = " " * indent + key
+        name = " " * indent + str(key)
         if isinstance(value, Mapping) and value:
             console.print(name, highlight=False)
             show_facts(console, value, indent + 2)
@@ -151,9 +152,16 @@ def show_facts(console: Console, facts: Mapping[str, Any], indent: int = 0) -> N
 def _plain(value: Any) -> str:
     if value is None or (isinstance(value, Mapping | Sequence) and len(value) == 0):
         return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+
+
+def counts(found: Mapping[str, int]) -> str:
+    """Return counts under their names as text."""
+    return ", ".join(f"{name}: {count}" for name, count in found.items())
 
 
 def kilonewton(force_n: float) -> str:

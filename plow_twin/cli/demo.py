@@ -9,7 +9,10 @@ import click
 from plow_twin.cli.console import POSITIVE, quiet_option
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with counted loss.")
+@click.command(
+    short_help="Run publisher, node and recorder for some seconds.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with counted loss.",
+)
 @click.option(
     "--speed",
     type=click.Choice(["real", "fast"]),

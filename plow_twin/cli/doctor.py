@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts
 
 
 @click.command(
-    epilog="Exit codes: 0 nothing is missing, 1 failed or no recording, 2 wrong usage, 3 something is missing."
+    short_help="Say what a recording holds and lacks; repair it.",
+    epilog="Exit codes: 0 nothing is missing, 1 failed or no recording, 2 wrong usage, 3 something is missing.",
 )
 @click.argument("recording", type=click.Path(path_type=Path, exists=True))
 @click.option("--repair", is_flag=True, help="Rewrite parts that were cut off or damaged; the old ones are kept.")
@@ -30,8 +32,16 @@ def doctor(recording: Path, repair: bool, as_json: bool) -> int:
     if as_json:
         click.echo(json.dumps(facts, indent=2))
     else:
-        console = output_console()
-        for key, value in facts.items():
-            for line in value if isinstance(value, list) and value else [value]:
-                console.print(f"{key:18} {line}", highlight=False, soft_wrap=True)
+        show_facts(output_console(), _shown(facts))
     return DONE_WITH_LOSS if before.problems else DONE
+
+
+def _shown(facts: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts as they are shown: the parts by name, each problem in a line of its own."""
+    parts = {part["file"]: {key: value for key, value in part.items() if key != "file"} for part in facts["parts"]}
+    problems: dict[str, Any] = {
+        key: dict(enumerate(facts[key], 1)) if facts[key] else None
+        for key in ("problems", "problems_before")
+        if key in facts
+    }
+    return {**facts, **problems, "parts": parts}

@@ -10,8 +10,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from rich.markup import escape
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, FAILED, busy, json_option, output_console, quiet_option, table
+from plow_twin.cli.console import (
+    DONE,
+    DONE_WITH_LOSS,
+    FAILED,
+    busy,
+    counts,
+    json_option,
+    output_console,
+    quiet_option,
+    table,
+)
+from plow_twin.cli.scene_facts import damping_unit
 
 if TYPE_CHECKING:
     from plow_twin.estimate.forces import Forces
@@ -21,8 +33,9 @@ if TYPE_CHECKING:
 
 
 @click.command(
+    short_help="Estimate clearances and contact from measured motion.",
     epilog="Exit codes: 0 done, also where an estimate is withdrawn; 1 failed; 2 wrong usage or scene; 3 done with "
-    "counted loss."
+    "counted loss.",
 )
 @click.argument("source", metavar="INPUT", type=click.Path(path_type=Path, exists=True))
 @click.option("--scene", type=click.Path(path_type=Path), help="Nominal scene, a file or a preset; INPUT's by default.")
@@ -90,14 +103,16 @@ def estimate(
     if as_json:
         click.echo(text)
     elif not quiet:
-        _show(result)
+        _show(result, task.scene)
+        if "live" in more:
+            _show_live(more["live"])
         if forces is not None:
             _show_forces(forces)
     if more.get("live", {}).get("repeated") is False:
         click.echo("the journal gives another estimate than the node published", err=True)
         return FAILED
     if more["losses"]:
-        click.echo(f"plow-twin: {source}: lost {more['losses']}", err=True)
+        click.echo(f"plow-twin: {source}: lost {counts(more['losses'])}", err=True)
     return DONE_WITH_LOSS if result.lost or more["losses"] else DONE
 
 
@@ -182,26 +197,42 @@ def _show_forces(forces: Forces) -> None:
     output_console().print(view)
 
 
-def _show(result: Estimate) -> None:
+def _show_live(live: dict[str, Any]) -> None:
+    """Say which estimate this is: its own times count from the window's first sample."""
+    same = "the same bit for bit" if live["repeated"] else "not the same"
+    window = f"{1e-9 * live['start_ns']:.3f} s to {1e-9 * live['end_ns']:.3f} s"
+    text = (
+        f"the newest of the node's {live['estimates']} estimates computed again, {same}; its window by stamp: {window}"
+    )
+    output_console().print(text, highlight=False, soft_wrap=True)
+
+
+def _show(result: Estimate, scene: Scene) -> None:
+    damping = "restitution [1]" if scene.contact.damping is None else f"damping [{damping_unit(scene)}]"
     rows: list[tuple[str, Interval | None, float, str, str]] = [
-        ("horizontal clearance", result.horizontal, 1e3, "mm", result.horizontal_state.value),
-        ("vertical clearance", result.vertical, 1e3, "mm", result.vertical_state.value),
-        ("stiffness", result.stiffness, 1.0, "N/m^n", ""),
-        ("damping", result.damping, 1.0, "", ""),
-        ("load gain fx", result.gain_fx, 1.0, "", ""),
-        ("load gain fy", result.gain_fy, 1.0, "", ""),
-        ("load gain m", result.gain_m, 1.0, "", ""),
-        ("bias x", result.bias_x, 1e3, "mm", ""),
-        ("bias y", result.bias_y, 1e3, "mm", ""),
-        ("bias theta", result.bias_theta, 1e3, "mrad", ""),
-        ("delay", result.delay, 1e3, "ms", ""),
+        ("horizontal clearance [mm]", result.horizontal, 1e3, ".3f", result.horizontal_state.value),
+        ("vertical clearance [mm]", result.vertical, 1e3, ".3f", result.vertical_state.value),
+        ("stiffness [MN/m^n]", result.stiffness, 1e-6, ".5g", ""),
+        (damping, result.damping, 1.0, ".5g", ""),
+        ("load gain fx [1]", result.gain_fx, 1.0, ".4f", ""),
+        ("load gain fy [1]", result.gain_fy, 1.0, ".4f", ""),
+        ("load gain m [1]", result.gain_m, 1.0, ".4f", ""),
+        ("bias x [mm]", result.bias_x, 1e3, ".3f", ""),
+        ("bias y [mm]", result.bias_y, 1e3, ".3f", ""),
+        ("bias theta [mrad]", result.bias_theta, 1e3, ".3f", ""),
+        ("delay [ms]", result.delay, 1e3, ".3f", ""),
     ]
-    rows += [(name.replace("_", ", "), value, 1e3, "mm", state.value) for name, (value, state) in result.groups.items()]
-    view = table(f"Estimate from {result.t_start:.2f} s to {result.t_end:.2f} s", "", "mean", "5 %", "95 %", "", "")
-    for name, value, factor, unit, state in rows:
+    rows += [
+        (f"{name.replace('_', ', ')} [mm]", value, 1e3, ".3f", state.value)
+        for name, (value, state) in result.groups.items()
+    ]
+    view = table(
+        f"Estimate of the window from {result.t_start:.2f} s to {result.t_end:.2f} s", "", "mean", "5 %", "95 %", ""
+    )
+    for name, value, factor, form, state in rows:
         if value is not None:
-            numbers: list[Any] = [f"{factor * number:.5g}" for number in (value.mean, value.p05, value.p95)]
-            view.add_row(name, *numbers, unit, state)
+            numbers = (format(factor * number, form) for number in (value.mean, value.p05, value.p95))
+            view.add_row(escape(name), *numbers, state)
     console = output_console()
     console.print(view)
     console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, busy, json_option, output_console, quiet_option, table
+from plow_twin.cli.console import (
+    DONE,
+    DONE_WITH_LOSS,
+    POSITIVE,
+    busy,
+    counts,
+    json_option,
+    output_console,
+    quiet_option,
+    table,
+)
 from plow_twin.scene_file.presets import scene_path
 
 if TYPE_CHECKING:
@@ -18,8 +28,9 @@ if TYPE_CHECKING:
 
 
 @click.command(
+    short_help="Forecast when a clearance reaches its limit.",
     epilog="Exit codes: 0 done, also where the limit is not reached; 1 failed; 2 wrong usage or scene; 3 done, but "
-    "something of the run is missing."
+    "something of the run is missing.",
 )
 @click.argument("scene")
 @click.option("--limit-horizontal", metavar="MM", type=POSITIVE, required=True, help="Limit of the clearance [mm].")
@@ -81,7 +92,9 @@ def forecast(
         raise click.UsageError(f"--stop: got {stop:g} h, expected at most the horizon, --horizon {horizon:g}")
     model, facts_now, lost = _scene(scene)
     if model.wear is None or model.wear.travel_speed_m_s <= 0.0:
-        raise click.UsageError(f"{scene}: wear: got none or no travel speed, expected both")
+        raise click.UsageError(
+            f"{scene}: wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0"
+        )
     if estimated is not None:
         facts_now = _estimate(estimated)
     limits = 1e-3 * limit_horizontal, 1e-3 * limit_vertical
@@ -111,7 +124,7 @@ def forecast(
         draw_forecast(found, plot)
     facts["lost"] = lost
     if lost:
-        click.echo(f"plow-twin: {scene}: lost {lost}: there may be a newer estimate", err=True)
+        click.echo(f"plow-twin: {scene}: lost {counts(lost)}; there may be a newer estimate", err=True)
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:

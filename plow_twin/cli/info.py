@@ -19,7 +19,10 @@ from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_cons
 from plow_twin.scene_file.presets import PRESETS
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 a recording with loss.")
+@click.command(
+    short_help="Describe a scene, a recording or this installation.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 a recording with loss.",
+)
 @click.argument("target", required=False)
 @click.option("--unused", is_flag=True, help="Of a recording: each message that came and was not used, one a line.")
 @json_option

@@ -35,7 +35,10 @@ _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.")
+@click.command(
+    short_help="Run the twin on CSV files, standard input or MQTT.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
+)
 @click.argument("source")
 @click.option("--scene", help="Scene file or preset; else the parameter scene.")
 @click.option("--map", "mapping", type=_FILE, help="YAML that says where load, travel and pose stand, with units.")

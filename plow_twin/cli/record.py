@@ -20,7 +20,10 @@ from plow_twin.cli.console import (
 )
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with loss or without a named topic.")
+@click.command(
+    short_help="Record other topics beside a run.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done with loss or without a named topic.",
+)
 @click.argument("run", type=click.Path(path_type=Path, file_okay=False))
 @click.argument("topics", metavar="[TOPIC]...", nargs=-1)
 @click.option("--all", "every", is_flag=True, help="All topics but hidden ones and those that the run holds itself.")

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    epilog="Exit codes: 0 the same, bit for bit; 1 diverged or failed; 2 wrong usage; 3 the same, with counted loss."
+    short_help="Compute a recording again and compare it bit for bit.",
+    epilog="Exit codes: 0 the same, bit for bit; 1 diverged or failed; 2 wrong usage; 3 the same, with counted loss.",
 )
 @click.argument("recording", type=click.Path(path_type=Path, exists=True))
 @click.option("--digests-only", is_flag=True, help="Compare the digests of the state alone.")

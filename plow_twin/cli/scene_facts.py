@@ -32,6 +32,8 @@ def _numbers_of(part: Any, path: str, scene: Scene) -> Iterator[Fact]:
         if "unit" not in spec.metadata or value is None:
             continue
         key, unit = f"{path}.{spec.name}", spec.metadata["unit"]
+        if key == "contact.damping":
+            unit = damping_unit(scene)
         units = [text.strip() for text in unit.split(",")]
         if not isinstance(value, tuple):
             yield _row(key, value, unit, scene, (key,))
@@ -39,6 +41,11 @@ def _numbers_of(part: Any, path: str, scene: Scene) -> Iterator[Fact]:
         for index, item in enumerate(value):
             place = f"{key}[{index}]"
             yield _row(place, item, units[index] if len(units) > 1 else unit, scene, (place, key))
+
+
+def damping_unit(scene: Scene) -> str:
+    """Return the unit of `contact.damping`, which is C of an additive law and lambda of the others."""
+    return "N s/m" if LAWS[scene.contact.law].additive else "s/m"
 
 
 def _row(key: str, value: float, unit: str, scene: Scene, paths: tuple[str, ...]) -> Fact:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MOST_ROWS: Final = 10_000_000
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene.")
+@click.command(short_help="Simulate a scene.", epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene.")
 @click.argument("scene")
 @click.option("--t-end", metavar="T", type=POSITIVE, required=True, help="Time to simulate [s].")
 @click.option(
@@ -45,10 +45,10 @@ MOST_ROWS: Final = 10_000_000
     "--audit",
     "energy_balance",
     is_flag=True,
-    help="Balance energy and momentum; costs about as much as the run.",
+    help="Balance energy and momentum; takes some four times as long.",
 )
 @click.option(
-    "--trust", is_flag=True, help="Say how errors grow and what the tolerance is worth; costs some ten times the run."
+    "--trust", is_flag=True, help="Say how errors grow and what the tolerance is worth; takes some ten times as long."
 )
 @click.option("--max-steps", type=click.IntRange(min=1), default=10**8, show_default=True, help="Steps at most.")
 @click.option(

@@ -9,7 +9,10 @@ from plow_twin.cli.study_paper import paper
 from plow_twin.cli.study_sweep import sweep
 
 
-@click.group(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.")
+@click.group(
+    short_help="Sweeps, calibration and the paper: what takes many runs.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
+)
 def study() -> None:
     """Ask questions that take many runs: sweeps, calibration, the paper."""
 

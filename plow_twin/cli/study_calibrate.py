@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from plow_twin.study.calibration.unknowns import Space
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, scene or targets.")
+@click.command(
+    short_help="Fit unknowns to published figures or a recorded motion.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, scene or targets.",
+)
 @click.argument("scene")
 @click.option(
     "--unknown",

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 _STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but single runs failed.")
+@click.command(
+    short_help="Compute the paper's figures and numbers again.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but single runs failed.",
+)
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),

@@ -30,7 +30,8 @@ _COLUMN, _FIRST_COLUMN = 12, 8
 
 
 @click.command(
-    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but some members failed (they are listed)."
+    short_help="Sweep one or two parameters of a scene.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done, but some members failed (they are listed).",
 )
 @click.argument("scene")
 @click.option("--x", "first", required=True, metavar="AXIS", help="PATH=LOW:HIGH:COUNT[:log] or PATH=VALUE,VALUE..")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, progress, quiet_option
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, counts, progress, quiet_option
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 _MOST_EXAGGERATED = 1e4
 
 
-@click.command(epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but parts of the recording are missing.")
+@click.command(
+    short_help="Draw a recording for rerun, or as a picture.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, but parts of the recording are missing.",
+)
 @click.argument("recording", type=click.Path(path_type=Path))
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), help="The .rrd file; by default beside the .mcap."
@@ -130,7 +133,7 @@ def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int]) -> 
     if not whole:
         click.echo(f"plow-twin: {recording}: {status.value}", err=True)
     if lost:
-        click.echo(f"plow-twin: {recording}: lost {dict(lost)}", err=True)
+        click.echo(f"plow-twin: {recording}: lost {counts(lost)}", err=True)
     return not whole or bool(lost)
 
 

@@ -208,7 +208,7 @@ def _forecast(
     """Forecast for a wear coefficient that is a multiple of what is known of it."""
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
-        raise LifeError("wear: got none or no travel speed, expected both")
+        raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
     if not all(0.0 <= value < math.inf for value in deviation_m):
         raise LifeError(f"deviations: got {deviation_m} m, expected two finite ones >= 0")
     if known is None:

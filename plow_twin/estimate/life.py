@@ -130,7 +130,7 @@ def _trace(scene: Scene, period: float) -> float:
     """Return a wear coefficient in m^2/N that leaves the walls where they are: `_TRACE_M` deep under the weight."""
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
-        raise LifeError("wear: got none or no travel speed, expected both")
+        raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
     impulse = scene.head.mass_kg * 10.0 * (SETTLE_PERIODS + MEAN_PERIODS) * period
     return _TRACE_M * wear.pad_area_m2 / (wear.travel_speed_m_s * impulse)
 

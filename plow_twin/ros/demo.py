@@ -98,7 +98,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
         return FAILED
     lost = _losses(watch, sent, summary)
     if not quiet:
-        _print(Console(), watch, summary, sent, lost)
+        _print(Console(), watch, summary, sent, lost, fast=speed == "fast")
         _print_places(Console(), folder / "run", view)
     return DONE_WITH_LOSS if any(lost.values()) else DONE
 
@@ -299,14 +299,14 @@ def _losses(watch: Watch, sent: int, summary: RunSummary) -> dict[str, int]:
     }
 
 
-def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost: dict[str, int]) -> None:
+def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost: dict[str, int], *, fast: bool) -> None:
     console.print(_force_table(summary))
     for sense, shares in summary.contact_sets.items():
         sets = "  ".join(f"{corners} {share:.1%}" for corners, share in shares.items() if share >= 0.001)
         console.print(f"contact sets {sense}: {sets or 'none'}", highlight=False, soft_wrap=True)
     _print_clearances(console, summary)
     wear = (
-        "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e9:.3f} nm, deepest pad"
+        "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e6:.3f} um, deepest pad"
     )
     console.print(f"wear {wear}", highlight=False)
     used, out = watch.text("input", "samples_used"), watch.text("output", "published")
@@ -316,7 +316,8 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
             console.print(f"  {name}: {count}", style="red", highlight=False)
     factor = watch.text("state", "real_time_factor_mean")
     p50, p99 = watch.text("output", "latency_p50_ms"), watch.text("output", "latency_p99_ms")
-    console.print(f"real-time factor {factor}; latency p50 {p50} ms, p99 {p99} ms", highlight=False)
+    waiting = ", most of it in the queue: samples come as fast as they are used" if fast else ""
+    console.print(f"real-time factor {factor}; latency p50 {p50} ms, p99 {p99} ms{waiting}", highlight=False)
 
 
 def _print_clearances(console: Console, summary: RunSummary) -> None:
