@@ -106,8 +106,8 @@ def one_life(seed: int) -> list[dict[str, Any]]:
 def summary(rows: list[dict[str, Any]]) -> str:
     """Return the table of the page."""
     lines = [
-        f"| share of the life | lives | within {100 * ALPHA:.0f} % | 80 % interval holds | its width | "
-        "90 % interval holds | its width | CRPS / life | coefficient within 1.3 |",
+        f"| share of the life | lives | within {100 * ALPHA:.0f} % | 80 % interval holds | its width / "
+        "time left | 90 % interval holds | its width / time left | CRPS / life | coefficient within 1.3 |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for share in SHARES:

@@ -1,4 +1,4 @@
-"""A year of a head, from new skids to the limit: the clearance estimated month by month, the forecast narrowing.
+"""A year of a head, from new pads to the limit: the clearance estimated month by month, the forecast narrowing.
 
 The head's sensor is synthetic: its poses are those of the simulated machine, with noise, bias and delay.
 """

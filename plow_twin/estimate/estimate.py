@@ -116,7 +116,7 @@ def estimate(
     Parameters
     ----------
     scene : Scene
-        The nominal scene: its clearances and contact numbers are priors only; geometry, masses and gravity hold.
+        The nominal scene: its clearances and contact parameters are priors only; geometry, masses and gravity hold.
     load : Load
         The load believed.
     poses : Poses

@@ -1,8 +1,8 @@
 """Contact forces with intervals: full twins drawn from an estimate, advanced together under the load believed.
 
-Each member has clearances, contact numbers and load gains of its own, drawn from the estimate with their correlation,
-and each follows every sample of the load; the quantiles over the members are the interval. After some load periods the
-members have forgotten where they began, so what they differ by is what is not known.
+Each member has clearances, contact parameters and load gains of its own, drawn from the estimate with their
+correlation, and each follows every sample of the load; the quantiles over the members are the interval. After some
+load periods the members have forgotten where they began, so what they differ by is what is not known.
 """
 
 from __future__ import annotations

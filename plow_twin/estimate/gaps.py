@@ -22,7 +22,7 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Constant error of a sensor in m (standard deviation) where none is stated: dirt on a worn skid.
+#: Constant error of a sensor in m (standard deviation) where none is stated: dirt on a worn pad.
 CONSTANT_ERROR: Final = 1e-4
 #: Fewest messages from which anything is told.
 FEWEST_MESSAGES: Final = 20

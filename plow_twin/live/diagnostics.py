@@ -122,10 +122,10 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "recorder": "off, recording, or trouble: something was lost or it has stopped",
     "horizontal": "where the interval of the horizontal clearance comes from: prior, estimated, not_observable or "
     "withdrawn",
-    "vertical": "the same of the vertical clearance",
+    "vertical": "the same for the vertical clearance",
     "model": "whether the model fits what is measured: ok or suspect; empty: nothing has been estimated",
-    "sensor": "the same of the sensor of head_pose",
-    "pads": "the same of the pads' wear",
+    "sensor": "the same for the sensor of head_pose",
+    "pads": "where the interval of the pads' wear comes from, as for the clearances",
     **{f"publishers_{topic}": f"publishers of `{topic}` that this node is connected to" for topic in TOPICS},
 }
 

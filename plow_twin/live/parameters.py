@@ -201,7 +201,7 @@ class Settings:
         "only the last so many seconds are kept, in memory, and written to a folder each time at an alarm or a mark; "
         "0: everything is recorded",
     )
-    record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk each half second, against a loss of power")
+    record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk every half second, against a loss of power")
     excitation_timeout: float = _number(
         0.5,
         "s",
@@ -256,7 +256,9 @@ class Settings:
     clearance_horizontal: float = _number(
         -1.0, "m", -1.0, 10.0, Effect.NOW, "horizontal clearance of unworn pads; -1: the scene's"
     )
-    clearance_vertical: float = _number(-1.0, "m", -1.0, 10.0, Effect.NOW, "the same, vertical; -1: the scene's")
+    clearance_vertical: float = _number(
+        -1.0, "m", -1.0, 10.0, Effect.NOW, "vertical clearance of unworn pads; -1: the scene's"
+    )
     stiffness: float = _number(
         -1.0, "N/m^exponent", -1.0, 1e300, Effect.NOW, "stiffness of the contact law; -1: the scene's"
     )
@@ -266,10 +268,12 @@ class Settings:
         -1.0,
         1e300,
         Effect.NOW,
-        "the same of its damping, where it has one",
+        "damping of the contact law, where it has one; -1: the scene's",
     )
-    restitution: float = _number(-1.0, "1", -1.0, 1.0, Effect.NOW, "the same of its restitution, where it has one")
-    wear_coefficient: float = _number(-1.0, "m^2/N", -1.0, 1.0, Effect.NOW, "the same of the wear coefficient")
+    restitution: float = _number(
+        -1.0, "1", -1.0, 1.0, Effect.NOW, "restitution of the contact law, where it has one; -1: the scene's"
+    )
+    wear_coefficient: float = _number(-1.0, "m^2/N", -1.0, 1.0, Effect.NOW, "wear coefficient; -1: the scene's")
     max_evaluations: int = _number(
         0,
         "evaluations",
@@ -293,14 +297,16 @@ class Settings:
         Effect.CONFIGURE,
         "standard deviation of head_pose, x, y, theta, in the recording's header; 0: not known",
     )
-    gaps_deviation: float = _number(0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "the same of gaps")
+    gaps_deviation: float = _number(
+        0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "standard deviation of gaps, in the recording's header; 0: not known"
+    )
     excitation_deviation: tuple[float, ...] = _list(
         (0.0, 0.0, 0.0),
         "N, N, N m",
         0.0,
         1e12,
         Effect.CONFIGURE,
-        "the same of the excitation, Fx, Fy, M",
+        "standard deviation of the excitation, Fx, Fy, M, in the recording's header; 0: not known",
     )
     alarm_force: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -308,16 +314,31 @@ class Settings:
         0.0,
         1e12,
         Effect.CONFIGURE,
-        "largest force from which on there is a warning, an error; 0: none",
+        "largest force at which a warning, an error begins; 0: none",
     )
     alarm_clearance: tuple[float, ...] = _list(
-        (0.0, 0.0), "m", 0.0, 10.0, Effect.CONFIGURE, "the same of the larger of the two clearances"
+        (0.0, 0.0),
+        "m",
+        0.0,
+        10.0,
+        Effect.CONFIGURE,
+        "larger of the two clearances at which a warning, an error begins; 0: none",
     )
     alarm_wear_rate: tuple[float, ...] = _list(
-        (0.0, 0.0), "m/s", 0.0, 1.0, Effect.CONFIGURE, "the same of the fastest wear of a pad"
+        (0.0, 0.0),
+        "m/s",
+        0.0,
+        1.0,
+        Effect.CONFIGURE,
+        "fastest wear of a pad at which a warning, an error begins; 0: none",
     )
     alarm_clearance_rate: tuple[float, ...] = _list(
-        (0.0, 0.0), "m/s", 0.0, 1.0, Effect.CONFIGURE, "the same of the growth of that clearance over 10 s"
+        (0.0, 0.0),
+        "m/s",
+        0.0,
+        1.0,
+        Effect.CONFIGURE,
+        "growth of the larger clearance, over 10 s, at which a warning, an error begins; 0: none",
     )
     alarm_residual: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -325,7 +346,7 @@ class Settings:
         0.0,
         10.0,
         Effect.CONFIGURE,
-        "the same of the distance of head_pose from the model at its stamp",
+        "distance of head_pose from the model at its stamp at which a warning, an error begins; 0: none",
     )
     alarm_duration: float = _number(
         0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "how long a level must last before there is an alarm"

@@ -147,7 +147,7 @@ def _journal(reader: RunReader) -> tuple[Array, list[int], Array, Array, Array, 
     """Return samples, the rows of them before which some are missing, poses and gaps, and what is said of deviations.
 
     Stamps in ns are in front. The deviations are the largest of the load, (3,), and those that came with each pose,
-    (n, 3), NaN where none did. What was before new skids, or a step of the clock, is of another machine or time: the
+    (n, 3), NaN where none did. What was before new pads, or a step of the clock, is of another machine or time: the
     last stretch counts.
     """
     nothing = [np.zeros((0, 4))]

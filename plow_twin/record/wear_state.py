@@ -39,7 +39,7 @@ class WearState:
 def scene_identity(scene: Scene) -> str:
     """Return a hash of what makes a pad's depth comparable: frame, clearance, head, and the initial depths.
 
-    Loads, contact numbers and the wear coefficient may change: the pads stay the same.
+    Loads, contact parameters and the wear coefficient may change: the pads stay the same.
     """
     numbers = (
         *(scene.frame.width_m, scene.frame.height_m),
