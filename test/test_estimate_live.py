@@ -308,6 +308,9 @@ def test_a_worker_that_reads_nothing_is_told_and_nothing_more_is_kept_for_it(mon
 
 def test_a_worker_that_died_is_told_and_stops_nothing() -> None:
     worker = Worker(preset("paper"), Windows(10.0, 4.0, 1.0))
+    os.kill(worker._process.pid, signal.SIGSTOP)
+    worker._connection.close()
+    assert worker.poll() is None and not worker.error  # its end is not waited for
     worker._process.kill()
     give_up = time.monotonic() + 20.0
     while not worker.error and time.monotonic() < give_up:

@@ -139,7 +139,9 @@ class Worker:
                 found: Found = self._connection.recv()
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
-            self._fail(f"the estimator ended with code {self._process.wait(_STOP_S)}")
+            code = self._process.poll()
+            if code is not None:  # else it is about to end: the next call says so
+                self._fail(f"the estimator ended with code {code}")
         return None
 
     def _fail(self, error: str) -> None:
