@@ -2,6 +2,9 @@
 .DELETE_ON_ERROR:
 .PHONY: demo test stress lint coverage docs lowest bench clean
 
+# what Python has compiled is kept, whatever the caller's habit: hundreds of processes start in the tests
+unexport PYTHONDONTWRITEBYTECODE
+
 SUPPORTED := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
 PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
 	if "$$python" -c '$(SUPPORTED)' 2>/dev/null; then echo "$$python"; break; fi; done)
@@ -13,9 +16,9 @@ INSTALLED := $(VENV)/.installed
 SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
-# three processes for two cores, each with whole files: some of them wait for nodes and viewers; one that a test has ended
-# is not replaced, for the next one would begin with that test again
-PARALLEL ?= -n 3 --dist loadfile --max-worker-restart=0
+# three processes for two cores, each with whole files in the order of test/conftest.py: some of them wait for nodes and
+# viewers; one that a test has ended is not replaced, for the next one would begin with that test again
+PARALLEL ?= -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 BENCH_ARGS ?=
 SITE ?= out/site
 COVERED ?= $(wildcard test/test_model_*.py test/test_scene_*.py test/test_stream_*.py test/test_record_file.py)

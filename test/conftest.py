@@ -15,6 +15,7 @@ from hypothesis import Phase, settings
 
 ROOT = Path(__file__).resolve().parent.parent
 SKIPS = ROOT / "test" / "skips.txt"
+FIRST = ROOT / "test" / "first.txt"
 
 
 def _prepare_environment() -> None:
@@ -47,6 +48,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--golden-update", action="store_true", help="pin the digests of test/golden.py anew")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    place = {name: number for number, name in enumerate(_listed(FIRST))}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for nodeid, reason in _skipped(terminalreporter):
         terminalreporter.write_line(f"skipped: {nodeid} | {reason}")
@@ -56,7 +62,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if not session.config.getoption("--check-skips") or hasattr(session.config, "workerinput"):
         return
     reporter = session.config.pluginmanager.get_plugin("terminalreporter")
-    allowed = _allowed_skips()
+    allowed = _listed(SKIPS)
     skipped = _skipped(reporter)
     unknown = [entry for entry in skipped if not any(fnmatchcase(entry[0], glob) for glob in allowed)]
     for nodeid, reason in unknown:
@@ -70,6 +76,7 @@ def _skipped(reporter: pytest.TerminalReporter) -> list[tuple[str, str]]:
     return [(report.nodeid, report.longrepr[2] if isinstance(report.longrepr, tuple) else "") for report in reports]
 
 
-def _allowed_skips() -> list[str]:
-    lines = (line.partition("#")[0].strip() for line in SKIPS.read_text(encoding="utf-8").splitlines())
+def _listed(file: Path) -> list[str]:
+    """What stands before the first bar of each line, without comments."""
+    lines = (line.partition("#")[0].strip() for line in file.read_text(encoding="utf-8").splitlines())
     return [line.partition("|")[0].strip() for line in lines if line]

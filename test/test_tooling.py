@@ -88,6 +88,11 @@ def test_a_test_that_hangs_is_named_and_ends_the_run(tmp_path: Path) -> None:
     assert "in test_that_hangs" in done.stderr  # where it stands
 
 
+def test_the_files_that_come_first_exist() -> None:
+    names = [line for line in (ROOT / "test" / "first.txt").read_text().splitlines() if not line.startswith("#")]
+    assert names and all((ROOT / "test" / name).is_file() for name in names)
+
+
 def test_ci_is_bounded_and_runs_every_check() -> None:
     steps = re.findall(r'^step "([^"]+)" (\d+) make (.+)', (ROOT / ".ci" / "run").read_text(), re.MULTILINE)
     assert sum(int(limit) for _, limit, _ in steps) <= 4200
