@@ -29,7 +29,7 @@ from rosbags.highlevel import AnyReader
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import decode, encode, typestore
-from plow_twin.record.chunks import decompress, independent_blocks
+from plow_twin.record.compression import decompress, independent_blocks
 from plow_twin.record.entries import EntryRecord, OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests, to_message
