@@ -44,6 +44,7 @@ _pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, typ
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
 MESSAGE_HEAD: Final = 31
+_MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
 #: Messages ahead whose heads are fetched: a multiple of the three of a publication.
 _FETCHED: Final = 12
@@ -132,9 +133,7 @@ class ChunkReader:
     def __iter__(self) -> Iterator[Messages]:
         self.finished, self.damaged, self.left_out, self.position = False, 0, 0, 0
         schemas: dict[int, tuple[str, bytes]] = {}
-        loose: list[bytes] = []
-        opened: list[Bytes] = []
-        held = 0  # bytes of these
+        waiting = _Waiting()
         small = _SMALL if self.wanted is None else _SMALL_ALONE
         with open_mcap(self.path) as stream:
             descriptor = stream.fileno()
@@ -142,15 +141,14 @@ class ChunkReader:
             heads, place = _Heads(descriptor, size), len(MAGIC)
             while True:
                 opcode, length = heads.at(place)
-                begin = place + _HEAD.size
+                begin = place + _HEAD_SIZE
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
                 behind = len(MAGIC) if opcode == _FOOTER else 0  # a writer may have come as far as between the two
                 if begin + length + behind > size:
                     if self.more is None:
                         break
-                    yield from self._scan([*opened, *map(_bytes, loose)], schemas)
-                    opened, loose, held = [], [], 0
+                    yield from self._scan(waiting.taken(), schemas)
                     yield Messages.none()
                     if not self.more(stream, size):
                         break
@@ -159,39 +157,29 @@ class ChunkReader:
                     continue
                 place = self.position = begin + length
                 if opcode == _MESSAGE:
-                    loose.append(os.pread(descriptor, _HEAD.size + length, begin - _HEAD.size))
-                if loose and (opcode != _MESSAGE or len(loose) >= 4096 or length > small):
-                    opened.append(np.frombuffer(b"".join(loose), np.uint8))
-                    held += len(opened[-1])
-                    loose = []
-                if held > small:
-                    yield from self._scan(opened, schemas)
-                    opened, held = [], 0
+                    waiting.add_message(os.pread(descriptor, _HEAD_SIZE + length, begin - _HEAD_SIZE))
+                if waiting.size > small:
+                    yield from self._scan(waiting.taken(), schemas)
                 if opcode == _CHUNK:
                     channels, place = heads.index()
                     if not self._is_wanted(channels):
                         continue
                     content = self._open(os.pread(descriptor, length, begin))
                     if content is None or len(content) > small:
-                        yield from self._scan(opened, schemas)
-                        opened, held = [], 0
+                        yield from self._scan(waiting.taken(), schemas)
                     if content is not None:
-                        opened.append(content)
-                        held += len(content)
+                        waiting.add(content)
                     else:
                         self._note_damage(schemas)
                 elif opcode in (_SCHEMA, _CHANNEL):
                     self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
-                    yield from self._scan(opened, schemas)  # a note of damage stands between the messages
-                    opened, held = [], 0
+                    yield from self._scan(waiting.taken(), schemas)  # a note of damage stands between the messages
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
                     break
-            if loose:
-                opened.append(np.frombuffer(b"".join(loose), np.uint8))
-            yield from self._scan(opened, schemas)
+            yield from self._scan(waiting.taken(), schemas)
 
     def _is_wanted(self, channels: int) -> bool:
         """Ask for a chunk by the channels in its index, a bit each; without one the chunk is wanted."""
@@ -294,6 +282,37 @@ class ChunkReader:
             self.channels.setdefault(
                 channel.id, Channel(channel.topic, name, channel.message_encoding, text, channel.metadata)
             )
+
+
+class _Waiting:
+    """Chunks, and messages that stand in none, which are looked through together: each look costs as much."""
+
+    def __init__(self) -> None:
+        self._contents: list[Bytes] = []
+        self._messages: list[bytes] = []
+        self.size = 0
+
+    def add(self, content: Bytes) -> None:
+        """Add what a chunk holds."""
+        self._join()
+        self._contents.append(content)
+        self.size += len(content)
+
+    def add_message(self, record: bytes) -> None:
+        """Add the record of a message outside the chunks."""
+        self._messages.append(record)
+        self.size += len(record)
+
+    def taken(self) -> list[Bytes]:
+        """Return everything in the file's order, and keep nothing."""
+        self._join()
+        contents, self._contents, self.size = self._contents, [], 0
+        return contents
+
+    def _join(self) -> None:
+        if self._messages:
+            self._contents.append(np.frombuffer(b"".join(self._messages), np.uint8))
+            self._messages = []
 
 
 def is_begun(path: Path) -> bool:
@@ -408,10 +427,6 @@ def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
     return count
 
 
-def _bytes(record: bytes) -> Bytes:
-    return np.frombuffer(record, np.uint8)
-
-
 @compiled
 def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
     """Fill the columns of `table` with the messages of a chunk and `others` with the places of schemas and channels.
@@ -421,24 +436,24 @@ def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, boo
     """
     place, count, other = 0, 0, 0
     size, room = content.size, table.shape[1]
-    while place + 9 <= size:
-        length, start = word(content, place + 1), place + 9
+    while place + _HEAD_SIZE <= size:
+        length, start = word(content, place + 1), place + _HEAD_SIZE
         if length < 0 or length > size - start:
             return count, other, False
         opcode = content[place]
-        if opcode == 5 and length >= 22:
+        if opcode == _MESSAGE and length >= _MESSAGE_FIELDS:
             if count == room:
                 return room + 1, other, False
             head = word(content, start)
             table[0, count], table[1, count] = head & 0xFFFF, head >> 16 & 0xFFFFFFFF
             table[2, count], table[3, count] = word(content, start + 6), word(content, start + 14)
-            table[4, count], table[5, count] = start + 22, length - 22
+            table[4, count], table[5, count] = start + _MESSAGE_FIELDS, length - _MESSAGE_FIELDS
             if count >= _FETCHED:  # messages repeat their lengths: the head of one to come
                 head_at = 2 * place - (table[4, count - _FETCHED] - MESSAGE_HEAD)
                 fetch(content, head_at)
                 fetch(content, head_at + MESSAGE_HEAD - 1)
             count += 1
-        elif opcode == 3 or opcode == 4:
+        elif opcode in (_SCHEMA, _CHANNEL):
             if other < others.size:
                 others[other] = place
             other += 1
