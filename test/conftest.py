@@ -19,13 +19,15 @@ FIRST = ROOT / "test" / "first.txt"
 
 
 def _prepare_environment() -> None:
-    """Set what child processes inherit; runs before rclpy is imported anywhere."""
+    """Set what child processes inherit; runs before rclpy and numpy are imported anywhere."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.pop("ROS_LOCALHOST_ONLY", None)
     # 1..101 keeps clear of the ephemeral ports; each process of a run has its own, two runs at once have others
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")
     number = 8 * (os.getppid() if worker else os.getpid()) + int(worker.removeprefix("gw") or 0)
     os.environ["ROS_DOMAIN_ID"] = str(1 + number % 101)
+    # the processes of a suite take all cores: threads of linear algebra would wait for each other at full speed
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     logs = tempfile.mkdtemp(prefix="plow_twin-ros-log-")
     atexit.register(shutil.rmtree, logs, ignore_errors=True)
     os.environ["ROS_LOG_DIR"] = logs
