@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from plow_twin.record.importing import Walked, Walker
+from plow_twin.record.walking import Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path

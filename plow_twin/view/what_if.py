@@ -11,7 +11,7 @@ from plow_twin.errors import RecordingError
 from plow_twin.model.scene import Scene
 from plow_twin.record.entries import Entries
 from plow_twin.record.header import RunHeader
-from plow_twin.record.importing import JournalWalk, Walked, Walker
+from plow_twin.record.walking import JournalWalk, Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.stream.session import Session
 from plow_twin.view import layout

@@ -18,10 +18,11 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders, readable_beside
 from plow_twin.record.follow import Tail
-from plow_twin.record.importing import Feed, JournalWalk, Walked, Walker
+from plow_twin.record.importing import Feed
 from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source
 from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import open_source, packed
+from plow_twin.record.walking import JournalWalk, Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path

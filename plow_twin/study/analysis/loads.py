@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
-from plow_twin.record.importing import Walked
+from plow_twin.record.walking import Walked
 from plow_twin.run.energy_balance import elastic_energy
 
 Array = NDArray[np.float64]

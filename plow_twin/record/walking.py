@@ -1,0 +1,264 @@
+"""Many samples at a time through a session: of a run's journal, or of a load from anybody's recording.
+
+Nothing is held for want of samples: time is that of the stamps, a load runs straight from one to the next.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.scene import Scene
+from plow_twin.record.entries import Entries, Holes
+from plow_twin.record.journal_codec import Dropped
+from plow_twin.run.advance import AdvanceSeries
+from plow_twin.stream.journal import Digest, Entry, Loss, Reset, Restore, SetModel, SetWear, Snapshot, Travel
+from plow_twin.stream.outputs import Publications
+from plow_twin.stream.session import DIGEST_INTERVAL, Session
+
+if TYPE_CHECKING:
+    from plow_twin.record.writer import RunWriter
+
+#: Samples advanced together.
+BATCH: Final = 4096
+#: Entries that a walk of a journal acts on; across all others late samples are put in their places.
+_ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
+#: Failed advances in a row after which the model is reset.
+_FAILURE_LIMIT: Final = 10
+
+
+@dataclass(frozen=True)
+class Walked:
+    """Some advances: stamps (n,) [ns], wrench (n, 3), the rows of the model, and what would be published after each."""
+
+    stamp_ns: NDArray[np.int64]
+    wrench: NDArray[np.float64]
+    rows: AdvanceSeries
+    publications: Publications
+    #: signed speed along the face [m/s]
+    speed_m_s: float
+    #: with the changes of the model so far
+    scene: Scene
+
+
+class Walker:
+    """Advance a session by many samples at a time, write its journal and outputs, and hand the rows on.
+
+    Parameters
+    ----------
+    session
+        The session; nobody else may apply entries.
+    on_walked
+        Receives the rows of each batch.
+    writer
+        Where journal and outputs are written, or None.
+    """
+
+    def __init__(
+        self, session: Session, on_walked: Callable[[Walked], object], writer: RunWriter | None = None
+    ) -> None:
+        self.session = session
+        self._on_walked = on_walked
+        self._writer = writer
+        self._sequence = -1
+        self._advances = 0
+        self._log_time_ns = 0
+        #: advances that the solver could not make
+        self.failures = 0
+        #: called after each reset of the motion
+        self.on_reset: Callable[[], object] = lambda: None
+        self.speed_m_s = 0.0
+        self._opening: Snapshot | None = session.snapshot()
+
+    def _open(self, log_time_ns: int) -> None:
+        """Begin the journal with the state at the start, received with what comes first."""
+        opening, self._opening = self._opening, None
+        if opening is not None:
+            self._sequence += 1
+            if self._writer is not None:
+                self._writer.write_entry(self._sequence, log_time_ns, opening)
+
+    def _entry(self, entry: Entry) -> None:
+        self._open(self._log_time_ns)
+        self._sequence += 1
+        if self._writer is not None:
+            self._writer.write_entry(self._sequence, self._log_time_ns, entry)
+
+    def apply(self, entry: Entry, log_time_ns: int = 0) -> None:
+        """Apply an entry that is no sample."""
+        self._log_time_ns = log_time_ns or self._log_time_ns
+        self._entry(entry)
+        self.session.apply(entry)
+        if isinstance(entry, Reset | SetWear | Restore):
+            self.on_reset()
+
+    def samples(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_time_ns: NDArray[np.int64]) -> None:
+        """Apply samples of stamps that do not fall."""
+        for begin in range(0, len(stamp_ns), BATCH):
+            part = slice(begin, begin + BATCH)
+            self._walk(stamp_ns[part], wrench[part], log_time_ns[part])
+
+    def _walk(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_ns: NDArray[np.int64]) -> None:
+        count = len(stamp_ns)
+        numbers = self._advances + 1 + np.arange(count)
+        marks = 1 + np.flatnonzero(numbers % DIGEST_INTERVAL == 0)
+        done = self.session.advance_marked(stamp_ns, wrench, marks)
+        assert done.rows is not None
+        self._advances += count
+        good = np.flatnonzero(done.status == 0)
+        self.failures += count - len(good)
+        publications = self.session.outputs.take_rows(stamp_ns, done.rows, np.arange(count))
+        if self._writer is not None:
+            self._write(stamp_ns, wrench, log_ns, marks, done.digests, publications, good)
+        self._on_walked(Walked(stamp_ns, wrench, done.rows, publications, self.speed_m_s, self.session.twin.scene))
+        if count >= _FAILURE_LIMIT and done.status[-_FAILURE_LIMIT:].all():
+            self.apply(Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
+
+    def _write(
+        self,
+        stamp_ns: NDArray[np.int64],
+        wrench: NDArray[np.float64],
+        log_ns: NDArray[np.int64],
+        marks: NDArray[np.int64],
+        digests: list[str],
+        publications: Publications,
+        good: NDArray[np.int64],
+    ) -> None:
+        assert self._writer is not None
+        self._open(int(log_ns[0]))
+        sequence = (
+            self._sequence + 1 + np.arange(len(stamp_ns)) + np.searchsorted(marks, np.arange(len(stamp_ns)), "right")
+        )
+        begin = 0
+        for mark, digest in zip((*marks.tolist(), len(stamp_ns)), (*digests, ""), strict=True):
+            part = slice(begin, mark)
+            if mark > begin:
+                self._writer.write_samples(sequence[part], log_ns[part], stamp_ns[part], wrench[part])
+            if digest:
+                place = int(sequence[mark - 1]) + 1
+                self._writer.write_entry(place, int(log_ns[mark - 1]), Digest(int(stamp_ns[mark - 1]), digest))
+            begin = mark
+        self._sequence += len(stamp_ns) + len(marks)
+        self._log_time_ns = int(log_ns[-1])
+        if len(good) == len(stamp_ns):
+            self._writer.write_publications(sequence, log_ns, publications)
+
+    def close(self) -> None:
+        """End the journal."""
+        if self.session.stamp_ns is not None:
+            self._entry(Digest(self.session.stamp_ns, self.session.twin.digest()))
+
+
+class JournalWalk:
+    """The journal of a run through walkers of the run's scene and of others; nothing is held.
+
+    `used` and `late` count samples; a late one stands where its stamp puts it, if the walkers have not passed that.
+    `missing` counts entries that are not there: after them a new stretch begins.
+
+    Parameters
+    ----------
+    own
+        Walkers that take over states from the journal: after a loss, and wear that was set.
+    others
+        Walkers that go on from states of their own.
+    whole
+        Whether the journal begins with the run: else its first snapshot is taken over.
+    same_scene
+        Whether `own` are of the run's scene: they follow changes of the model and motions that were restored.
+    """
+
+    def __init__(
+        self, own: Sequence[Walker], others: Sequence[Walker], *, whole: bool = True, same_scene: bool = True
+    ) -> None:
+        self._own, self._all = own, (*own, *others)
+        self._same = own if same_scene else ()
+        #: speeds whose stamps have not been reached, by these
+        self._travels: list[Travel] = []
+        self._lost = not whole
+        self._reached_ns = -1
+        self.used = self.late = self.missing = 0
+        self._holes = Holes()
+
+    def add(self, entries: Entries) -> None:
+        """Take in entries."""
+        begin = 0
+        for place, count in self._holes.take(entries).items():
+            self._whole(entries[begin:place])
+            self._hole(count)
+            begin = place
+        self._whole(entries[begin:])
+
+    def _hole(self, count: int) -> None:
+        """Begin a new stretch: a load is not drawn over what is not there."""
+        self.missing += count
+        self._entry(Loss(count))
+
+    def _whole(self, entries: Entries) -> None:
+        stamps, wrench, begin = entries.stamp_ns, entries.wrench, 0
+        acting = sorted(place for place, entry in entries.rest.items() if isinstance(entry, _ACTING))
+        for place in (*acting, len(entries)):
+            samples = begin + np.flatnonzero(entries.sample[begin:place])
+            if samples.size:
+                self._samples(stamps[samples], wrench[samples])
+            if place < len(entries):
+                self._entry(entries.rest[place])
+            begin = place + 1
+
+    def _samples(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
+        order = np.argsort(stamps, kind="stable")
+        order = order[stamps[order] > self._reached_ns]
+        self.used, self.late = self.used + len(order), self.late + len(stamps) - len(order)
+        stamps, wrench = stamps[order], wrench[order]
+        while len(stamps):
+            count = len(stamps)
+            if self._travels:  # what was sent ahead of its time acts from its stamp on
+                count = int(np.searchsorted(stamps, self._travels[0].stamp_ns, "right"))
+            if count:
+                self._reached_ns = int(stamps[count - 1])
+                for walker in self._all:
+                    walker.samples(stamps[:count], wrench[:count], stamps[:count])
+                stamps, wrench = stamps[count:], wrench[count:]
+            if len(stamps):
+                self._speed(self._travels.pop(0).speed_m_s)
+
+    def _speed(self, speed_m_s: float) -> None:
+        for walker in self._all:
+            walker.speed_m_s = speed_m_s
+            walker.apply(Travel(max(0, self._reached_ns), speed_m_s))  # at once
+
+    def _begin_anew(self) -> None:
+        """Forget the time reached: the next stamp may be any; speeds that were to come act from now on."""
+        for travel in self._travels:
+            self._speed(travel.speed_m_s)
+        self._travels, self._reached_ns = [], -1
+
+    def _entry(self, entry: Entry | Dropped) -> None:
+        match entry:
+            case Travel(stamp_ns, speed) if 0 <= self._reached_ns < stamp_ns:
+                insort(self._travels, entry, key=lambda travel: travel.stamp_ns)
+            case Travel(_, speed):
+                self._speed(speed)
+            case Reset() | Loss():
+                self._begin_anew()
+                for walker in self._all:
+                    walker.apply(Reset(0, "loss") if isinstance(entry, Loss) else entry)
+            case Restore():
+                self._begin_anew()
+                for walker in self._all:
+                    walker.apply(entry if walker in self._same else Reset(0, "restore"))
+            case SetModel():
+                for walker in self._same:
+                    walker.apply(entry)
+            case Snapshot() if self._lost:
+                for walker in self._own:
+                    walker.apply(entry)
+                    self._reached_ns = walker.session.stamp_ns or -1
+            case SetWear():
+                for walker in self._all:
+                    walker.apply(entry) if walker in self._own else walker.on_reset()
+        self._lost = isinstance(entry, Loss) or (self._lost and not isinstance(entry, Snapshot))
