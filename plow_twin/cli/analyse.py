@@ -60,42 +60,26 @@ def analyse(
     quiet: bool,
 ) -> int:
     """Analyse recordings: runs of ours, MCAP, rosbag2's sqlite3, CSV, or folders of them."""
-    from plow_twin.study.analysis.analyse import expand, left_out
     from plow_twin.study.analysis.task import Task, names_apart
 
+    scene_file, further = Path(scene) if scene else None, tuple(map(Path, others))
     if watch is not None:
         if dask is not None or workers is not None:
             raise click.UsageError("--watch cannot be combined with --dask or --workers: it follows one run")
         if len(recordings) != 1:
             raise click.UsageError(f"--watch: got {len(recordings)} recordings, expected one")
-        task = Task(recordings[0], Path(scene) if scene else None, mapping, tuple(map(Path, others)), out)
-        facts = _watch(task, watch, as_json, quiet)
-        if as_json:
-            click.echo(json.dumps(facts, allow_nan=False))
-        else:
-            _show([facts], False, False, quiet)
-        return DONE_WITH_LOSS if facts["lossy"] else DONE
-    for path in recordings:
-        if not path.exists():
-            raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    found = list(dict.fromkeys(expand(recordings)))
+        return _watched(Task(recordings[0], scene_file, mapping, further, out), watch, as_json, quiet)
+    found, left = _found(recordings, out)
     many = len(found) > 1 or found != list(recordings)
     for option, given in (("--dask", dask), ("--workers", workers)):
         if given is not None and not many:
             raise click.UsageError(f"{option}: got one recording, expected many, or a folder of them")
     if dask is not None and workers is not None:
         raise click.UsageError("--workers cannot be combined with --dask: a cluster has its own")
-    # the results of an analysis before are no recording that was forgotten
-    results_before = () if out is None else (out.resolve(), (out / "run").resolve())
-    left = {item: path for path in recordings for item in left_out(path) if item.resolve() not in results_before}
-    for item, path in left.items():
-        click.echo(f"plow-twin: {item}: left out: no recording of {path}", err=True)
-    extra = tuple(Path(name) for name in others)
-    scene_file = Path(scene) if scene else None
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
-    beside = () if many else tuple(left)
+    beside = () if many else left
     tasks = [
-        Task(path, scene_file, mapping, extra, folder, beside) for path, folder in zip(found, folders, strict=True)
+        Task(path, scene_file, mapping, further, folder, beside) for path, folder in zip(found, folders, strict=True)
     ]
     for task in tasks:  # before the first of them removes anything
         task.check(found)
@@ -103,11 +87,38 @@ def analyse(
     if many and out is not None:
         from plow_twin.study.analysis.report import write_table_of_runs
 
-        write_table_of_runs(results, out, tuple(left))
+        write_table_of_runs(results, out, left)
     _show(results, many, as_json, quiet, list(map(str, left)))
+    if out is not None and not (as_json or quiet):
+        click.echo(str(out / ("runs.parquet" if many else "report.html")))
     failed = any("error" in facts for facts in results)
     lossy = any(facts.get("lossy") for facts in results)
     return FAILED if failed else DONE_WITH_LOSS if lossy else DONE
+
+
+def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tuple[Path, ...]]:
+    """Return the recordings that paths and folders stand for, and what of the folders is none, which is said."""
+    from plow_twin.study.analysis.analyse import expand, left_out
+
+    for path in recordings:
+        if not path.exists():
+            raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
+    # the results of an analysis before are no recording that was forgotten
+    results_before = () if out is None else (out.resolve(), (out / "run").resolve())
+    left = {item: path for path in recordings for item in left_out(path) if item.resolve() not in results_before}
+    for item, path in left.items():
+        click.echo(f"plow-twin: {item}: left out: no recording of {path}", err=True)
+    return list(dict.fromkeys(expand(recordings))), tuple(left)
+
+
+def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:
+    """Follow a run to its end, say what it came to, and return the exit code."""
+    facts = _watch(task, every, as_json, quiet)
+    if as_json:
+        click.echo(json.dumps(facts, allow_nan=False))
+    else:
+        _show([facts], False, False, quiet)
+    return DONE_WITH_LOSS if facts["lossy"] else DONE
 
 
 def _alone(task: Any, quiet: bool) -> dict[str, Any]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from plow_twin.record.entries import EntryRecord
-from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.record.unused import InputCounts
-from plow_twin.stream.journal import Loss
+from plow_twin.record.unused import InputCounts, noted_loss
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
@@ -22,18 +21,16 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     """
     reader = RunReader(path)
     first = last = None
-    lost: dict[str, int] = {}
+    noted: Counter[str] = Counter()
     inputs = InputCounts(reader.header.excitation_source)
     for record in reader:
         first = record.log_time_ns if first is None else first
         last = record.log_time_ns
         if isinstance(record, EntryRecord):
             inputs.add_entry(record.entry)
-        if isinstance(record, EntryRecord) and isinstance(record.entry, Loss | Dropped):
-            where = record.entry.topic if isinstance(record.entry, Dropped) else "journal"
-            lost[where] = lost.get(where, 0) + record.entry.count
+            noted += noted_loss(record.entry)
     # the recorder's closing count is the complete one; without it the notes in place are all there is
-    lost = {topic: count for topic, count in (reader.lost or lost).items() if count}
+    lost = {topic: count for topic, count in (reader.lost or noted).items() if count}
     lost |= reader.lost_parts
     header = reader.header
     facts: dict[str, Any] = {

@@ -18,7 +18,6 @@ from plow_twin.record.cdr import type_hash
 from plow_twin.record.chunks import DAMAGE_RECORD, MAGIC, ChunkReader, Messages, is_begun, is_mcap
 from plow_twin.record.follow import is_claimed
 from plow_twin.record.header import HEADER_RECORD, LOSS_RECORD
-from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import MESSAGE_TYPES
 from plow_twin.record.metadata_yaml import (
@@ -32,8 +31,8 @@ from plow_twin.record.metadata_yaml import (
     write_metadata,
 )
 from plow_twin.record.reader import FileStatus, RunReader, run_parts
-from plow_twin.record.unused import InputCounts
-from plow_twin.stream.journal import Digest, Loss, Sample, Snapshot
+from plow_twin.record.unused import InputCounts, noted_loss
+from plow_twin.stream.journal import Digest, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
 #: Key in the loss record of a repaired part.
@@ -124,6 +123,7 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     first = last = None
+    noted: Counter[str] = Counter()
     in_a_row = 0  # entries before the expected one without a gap
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
@@ -142,10 +142,9 @@ def examine(path: Path) -> RunReport:
             if entry is None:
                 stamp = int(entries.stamp_ns[index])
                 first, last = stamp if first is None else first, stamp
-            elif isinstance(entry, Loss | Dropped):
-                where = entry.topic if isinstance(entry, Dropped) else "journal"
-                report.lost[where] = report.lost.get(where, 0) + entry.count
-    report.lost = {topic: count for topic, count in (reader.lost or report.lost).items() if count}
+            else:
+                noted += noted_loss(entry)
+    report.lost = {topic: count for topic, count in (reader.lost or noted).items() if count}
     report.inputs = inputs.facts()
     report.span_s = 0.0 if first is None or last is None else (last - first) * 1e-9
     report.status = reader.status.value
