@@ -26,7 +26,7 @@ EXTRAS = {
         "pytest>=9",
         "pytest-cov",
         "pytest-timeout",
-        "pytest-xdist",
+        "pytest-xdist>=3.8",
         "hypothesis",
         "amqtt>=0.11",
         "websockets>=13",
