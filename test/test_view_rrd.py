@@ -117,6 +117,8 @@ def test_no_peak_is_lost_from_the_force_curves(run: Run, view: tuple[ViewSummary
         times = table["ros_time"].combine_chunks().cast(pa.int64()).to_numpy()
         np.testing.assert_array_equal(times, BASE_NS + STEP_NS * np.arange(COUNT))
         np.testing.assert_array_equal(table["step"].to_numpy(), np.arange(COUNT))
+        since = table["run_time"].combine_chunks().cast(pa.int64()).to_numpy()
+        np.testing.assert_array_equal(since, STEP_NS * np.arange(COUNT))
     assert summary.curve_rows == COUNT and summary.status is FileStatus.COMPLETE
 
 

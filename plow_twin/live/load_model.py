@@ -24,8 +24,6 @@ from plow_twin.record.mapping import LOAD_MODEL, read_map_file
 
 #: Below that speed [m/s] the power says nothing of the chain's force.
 SLOWEST_M_S: Final = 0.1
-#: 5 % and 95 % points of a normal distribution, in standard deviations.
-POINT_90: Final = 1.6448536269514722
 
 Number = tuple[float, float]
 Wrench = tuple[float, float, float]

@@ -67,39 +67,7 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     reader = RunReader(path)
     scene = reader.header.scene(reader.path)
     section = Section.of(scene)
-    force, load, clearance = drawn = _Largest(8), _Largest(3), _Largest(6)
-    names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}
-    first_ns: int | None = None
-    shown: _Moment | None = None
-    held, gaps = np.zeros(8), np.zeros(8)
-    reached: int | None = None  # number of the newest entry
-    for record in reader:
-        if isinstance(record, EntryRecord):
-            ahead = 1 if reached is None else (record.sequence - reached + _HALF) % (2 * _HALF) - _HALF
-            if ahead > 1 or isinstance(record.entry, Reset):
-                for rows in drawn:
-                    rows.end()
-            reached = record.sequence if ahead > 0 else reached
-            if isinstance(record.entry, Sample):
-                first_ns = record.entry.stamp_ns if first_ns is None else first_ns
-                load.add((record.entry.stamp_ns - first_ns) * 1e-9, np.array(record.entry.wrench) / 1e3)
-            continue
-        name = names.get(record.topic)
-        message = record.message() if name is not None else None
-        if isinstance(message, Odometry):
-            turn = message.orientation
-            now = (message.position[0], message.position[1], 2.0 * math.atan2(turn[2], turn[3]))
-            if shown is None or held.max() > shown.force.max():
-                shown = _Moment(now, held, gaps)
-        elif isinstance(message, JointState):
-            first_ns = message.stamp_ns if first_ns is None else first_ns
-            time_s = (message.stamp_ns - first_ns) * 1e-9
-            if name == "contact_forces":
-                held, gaps = message.effort, message.position
-            elif name == "contact_peaks":
-                force.add(time_s, message.effort / 1e3)
-            else:
-                clearance.add(time_s, _clearance_row(message))
+    force, load, clearance, shown = _collected(reader)
     if not (force.rows or load.rows or clearance.rows):
         raise RecordingError(f"{reader.path}: got no row to draw ({reader.status.value}), expected some")
     figure = Figure(figsize=(15, 8.5), layout="constrained")
@@ -134,6 +102,44 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     except OSError as error:
         raise RecordingError(f"{out}: cannot be written: {error.strerror}") from error
     return reader.status, lost
+
+
+def _collected(reader: RunReader) -> tuple[_Largest, _Largest, _Largest, _Moment | None]:
+    """Return forces [kN], load [kN, kN m] and clearances [mm] over time, and the moment of the largest force."""
+    force, load, clearance = drawn = _Largest(8), _Largest(3), _Largest(6)
+    names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}
+    first_ns: int | None = None
+    shown: _Moment | None = None
+    held, gaps = np.zeros(8), np.zeros(8)
+    reached: int | None = None  # number of the newest entry
+    for record in reader:
+        if isinstance(record, EntryRecord):
+            ahead = 1 if reached is None else (record.sequence - reached + _HALF) % (2 * _HALF) - _HALF
+            if ahead > 1 or isinstance(record.entry, Reset):
+                for rows in drawn:
+                    rows.end()
+            reached = record.sequence if ahead > 0 else reached
+            if isinstance(record.entry, Sample):
+                first_ns = record.entry.stamp_ns if first_ns is None else first_ns
+                load.add((record.entry.stamp_ns - first_ns) * 1e-9, np.array(record.entry.wrench) / 1e3)
+            continue
+        name = names.get(record.topic)
+        message = record.message() if name is not None else None
+        if isinstance(message, Odometry):
+            turn = message.orientation
+            now = (message.position[0], message.position[1], 2.0 * math.atan2(turn[2], turn[3]))
+            if shown is None or held.max() > shown.force.max():
+                shown = _Moment(now, held, gaps)
+        elif isinstance(message, JointState):
+            first_ns = message.stamp_ns if first_ns is None else first_ns
+            time_s = (message.stamp_ns - first_ns) * 1e-9
+            if name == "contact_forces":
+                held, gaps = message.effort, message.position
+            elif name == "contact_peaks":
+                force.add(time_s, message.effort / 1e3)
+            else:
+                clearance.add(time_s, _clearance_row(message))
+    return force, load, clearance, shown
 
 
 def _clearance_row(message: JointState) -> NDArray[np.float64]:
