@@ -50,6 +50,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     reader = RunReader(folder / "run")
     assert sum(1 for _ in reader) > 12000
     assert reader.status is FileStatus.COMPLETE and not reader.lost
+    assert reader.header.clock == ("ros" if speed == "fast" else "system")
     assert (folder / "run.rrd").stat().st_size > 10_000
     assert json.loads((folder / "publisher.log").read_text().splitlines()[-1])["stalls"] == 0
     assert "Traceback" not in (folder / "node.log").read_text()
