@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import re
+import resource
 import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,6 +50,34 @@ def test_csv_and_json_keep_the_contract(tmp_path: Path) -> None:
     assert answer["solver"].keys() >= {"method", "steps", "evaluations", "events"}
     assert answer["wall_s"] > 0.0
     assert answer["compile_s"] >= 0.0
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_a_file_is_the_one_before_or_whole_when_the_disk_is_full(suffix: str, tmp_path: Path) -> None:
+    out = tmp_path / f"run{suffix}"
+    arguments = ("simulate", "bench_kv", "--t-end", "1", "--quiet", "--out", str(out))
+    assert plow_twin_here(*arguments).returncode == 0
+    before = out.read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, hard))
+    try:
+        done = plow_twin_here(*arguments)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (done.returncode, done.stderr) == (1, f"plow-twin: {out}: File too large\n")
+    assert out.read_bytes() == before and [*tmp_path.iterdir()] == [out]
+
+
+def test_what_is_no_file_is_written_to_as_it_is(tmp_path: Path) -> None:
+    pipe, other = tmp_path / "pipe.csv", tmp_path / "other.csv"
+    os.mkfifo(pipe)
+    (tmp_path / "link.csv").symlink_to(other)
+    with ThreadPoolExecutor(1) as pool:
+        read = pool.submit(pipe.read_text)
+        for name in ("pipe.csv", "link.csv"):
+            done = plow_twin_here("simulate", "bench_kv", "--t-end", "1", "-q", "--out", str(tmp_path / name))
+            assert done.returncode == 0
+    assert read.result() == other.read_text() and pipe.is_fifo() and (tmp_path / "link.csv").is_symlink()
 
 
 def test_npz_keeps_the_contract(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import math
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, Final
 
@@ -36,6 +36,12 @@ OnProgress = Callable[[float], None]
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and no tables; files and errors only.")
 json_option = click.option("--json", "as_json", is_flag=True, help="The result as JSON on standard output.")
+
+
+def say_error(text: str) -> None:
+    """Print a line on standard error; where that takes none, a full disk or a terminal that has gone, work goes on."""
+    with suppress(OSError):
+        click.echo(text, err=True)
 
 
 class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on

@@ -21,6 +21,7 @@ from plow_twin.cli.console import (
     json_option,
     output_console,
     quiet_option,
+    say_error,
     table,
 )
 from plow_twin.cli.scene_facts import damping_unit
@@ -75,6 +76,7 @@ def estimate(
     import numpy as np
 
     from plow_twin.estimate.estimate import warm_up
+    from plow_twin.record.durable import whole_file, write_whole
     from plow_twin.record.measured import LOAD_FILE
     from plow_twin.record.reader import own_run
 
@@ -98,8 +100,9 @@ def estimate(
         out.mkdir(parents=True, exist_ok=True)
         if forces is not None:
             names, rows = forces.table()
-            np.savetxt(out / "forces.csv", rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
-        (out / "estimate.json").write_text(text + "\n", encoding="utf-8")
+            with whole_file(out / "forces.csv") as stream:
+                np.savetxt(stream, rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
+        write_whole(out / "estimate.json", (text + "\n").encode())
     if as_json:
         click.echo(text)
     elif not quiet:
@@ -109,10 +112,10 @@ def estimate(
         if forces is not None:
             _show_forces(forces)
     if more.get("live", {}).get("repeated") is False:
-        click.echo("the journal gives another estimate than the node published", err=True)
+        say_error("the journal gives another estimate than the node published")
         return FAILED
     if more["losses"]:
-        click.echo(f"plow-twin: {source}: lost {counts(more['losses'])}", err=True)
+        say_error(f"plow-twin: {source}: lost {counts(more['losses'])}")
     return DONE_WITH_LOSS if result.lost or more["losses"] else DONE
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import click
 
@@ -91,10 +91,7 @@ def simulate(
     )
     t_end = t_end if stopped is None else stopped.time_s
     if out is not None:
-        try:
-            write_samples(result, out)
-        except OSError as error:
-            raise OSError(error.errno, error.strerror, str(out)) from None
+        write_samples(result, out)
     if as_json:
         click.echo(json.dumps(as_plain(result, scene, t_end), indent=2, allow_nan=False))
     elif not quiet:
@@ -148,20 +145,30 @@ def _check_rows(t_end: float, output_dt: float | None) -> None:
 
 
 def write_samples(result: Result, path: Path) -> None:
-    """Write the samples as .csv (numbers with 17 digits, exact) or .npz (with all contact events)."""
+    """Write the samples as .csv (numbers with 17 digits, exact) or .npz (with all contact events), in one step."""
+    from plow_twin.record.durable import whole_file
+
+    with whole_file(path) as stream:
+        (_write_csv if path.suffix == ".csv" else _write_npz)(result, stream)
+
+
+def _write_csv(result: Result, stream: BinaryIO) -> None:
     import numpy as np
 
     from plow_twin.model.pairs import PAIR_NAMES
 
-    if path.suffix == ".csv":
-        names = ["t", "x", "y", "theta", "vx", "vy", "omega", *(f"force_{name}" for name in PAIR_NAMES)]
-        rows = np.column_stack([result.t, result.q, result.v, result.force])
-        np.savetxt(path, rows, fmt="%.17g", delimiter=",", header=",".join(names), comments="")
-        return
+    names = ["t", "x", "y", "theta", "vx", "vy", "omega", *(f"force_{name}" for name in PAIR_NAMES)]
+    rows = np.column_stack([result.t, result.q, result.v, result.force])
+    np.savetxt(stream, rows, fmt="%.17g", delimiter=",", header=",".join(names), comments="")
+
+
+def _write_npz(result: Result, stream: BinaryIO) -> None:
+    import numpy as np
+
     events = result.events
     more: dict[str, Any] = {} if result.frame is None else {"frame": result.frame}
     np.savez(
-        path,
+        stream,
         t=result.t,
         q=result.q,
         v=result.v,

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import base64
 import csv
+import io
 import json
 import math
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from plow_twin.record.durable import whole_file, write_whole
 
 
 def require(*modules: str) -> None:
@@ -37,7 +40,7 @@ def write_html(path: Path, template: str, context: Mapping[str, Any]) -> None:
     )
     environment.filters["image"] = _embedded
     environment.filters["percent"] = percent
-    path.write_text(environment.get_template(template).render(context), encoding="utf-8")
+    write_whole(path, environment.get_template(template).render(context).encode())
 
 
 def _embedded(picture: Path) -> str:
@@ -51,9 +54,8 @@ def percent(share: float | None) -> str:
 
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write plain values; numbers that are not finite become null."""
-    path.write_text(
-        json.dumps(_plain(document), indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
+    text = json.dumps(_plain(document), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    write_whole(path, text.encode())
 
 
 def _plain(value: Any) -> Any:
@@ -68,7 +70,7 @@ def _plain(value: Any) -> Any:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows with the same keys, the first row's as header."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+    with whole_file(path) as stream, io.TextIOWrapper(stream, encoding="utf-8", newline="") as text:
+        writer = csv.DictWriter(text, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)

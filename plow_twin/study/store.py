@@ -9,7 +9,6 @@ A chunk is written beside its place, synced and moved there in one step: a kille
 from __future__ import annotations
 
 import json
-import os
 import re
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +17,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.record.durable import write_whole
 from plow_twin.study.parameters import StudyError
 from plow_twin.study.sweep.table import Sweep, Table, chunks_of
 
@@ -63,7 +63,7 @@ class Store:
             )
         self._chunks.mkdir(parents=True, exist_ok=True)
         facts = {"format": FORMAT, "chunk": self.chunk, "arguments": sweep.arguments()}
-        write_atomically(folder / "sweep.json", json.dumps(facts, indent=1).encode())
+        write_whole(folder / "sweep.json", json.dumps(facts, indent=1).encode(), sync=True)
 
     def _take_up(self) -> None:
         path = self.folder / "sweep.json"
@@ -105,7 +105,7 @@ class Store:
 
         buffer = BytesIO()
         np.savez(buffer, table=table, build=np.array(build))
-        write_atomically(self._path(index), buffer.getvalue())
+        write_whole(self._path(index), buffer.getvalue(), sync=True)
 
     def table(self) -> Table:
         """Return the whole table.
@@ -131,18 +131,3 @@ def _difference(key: str, stored: Any, asked: Any) -> str:
     if key == "scene_yaml":
         return "the scene"
     return f"{key} (stored {json.dumps(stored)}, asked {json.dumps(asked)})"
-
-
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that it is there whole or not at all, also after a kill or a power cut."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    with beside.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

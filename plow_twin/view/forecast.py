@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plow_twin.record.durable import whole_file
+
 if TYPE_CHECKING:
     from plow_twin.estimate.forecast import Forecast
 
@@ -57,4 +59,5 @@ def draw_forecast(found: Forecast, path: FilePath) -> None:
     missed = 100.0 * float(np.mean(~np.isfinite(found.hours)))
     right.set(xlabel="hours of operation", ylabel="probability that a limit is reached [%]", xlim=(0.0, end))
     right.set(ylim=(0.0, 102.0), title=f"Not reached in {plan.horizon_h:g} h: {missed:.0f} %")
-    figure.savefig(path, dpi=110, format="png")
+    with whole_file(path) as stream:
+        figure.savefig(stream, dpi=110, format="png")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.durable import whole_file
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import FileStatus, RunReader
@@ -98,7 +99,8 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     figure.suptitle(f"{reader.path.name}: {', '.join(told)}")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        FigureCanvasAgg(figure).print_png(str(out))  # type: ignore[no-untyped-call]
+        with whole_file(out) as stream:
+            FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
     except OSError as error:
         raise RecordingError(f"{out}: cannot be written: {error.strerror}") from error
     return reader.status, lost

@@ -5,14 +5,14 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.durable import naming
+from plow_twin.record.durable import naming, whole_file, write_whole
 
 if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
@@ -79,7 +79,7 @@ def _write_report(found: Analysis, out: Path) -> None:
 
     out.mkdir(parents=True, exist_ok=True)
     facts = found.facts()
-    (out / "analysis.json").write_text(json.dumps(facts, indent=2, allow_nan=False), encoding="utf-8")
+    write_whole(out / "analysis.json", json.dumps(facts, indent=2, allow_nan=False).encode())
     environment = Environment(autoescape=True)
     page = environment.from_string(_PAGE).render(
         facts=facts,
@@ -88,30 +88,27 @@ def _write_report(found: Analysis, out: Path) -> None:
         number=lambda value: "" if value is None else f"{value:.4g}",
         picture=_picture(found),
     )
-    (out / "report.html").write_text(page, encoding="utf-8")
+    write_whole(out / "report.html", page.encode())
     for number, prediction in enumerate(found.predictions):
         _write_tables(prediction, out, f"_{number}" if number else "")
     _write_measured(found, out)
 
 
 def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
-    import pyarrow as pa
-    from pyarrow import parquet
-
     stamps, columns = prediction.series()
     if len(stamps):
-        parquet.write_table(pa.table({"stamp_ns": stamps, **columns}), out / f"predicted{suffix}.parquet")
+        _write_table({"stamp_ns": stamps, **columns}, out / f"predicted{suffix}.parquet")
     times, values = prediction.clearance.series()
     if len(times):
         from plow_twin.stream.outputs import CLEARANCE_NAMES
 
         table = {"stamp_ns": times} | {name: values[:, index] for index, name in enumerate(CLEARANCE_NAMES)}
-        parquet.write_table(pa.table(table), out / f"clearance{suffix}.parquet")
+        _write_table(table, out / f"clearance{suffix}.parquet")
     if prediction.loads.face:
         rows = [(number, piece, force) for (number, piece), force in sorted(prediction.loads.face.items())]
         keys = ("pass", "position_m", "largest_force_n")
         face = {key: list(column) for key, column in zip(keys, zip(*rows, strict=True), strict=True)}
-        parquet.write_table(pa.table(face), out / f"face{suffix}.parquet")
+        _write_table(face, out / f"face{suffix}.parquet")
     if prediction.loads.slide_wear:
         from plow_twin.model.pairs import PAIR_NAMES
 
@@ -119,12 +116,11 @@ def _write_tables(prediction: Prediction, out: Path, suffix: str) -> None:
         depth = np.array([prediction.loads.slide_wear[place] for place in places])
         where = {"backward": [bool(one) for one, _ in places], "position_m": [piece for _, piece in places]}
         worn = {name: depth[:, index] for index, name in enumerate(PAIR_NAMES)}
-        parquet.write_table(pa.table({**where, **worn}), out / f"slide_wear{suffix}.parquet")
+        _write_table({**where, **worn}, out / f"slide_wear{suffix}.parquet")
 
 
 def _write_measured(found: Analysis, out: Path) -> None:
     import pyarrow as pa
-    from pyarrow import parquet
 
     series = {name: signal.series() for name, signal in found.measured.signals.items()}
     if not series:
@@ -135,7 +131,15 @@ def _write_measured(found: Analysis, out: Path) -> None:
         "stamp_ns": np.concatenate([stamps for stamps, _ in series.values()]),
         "value": np.concatenate([values for _, values in series.values()]),
     }
-    parquet.write_table(pa.table(table), out / "measured.parquet")
+    _write_table(table, out / "measured.parquet")
+
+
+def _write_table(columns: Mapping[str, Any], path: Path) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with whole_file(path) as stream:
+        parquet.write_table(pa.table(columns), stream)
 
 
 def _picture(found: Analysis) -> str:
@@ -175,9 +179,6 @@ def _picture(found: Analysis) -> str:
 
 def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:
     """Write one row a recording to `runs.parquet`, and one with the reason for each folder that was left out."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
     flat = []
     for facts in [*rows, *({"run": str(path), "error": LEFT_OUT} for path in left_out)]:
         lost = sum(facts["lost"].values()) if "lost" in facts else None
@@ -190,4 +191,4 @@ def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequenc
         flat.append(row)
     out.mkdir(parents=True, exist_ok=True)
     keys = list(dict.fromkeys(key for row in flat for key in row))
-    parquet.write_table(pa.table({key: [row.get(key) for row in flat] for key in keys}), out / "runs.parquet")
+    _write_table({key: [row.get(key) for row in flat] for key in keys}, out / "runs.parquet")

@@ -16,12 +16,12 @@ from plow_twin.build import package_version
 from plow_twin.errors import PlowTwinError, RecordingError
 from plow_twin.record.bag import beside_folders
 from plow_twin.record.chunks import ChunkReader
+from plow_twin.record.durable import write_whole
 from plow_twin.record.reader import read_header
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
-from plow_twin.study.store import write_atomically
 
 #: Written last: what the other files of an analysis were made of.
 _ASKED: Final = "asked.json"
@@ -130,7 +130,7 @@ class Task:
         found.left_out = self.left_out
         if self.out is not None:
             write_report(found, self.out)
-            write_atomically(self.out / _ASKED, json.dumps(asked, indent=1).encode())
+            write_whole(self.out / _ASKED, json.dumps(asked, indent=1).encode(), sync=True)
         return {**found.facts(), "lossy": found.lossy}
 
     def _asked(self) -> dict[str, Any]:

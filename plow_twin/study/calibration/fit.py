@@ -12,13 +12,13 @@ from typing import Any, Final
 
 from plow_twin.build import build_fingerprint, package_version
 from plow_twin.model.scene import Mark, Provenance, Scene
+from plow_twin.record.durable import write_whole
 from plow_twin.scene_file import dump_scene
 from plow_twin.study.calibration.calibrate import Calibration, Search
 from plow_twin.study.calibration.objective import Objective, TargetObjective
 from plow_twin.study.calibration.uniqueness import Cluster, Identifiability
 from plow_twin.study.calibration.unknowns import Space
 from plow_twin.study.parameters import Value, with_parameters
-from plow_twin.study.store import write_atomically
 
 _NOT_NUMBERS: Final = ("sign", "scale", "labels", "law", "rotation")
 
@@ -128,8 +128,9 @@ class Fit:
 def write_fit(fit: Fit, space: Space, arguments: Mapping[str, Any], folder: Path) -> None:
     """Write fit.yaml (the fitted scene) and calibration.json (everything else)."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_atomically(folder / "fit.yaml", dump_scene(fit.scene).encode())
-    write_atomically(folder / "calibration.json", json.dumps(fit.plain(space, arguments), indent=1).encode())
+    write_whole(folder / "fit.yaml", dump_scene(fit.scene).encode(), sync=True)
+    content = json.dumps(fit.plain(space, arguments), indent=1).encode()
+    write_whole(folder / "calibration.json", content, sync=True)
 
 
 def objective_of(objective: Objective, values: Mapping[str, Value]) -> float:

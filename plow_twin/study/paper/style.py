@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from plow_twin.record.durable import whole_file
 from plow_twin.study.paper.values import Sense
 
 if TYPE_CHECKING:
@@ -48,4 +49,5 @@ def sheet(width: float, height: float) -> Iterator[Figure]:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG."""
-    figure.savefig(path, dpi=_DPI, facecolor="white")
+    with whole_file(path) as stream:
+        figure.savefig(stream, dpi=_DPI, facecolor="white", format="png")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from plow_twin.build import package_version
+from plow_twin.record.durable import whole_file
 from plow_twin.study.statistics import unit_of
 from plow_twin.study.sweep.table import Axis, Table
 
@@ -42,9 +43,8 @@ def write_parquet(table: Table, path: Path) -> None:
     }
     # metadata is written with the schema: the same table gives the same bytes
     arrow = pa.table(columns).replace_schema_metadata({METADATA_KEY: json.dumps(facts, sort_keys=True)})
-    beside = path.with_name(f".{path.name}")
-    pq.write_table(arrow, beside)
-    beside.replace(path)
+    with whole_file(path) as stream:
+        pq.write_table(arrow, stream)
 
 
 def draw(table: Table, path: Path) -> None:
@@ -65,7 +65,8 @@ def draw(table: Table, path: Path) -> None:
             _heat_map(axes, table, index)
         unit = _scaled(table, index)[1]
         axes.set_title(name if unit == "1" else f"{name} [{unit}]", fontsize=10)
-    figure.savefig(path, dpi=150)
+    with whole_file(path) as stream:
+        figure.savefig(stream, dpi=150, format="png")
 
 
 def _scaled(table: Table, index: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:
