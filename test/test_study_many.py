@@ -30,6 +30,7 @@ from plow_twin.study.analysis.analyse import expand, left_out
 from plow_twin.study.analysis.many import analyse_many
 from plow_twin.study.analysis.report import write_table_of_runs
 from plow_twin.study.analysis.task import Task, analyse_task, names_apart
+from plow_twin.study.parameters import StudyError
 
 RUNS = 4
 PAPER = Path("paper")
@@ -140,6 +141,19 @@ def test_a_cluster_gives_the_same_results(runs: Path, tmp_path: Path) -> None:
         found = analyse_many(some, workers=1, dask=cluster.scheduler_address)
     assert [facts["input"]["samples_used"] for facts in found] == [2000, 2001]
     assert all(task.stored() is not None for task in some)
+
+
+def test_a_cluster_without_workers_is_not_waited_for_without_end(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from distributed import LocalCluster
+
+    monkeypatch.setattr("plow_twin.study.cluster.WORKER_TIMEOUT_S", 0.1)
+    with (
+        LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster,
+        pytest.raises(StudyError, match="got no worker"),
+    ):
+        analyse_many(tasks(runs, tmp_path / "out"), workers=1, dask=cluster.scheduler_address)
 
 
 def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:

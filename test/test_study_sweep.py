@@ -119,7 +119,7 @@ def test_a_killed_sweep_goes_on_where_it_was(tmp_path: Path, capsys: pytest.Capt
 def test_failed_members_are_listed_and_other_questions_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("plow_twin.study.sweep.run.CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("plow_twin.study.cluster.CONNECT_TIMEOUT_S", 0.5)
     arguments = ["study", "sweep", "paper", "--statistic", "max", "--t-end", "2", "--out", str(tmp_path)]
     arguments += ["--x", "contact.stiffness=1e3,-1,1e7,1e8"]
     assert run(arguments) == 3

@@ -13,10 +13,7 @@ from multiprocessing.connection import wait
 from typing import Any
 
 from plow_twin.study.analysis.task import Task, analyse_task
-from plow_twin.study.parameters import StudyError
-
-#: Time to wait for a scheduler [s].
-CONNECT_TIMEOUT_S = 20.0
+from plow_twin.study.cluster import completed, connect
 
 #: Receives the share of the recordings that are done.
 OnProgress = Callable[[float], object]
@@ -38,7 +35,7 @@ def analyse_many(
     Raises
     ------
     StudyError
-        The cluster cannot be reached.
+        The cluster cannot be reached, or has no worker.
     """
     results = {number: facts for number, task in enumerate(tasks) if (facts := task.stored()) is not None}
 
@@ -100,18 +97,12 @@ def _belong_to_the_caller() -> None:
 
 
 def _on_cluster(tasks: Sequence[Task], waiting: list[int], address: str, done: _OnDone) -> None:
-    from distributed import Client
-    from distributed import as_completed as as_distributed
-
-    try:
-        client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise StudyError(f"dask: got {address!r}, expected the address of a scheduler ({error})") from None
-    with client:
+    with connect(address) as client:
         futures = {client.submit(analyse_task, tasks[number], pure=False, retries=2): number for number in waiting}
-        for future in as_distributed(list(futures), loop=client.loop):
+        for future in completed(client, futures):
             number = futures[future]
             try:
                 done(number, future.result())
             except Exception as error:  # whatever became of the worker
-                done(number, {"run": str(tasks[number].path), "error": f"{tasks[number].path}: {error!r}"})
+                path = str(tasks[number].path)
+                done(number, {"run": path, "error": f"{path}: {type(error).__name__}: {error}"})

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.build import build_fingerprint
+from plow_twin.study.cluster import completed, connect
 from plow_twin.study.parameters import StudyError
 from plow_twin.study.store import Store
 from plow_twin.study.sweep.table import Sweep, Table, run_members_of
@@ -17,8 +18,6 @@ from plow_twin.study.sweep.table import Sweep, Table, run_members_of
 Array = NDArray[np.float64]
 #: Called with the number of members that are done.
 OnProgress = Callable[[int], None]
-#: Time to wait for a scheduler [s].
-CONNECT_TIMEOUT_S = 20.0
 
 
 def run_here(store: Store, workers: int | None = None, on_progress: OnProgress | None = None) -> Table:
@@ -46,23 +45,17 @@ def run_on_cluster(store: Store, address: str, on_progress: OnProgress | None = 
     Raises
     ------
     StudyError
-        When the cluster cannot be reached or gives a task up.
+        When the cluster cannot be reached, has no worker, or gives a task up.
     """
-    from distributed import Client, as_completed
-
     chunks, missing = store.chunks, store.missing()
     done = store.sweep.size - sum(len(chunks[index]) for index in missing)
     if not missing:
         return store.table()
-    try:
-        client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise StudyError(f"dask: got {address!r}, expected the address of a scheduler ({error})") from None
-    with client:
+    with connect(address) as client:
         futures: dict[Any, int] = {
             client.submit(_task, store.sweep, list(chunks[index]), pure=False, retries=2): index for index in missing
         }
-        for future in as_completed(list(futures), loop=client.loop):
+        for future in completed(client, futures):
             index = futures[future]
             try:
                 table, build = future.result()

@@ -1,0 +1,63 @@
+"""A Dask cluster: the connection to its scheduler, and its results as they come."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any, Final
+
+from plow_twin.study.parameters import StudyError
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+#: Time to wait for a scheduler [s].
+CONNECT_TIMEOUT_S = 20.0
+#: Time to wait for a cluster without a worker [s]: one that grows on demand takes a while.
+WORKER_TIMEOUT_S = 300.0
+#: Whether there is a worker is looked at that often while no result comes [s].
+_LOOK_S: Final = 2.0
+
+
+def connect(address: str) -> Client:
+    """Return a client of the scheduler at `address`.
+
+    Raises
+    ------
+    StudyError
+        It does not answer.
+    """
+    from distributed import Client
+
+    try:
+        return Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, TimeoutError, ValueError) as error:
+        raise StudyError(f"dask: got {address!r}, expected the address of a scheduler ({error})") from None
+
+
+def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future[Any]]:
+    """Yield futures as they end.
+
+    Raises
+    ------
+    StudyError
+        The cluster has had no worker for `WORKER_TIMEOUT_S`.
+    """
+    from distributed import as_completed
+
+    waiting: set[Any] = set(futures)
+    manned = time.monotonic()
+    while waiting:
+        try:
+            for future in as_completed(  # type: ignore[no-untyped-call]
+                list(waiting), loop=client.loop, timeout=_LOOK_S
+            ):
+                waiting.remove(future)
+                manned = time.monotonic()
+                yield future
+        except TimeoutError:
+            now = time.monotonic()
+            manned = now if client.scheduler_info()["workers"] else manned
+            if now - manned > WORKER_TIMEOUT_S:
+                what = f"got no worker for {WORKER_TIMEOUT_S:g} s, expected some"
+                raise StudyError(f"dask: {what}; what is stored stays, the same call does the rest") from None
