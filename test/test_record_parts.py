@@ -351,6 +351,27 @@ def test_a_part_that_is_not_there_is_counted_and_no_load_drawn_over_its_hole(whi
     assert found.predictions[0].loads.duration_s < whole.predictions[0].loads.duration_s
 
 
+def test_parts_that_are_removed_while_others_are_read_are_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the oldest parts go (`record_keep_mb`), a reader may be slower than the recorder."""
+    monkeypatch.setattr("plow_twin.record.reader._LEAST", 1)  # no part is read before what stands in the one before
+    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
+    (run.folder / "metadata.yaml").unlink()  # it is not there before the end
+    parts = RunReader(run.folder).parts
+    assert len(parts) >= 4
+    reader = RunReader(run.folder)
+    parts[0].unlink()
+    records = iter(reader)
+    first = next(records)
+    parts[1].unlink()  # open by now: read to its end
+    parts[2].unlink()
+    assert isinstance(first.entry, Snapshot)  # type: ignore[union-attr]
+    assert len(list(records)) < sum(reader.counts.values()) < COUNT * 4
+    assert reader.status is FileStatus.COMPLETE and reader.lost_parts == {"missing_parts": 1}
+    assert reader.parts == [parts[1], *parts[3:]]
+
+
 def test_estimate_and_forecast_tell_of_parts_that_are_not_there(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

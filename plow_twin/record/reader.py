@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
@@ -62,6 +63,7 @@ class RunReader:
     more, with the file that is read for it, and those `foreign`: of another run, by what differs in their headers from
     most. A part that is no MCAP file counts as a damaged chunk. `missing_parts` counts parts of a folder that are
     named by `metadata.yaml`, or by those around them, and not there; `lost_parts` has both counts, where there are any.
+    Parts that are removed while others are read are passed over like those that were not there before.
 
     With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
     follows each time that all there is has been read.
@@ -101,7 +103,12 @@ class RunReader:
         files = run_parts(self._place)
         for file in files:
             if file not in self._headers and (len(files) == 1 or (is_begun(file) and is_mcap(file))):
-                header = read_header(file)
+                try:
+                    header = read_header(file)
+                except RecordingError:
+                    if len(files) > 1 and not file.exists():  # removed meanwhile
+                        continue
+                    raise
                 if header is not None:
                     self._headers[file] = header
         self.parts, self.repeated, self.foreign = [], {}, self._of_other_runs()
@@ -166,7 +173,7 @@ class RunReader:
         self.stop_reason = None
         self.counts.clear()
         merger = _Merger(self, outputs)
-        size, before = sum(part.stat().st_size for part in self.parts), 0
+        size, before = self.size(), 0
         finished, cut = True, False
         for part in self._parts_to_read():
             self.damaged_chunks += cut  # what the part before lacks may be missing in what comes now
@@ -209,18 +216,27 @@ class RunReader:
         done: list[Path] = []
         while left := [part for part in self.parts if part not in done]:
             done.append(left[0])
-            if self.tail is None or left[0].exists():  # the oldest may have been removed meanwhile
+            if left[0].exists():
                 yield left[0]
+            elif len(self.parts) > 1:  # a recorder removes the oldest ones
+                self.parts.remove(left[0])
             if self.tail is not None and not self.tail.stopped:
                 self._look_for_parts()
+
+    def size(self) -> int:
+        """Return the size of the parts that are there [B]."""
+        found = 0
+        for part in self.parts:
+            with suppress(FileNotFoundError):  # removed meanwhile
+                found += part.stat().st_size
+        return found
 
     def duration_s(self) -> float:
         """Return the span of the receive times [s] by the index of the parts; a guess by their size without one."""
         from mcap.reader import make_reader
 
-        first, last, size = [], [], 0
+        first, last = [], []
         for part in self.parts:
-            size += part.stat().st_size
             try:
                 with part.open("rb") as stream:
                     summary = make_reader(stream).get_summary()
@@ -230,7 +246,7 @@ class RunReader:
                 first.append(summary.statistics.message_start_time)
                 last.append(summary.statistics.message_end_time)
         known = first and len(first) == len(self.parts)
-        return float(max(last) - min(first)) * 1e-9 if known else size / _BYTES_PER_S
+        return float(max(last) - min(first)) * 1e-9 if known else self.size() / _BYTES_PER_S
 
     def _metadata(self, name: str, record: dict[str, str]) -> None:
         if name != LOSS_RECORD:
