@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,21 @@ from plow_twin.scene_file import load_scene
 def _demo(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "plow_twin", "demo", "--out", str(folder), *arguments]
     return subprocess.run(command, cwd=ROOT, env=dict(os.environ), capture_output=True, text=True, timeout=110)
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv")
+def test_the_processes_of_the_demo_end_with_it_however_it_ends(tmp_path: Path) -> None:
+    text = (
+        "import os, pathlib, plow_twin.ros.demo\n"
+        f"child = plow_twin.ros.demo.Child(['http.server', '0'], pathlib.Path({str(tmp_path / 'log')!r}))\n"
+        "print(child._process.pid, flush=True)\n"
+        "os.kill(os.getpid(), 9)"
+    )
+    done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True, timeout=110)
+    child, give_up = Path("/proc", done.stdout.strip(), "cmdline"), time.monotonic() + 60.0
+    while child.exists() and child.read_bytes():  # a zombie's is empty
+        assert time.monotonic() < give_up
+        time.sleep(0.05)
 
 
 @pytest.mark.parametrize("speed", ["real", "fast"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -194,8 +195,12 @@ class Child:
         self._name = arguments[0]
         self._log = log
         self._stream: IO[bytes] = log.open("wb")
+        command = [sys.executable, "-m", *arguments]
+        bound = shutil.which("setpriv")
+        if bound is not None:  # stopped with this process, however it ends
+            command = [bound, "--pdeathsig", "TERM", *command]
         self._process = subprocess.Popen(
-            [sys.executable, "-m", *arguments], stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
+            command, stdout=self._stream, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
         )
 
     @property
