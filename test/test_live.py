@@ -13,7 +13,7 @@ import sys
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -347,6 +347,21 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
                 reader(path)
 
 
+def test_a_full_disk_under_the_log_does_not_end_the_twin(tmp_path: Path) -> None:
+    _csv(tmp_path / "load.csv", 50)
+    arguments = ["live", str(tmp_path / "load.csv"), "--record"]
+    full = Path("/dev/full").open("w")  # noqa: SIM115  # closing it fails
+    with redirect_stderr(full):
+        assert run_cli([*arguments, str(tmp_path / "log")]) == 0
+    with redirect_stdout(full):
+        assert run_cli([*arguments, str(tmp_path / "lines"), "--lines"]) == 3
+    with suppress(OSError):
+        full.close()
+    for name in ("log", "lines"):
+        report = replay(tmp_path / name)
+        assert (report.samples, report.exit_code) == (50, 0)
+
+
 class Live:
     """`plow-twin live --lines` in a process of its own."""
 
@@ -373,8 +388,8 @@ class Live:
     def until_count(self, key: str, count: int) -> dict[str, str]:
         return self.until(lambda heard: int(heard["input"]["values"][key]) >= count, f"{count} {key}")
 
-    def stop(self) -> int:
-        self.process.send_signal(signal.SIGTERM)
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
         self.process.communicate(timeout=60.0)
         return self.process.returncode
 
@@ -392,7 +407,9 @@ def _live(*arguments: str, **options: Any) -> Iterator[Live]:
 def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Path) -> None:
     path, run = tmp_path / "load.csv", tmp_path / "run"
     _csv(path, 100)
-    with _live(str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600") as live:
+    arguments = (str(path), "--follow", "--record", str(run), "--set", "excitation_timeout=3600")
+    # not of a `nohup` above the tests
+    with _live(*arguments, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)) as live:
         live.until_count("samples_used", 100)
         text = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(100, 200))
         with path.open("a") as stream:
@@ -405,7 +422,7 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
         path.write_text("t,fx,fy,m\n" + "".join(",".join(map(repr, _row(index))) + "\n" for index in range(200, 300)))
         values = live.until_count("samples_used", 300)
         assert values["samples_in"] == "300"
-        assert live.stop() == 0
+        assert live.stop(signal.SIGHUP) == 0  # of a terminal that is closed
     report = replay(run)
     assert (report.samples, report.exit_code) == (300, 0)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -16,12 +17,23 @@ from typing import NoReturn
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
+    _open_what_is_closed()
     with _ending_at_once():
         # with all that compiles: an import that is interrupted may end in an error of its own making
         import plow_twin.run.twin  # noqa: F401
         from plow_twin.cli.app import main as run
 
     run(arguments)
+
+
+def _open_what_is_closed() -> None:
+    """Let standard streams that were closed before the start lead nowhere: no file that is opened takes their place."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode, encoding="utf-8"))
 
 
 @contextmanager

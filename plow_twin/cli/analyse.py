@@ -22,6 +22,7 @@ from plow_twin.cli.console import (
     output_console,
     progress,
     quiet_option,
+    say_error,
     table,
 )
 
@@ -107,7 +108,7 @@ def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tu
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
     left = {item: path for path in recordings for item in left_out(path) if item.resolve() not in results_before}
     for item, path in left.items():
-        click.echo(f"plow-twin: {item}: left out: no recording of {path}", err=True)
+        say_error(f"plow-twin: {item}: left out: no recording of {path}")
     return list(dict.fromkeys(expand(recordings))), tuple(left)
 
 
@@ -187,9 +188,9 @@ def _unit(signal: str) -> str:
 def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool, left_out: Sequence[str] = ()) -> None:
     for facts in results:
         if "error" in facts:
-            click.echo(f"plow-twin: {facts['error']}", err=True)
+            say_error(f"plow-twin: {facts['error']}")
         elif facts["lost"]:
-            click.echo(f"plow-twin: {facts['run']}: lost {counts(facts['lost'])}", err=True)
+            say_error(f"plow-twin: {facts['run']}: lost {counts(facts['lost'])}")
     if as_json:
         facts = {"runs": results, "left_out": left_out} if many else results[0]
         click.echo(json.dumps(facts, indent=2, allow_nan=False))

@@ -13,7 +13,7 @@ import click
 
 from plow_twin.build import package_version
 from plow_twin.cli.analyse import analyse
-from plow_twin.cli.console import FAILED, WRONG_INPUT
+from plow_twin.cli.console import FAILED, WRONG_INPUT, say_error
 from plow_twin.cli.demo import demo
 from plow_twin.cli.doctor import doctor
 from plow_twin.cli.estimate import estimate
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
         # all is done: one more signal, as of a terminal and a launch at once, would end the process with another code
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:
         if sys.stdout is not None:  # closed before the start
@@ -114,5 +114,5 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, code: int = FAILED) -> int:
-    click.echo(f"plow-twin: {message}", err=True)
+    say_error(f"plow-twin: {message}")
     return code

@@ -18,6 +18,7 @@ from plow_twin.cli.console import (
     json_option,
     output_console,
     quiet_option,
+    say_error,
     table,
 )
 from plow_twin.scene_file.presets import scene_path
@@ -124,7 +125,7 @@ def forecast(
         draw_forecast(found, plot)
     facts["lost"] = lost
     if lost:
-        click.echo(f"plow-twin: {scene}: lost {counts(lost)}; there may be a newer estimate", err=True)
+        say_error(f"plow-twin: {scene}: lost {counts(lost)}; there may be a newer estimate")
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:

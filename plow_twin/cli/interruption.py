@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM of a verb that may be waiting in another library's code: it ends in bounded time."""
+"""Ctrl-C, SIGTERM and SIGHUP of a verb that may be waiting in another library's code: it ends in bounded time."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
+
+from plow_twin.live.stop import stop_signals
 
 #: An interrupted verb has that long to end by itself [s].
 PATIENCE_S: Final = 3.0
@@ -31,8 +33,7 @@ def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[C
             on_overdue()
             os._exit(1)
 
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda *_: None) for number in numbers}
+    before = {number: signal.signal(number, lambda *_: None) for number in stop_signals()}
     wakeup = signal.set_wakeup_fd(send)
     thread = threading.Thread(target=watch, daemon=True, name="plow_twin interruption")
     thread.start()

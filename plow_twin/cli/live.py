@@ -21,6 +21,7 @@ from plow_twin.cli.console import (
     json_option,
     output_console,
     quiet_option,
+    say_error,
     show_facts,
 )
 
@@ -84,20 +85,23 @@ def _live(
         settings = _settings(options)
         bridge = _bridge(source, options)
         for refused in apply_realtime(settings):
-            click.echo(f"plow-twin: refused by the system: {refused}", err=True)
+            say_error(f"plow-twin: refused by the system: {refused}")
         with busy("preparing the solver", quiet or not error_console().is_terminal):
             prepared = Preparation(settings).result(lambda: stop.stopped)
 
+        lines_lost = 0
+
         def say(name: str, part: tuple[int, str, dict[str, str]]) -> None:
+            nonlocal lines_lost
             level, message, values = part
             if lines:
-                click.echo(json.dumps({"topic": name, "level": level, "message": message, "values": values}))
-                sys.stdout.flush()
+                said = {"topic": name, "level": level, "message": message, "values": values}
+                lines_lost += not _said(json.dumps(said))
             elif name in ("status", "alarms") and not quiet:
-                click.echo(f"{_LEVELS[level]} {name}: {message}", err=True)
+                say_error(f"{_LEVELS[level]} {name}: {message}")
 
         def on_error(text: str) -> None:
-            click.echo(f"plow-twin: {text}", err=True)
+            say_error(f"plow-twin: {text}")
 
         front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error)
         stop.interrupt = False
@@ -106,6 +110,8 @@ def _live(
         return leave(DONE)
     parts = front.parts()
     facts = {name: values for name, (_, _, values) in parts.items()}
+    if lines_lost:
+        lost = [*lost, f"standard output took {lines_lost} lines not, or in part"]
     for text in lost:
         on_error(text)
     if as_json:
@@ -114,6 +120,18 @@ def _live(
         show_facts(output_console(), {"input": {key: facts["input"][key] for key in _shown(facts["input"])}})
     unused = any(int(facts["input"][key]) for key in facts["input"] if _LOST.fullmatch(key))
     return leave(DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE)
+
+
+def _said(line: str) -> bool:
+    """Print a line; False where standard output takes none, as on a full disk: the twin goes on."""
+    try:
+        click.echo(line)
+        sys.stdout.flush()
+    except BrokenPipeError:  # nobody reads them any more
+        raise
+    except OSError:
+        return False
+    return True
 
 
 def _shown(values: dict[str, str]) -> list[str]:

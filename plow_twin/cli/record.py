@@ -16,6 +16,7 @@ from plow_twin.cli.console import (
     json_option,
     output_console,
     quiet_option,
+    say_error,
     show_facts,
 )
 
@@ -63,7 +64,7 @@ def record(
 
         def say(folder: Path) -> None:
             if not quiet:
-                click.echo(f"recording to {folder} until interrupted", err=True)
+                say_error(f"recording to {folder} until interrupted")
 
         facts = record_topics(
             folder,
@@ -73,14 +74,14 @@ def record(
             but=own,
             stopped=stopped,
             on_started=say,
-            on_trouble=lambda text: click.echo(f"plow-twin: {text}", err=True),
+            on_trouble=lambda text: say_error(f"plow-twin: {text}"),
         )
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:
         show_facts(output_console(), facts)
     for name, reason in facts["skipped_topics"].items():
-        click.echo(f"plow-twin: {name}: not recorded: {reason}", err=True)
+        say_error(f"plow-twin: {name}: not recorded: {reason}")
     for name in facts["without_publisher"]:
-        click.echo(f"plow-twin: {name}: not recorded: no publisher, expected one", err=True)
+        say_error(f"plow-twin: {name}: not recorded: no publisher, expected one")
     return DONE if facts["complete"] else DONE_WITH_LOSS

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from plow_twin.cli.console import json_option, output_console, progress, quiet_option, show_facts
+from plow_twin.cli.console import json_option, output_console, progress, quiet_option, say_error, show_facts
 
 if TYPE_CHECKING:
     from plow_twin.record.replay_report import ReplayReport
@@ -35,23 +35,23 @@ def replay(recording: Path, digests_only: bool, write: Path | None, as_json: boo
         report = run(recording, on_progress, digests_only=digests_only, write=write)
     facts = _facts(report)
     if report.nothing:
-        click.echo("plow-twin: nothing could be compared", err=True)
+        say_error("plow-twin: nothing could be compared")
     if as_json:
         click.echo(json.dumps(facts, indent=2, allow_nan=False))
     elif not quiet:
         show_facts(output_console(), facts)
     if report.build_differences:
         other = ", ".join(f"{key} {there} (here {here})" for key, (there, here) in report.build_differences.items())
-        click.echo(f"plow-twin: warning: recorded by another build, which may round differently: {other}", err=True)
+        say_error(f"plow-twin: warning: recorded by another build, which may round differently: {other}")
     for file, read in report.repeated_parts.items():
-        click.echo(f"plow-twin: warning: {file} repeats {read}: it is not read", err=True)
+        say_error(f"plow-twin: warning: {file} repeats {read}: it is not read")
     for file, keys in report.foreign_parts.items():
         differ = ", ".join(keys)
-        click.echo(f"plow-twin: warning: {file} is of another run (its {differ} differ): it is not read", err=True)
+        say_error(f"plow-twin: warning: {file} is of another run (its {differ} differ): it is not read")
     if report.repeated:
-        click.echo(f"plow-twin: warning: {report.repeated} entries stand there more than once", err=True)
+        say_error(f"plow-twin: warning: {report.repeated} entries stand there more than once")
     if report.first_divergence is not None:
-        click.echo(f"plow-twin: diverged: {report.first_divergence}", err=True)
+        say_error(f"plow-twin: diverged: {report.first_divergence}")
     return report.exit_code
 
 

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.text import Text
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option, say_error
 
 if TYPE_CHECKING:
     from plow_twin.study.paper.rows import Row
@@ -61,7 +61,7 @@ def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: b
     with progress("the paper's figures (the first run compiles)", quiet) as on_progress:
         study = study_paper(model, scene, out, t_end, workers, recording, on_progress)
     if study.runs.failed:
-        click.echo(f"plow-twin: {study.runs.failed} run(s) failed; their rows are not computed", err=True)
+        say_error(f"plow-twin: {study.runs.failed} run(s) failed; their rows are not computed")
     if not quiet:
         _print(study, out)
     return DONE_WITH_LOSS if study.runs.failed else DONE

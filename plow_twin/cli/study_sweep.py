@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from plow_twin.cli.console import (
-    DONE,
-    DONE_WITH_LOSS,
-    POSITIVE,
-    output_console,
-    progress,
-    quiet_option,
-)
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option, say_error
 from plow_twin.cli.console import table as rich_table
 from plow_twin.cli.study_options import set_option, study_scene, usage_errors
 
@@ -88,9 +81,7 @@ def sweep(
         _show(result, out)
     _list_failed(result)
     if len(result.builds) > 1:
-        click.echo(
-            "plow-twin: warning: computed by several builds, which may round differently (see metadata)", err=True
-        )
+        say_error("plow-twin: warning: computed by several builds, which may round differently (see metadata)")
     return DONE_WITH_LOSS if result.failed else DONE
 
 
@@ -101,11 +92,11 @@ def _list_failed(result: Table) -> None:
         values = ", ".join(f"{path}={_text(value)}" for path, value in result.sweep.values(member).items())
         reasons.setdefault(result.reason(member), []).append(values)
     for reason, members in reasons.items():
-        click.echo(f"plow-twin: {len(members)} of {result.sweep.size} members failed: {reason}", err=True)
+        say_error(f"plow-twin: {len(members)} of {result.sweep.size} members failed: {reason}")
         for values in members[:MOST_ROWS]:
-            click.echo(f"  {values}", err=True)
+            say_error(f"  {values}")
         if len(members) > MOST_ROWS:
-            click.echo(f"  and {len(members) - MOST_ROWS} more, in sweep.parquet", err=True)
+            say_error(f"  and {len(members) - MOST_ROWS} more, in sweep.parquet")
 
 
 def _computed(store: Store, workers: int | None, dask: str | None, quiet: bool) -> Table:
@@ -114,7 +105,7 @@ def _computed(store: Store, workers: int | None, dask: str | None, quiet: bool) 
     size, chunks = store.sweep.size, store.chunks
     lacking = sum(len(chunks[index]) for index in store.missing())
     if not quiet:
-        click.echo(f"{size} members, {size - lacking} stored before, {lacking} to compute", err=True)
+        say_error(f"{size} members, {size - lacking} stored before, {lacking} to compute")
     with progress("sweeping", quiet) as on_progress:
 
         def report(done: int) -> None:

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as a clean stop."""
+"""SIGINT, SIGTERM and SIGHUP as a clean stop."""
 
 from __future__ import annotations
 
@@ -11,8 +11,14 @@ class StopRequested(BaseException):
     """The process was asked to stop while it could not look at a flag."""
 
 
+def stop_signals() -> list[signal.Signals]:
+    """Return the signals that ask for a stop: SIGHUP, of a terminal that goes, unless it is ignored, as by `nohup`."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [signal.SIGINT, signal.SIGTERM, *([] if ignored else [signal.SIGHUP])]
+
+
 class StopSignals:
-    """SIGINT and SIGTERM as a flag; while `interrupt` is set (a long start), as `StopRequested`.
+    """SIGINT, SIGTERM and SIGHUP as a flag; while `interrupt` is set (a long start), as `StopRequested`.
 
     A context: when it is left, the signals do what they did before.
     """
@@ -20,7 +26,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.stopped = False
         self.interrupt = True
-        self._before = {number: signal.signal(number, self._handle) for number in (signal.SIGINT, signal.SIGTERM)}
+        self._before = {number: signal.signal(number, self._handle) for number in stop_signals()}
 
     def __enter__(self) -> Self:
         return self
