@@ -347,6 +347,16 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
                 reader(path)
 
 
+def test_files_wait_for_a_recorder_that_is_slow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What comes as fast as it goes comes in batches, each of which fills a quarter of this queue."""
+    monkeypatch.setattr("plow_twin.live.recording._QUEUE_SIZE", 2400)
+    monkeypatch.setattr("plow_twin.record.recorder._POLL_S", 0.3)
+    path = _csv(tmp_path / "load.csv", 2000)
+    assert run_cli(["live", str(path), "--record", str(tmp_path / "run"), "--quiet"]) == 0
+    report = replay(tmp_path / "run")
+    assert (report.exit_code, report.compared["contact_forces"]) == (0, 2000)
+
+
 def test_a_full_disk_under_the_log_does_not_end_the_twin(tmp_path: Path) -> None:
     _csv(tmp_path / "load.csv", 50)
     arguments = ["live", str(tmp_path / "load.csv"), "--record"]

@@ -334,7 +334,7 @@ class Runtime:
         self.publishing.received_ns = now_ns = time.monotonic_ns()
         for publication in self.driver.samples(arrived, now_ns):
             self.publishing.publish(publication)
-        self._advanced()
+        self._advanced(len(arrived))
 
     def silence(self) -> float:
         """Go on without samples when they have been missing for too long; return how long that cannot be so [s]."""
@@ -449,13 +449,16 @@ class Runtime:
         stamp_ns = self.driver.session.stamp_ns
         return self._front.now_ns() if stamp_ns is None else stamp_ns
 
-    def _advanced(self) -> None:
+    def _advanced(self, count: int = 1) -> None:
         if self.recording:
             if self.recording.wants_snapshot:
                 self._renew_recording()
-            if self._front.follows_samples and self.recording.behind:
-                # nothing is late: a bounded pause lets the recorder's thread catch up
-                time.sleep(_CATCH_UP_S)
+            if self._front.follows_samples:
+                # nothing is late: a pause, bounded by the number of samples, lets the recorder's thread catch up
+                pauses = count
+                while pauses and self.recording.behind:
+                    time.sleep(_CATCH_UP_S)
+                    pauses -= 1
         unsteady = self.driver.unsteady(time.monotonic_ns())
         seen = (self.driver.state, tuple(self.inputs.other_senders()), unsteady)
         if seen != self._seen:
