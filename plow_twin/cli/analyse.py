@@ -39,7 +39,7 @@ from plow_twin.cli.console import (
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="YAML that says which topic is the excitation, the head_pose, the travel, the forces, the gaps.",
 )
-@click.option("--with", "others", multiple=True, help="A further scene to predict with; may be given many times.")
+@click.option("--with", "others", multiple=True, help="A further scene to predict with; may be repeated.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and Parquet.")
 @click.option("--workers", type=click.IntRange(1), help="Processes for many recordings; by default one a core.")
 @click.option(

@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     "scenarios",
     metavar="NAME:load=X,coefficient=Y",
     multiple=True,
-    help="The same for multiples of load and wear coefficient; may be given again.",
+    help="The same for multiples of load and wear coefficient; may be repeated.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="The same seed gives the same bits.")
 @click.option("--plot", type=click.Path(path_type=Path, dir_okay=False), help="PNG of clearances and probability.")

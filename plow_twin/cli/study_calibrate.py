@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     "unknowns",
     multiple=True,
     metavar="RANGE",
-    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; repeat it. Default: the target file's.",
+    help="PATH=LOW:HIGH[:log], PATH=CHOICE,CHOICE.. or, for a sign, PATH; may be repeated. Default: the target file's.",
 )
 @click.option("--target", metavar="FILE", help="Figures to fit to: a target file, or `paper` for the paper's.")
 @click.option(
-    "--without", multiple=True, metavar="PATTERN", help="Leave out targets by name, e.g. 'max at*'; repeat it."
+    "--without", multiple=True, metavar="PATTERN", help="Leave out targets by name, e.g. 'max at*'; may be repeated."
 )
 @click.option(
     "--recording",

@@ -16,7 +16,7 @@ set_option = click.option(
     "settings",
     multiple=True,
     metavar="PATH=VALUE",
-    help="Change a number or word of the scene first; repeat it.",
+    help="Change a number or word of the scene first; may be repeated.",
 )
 
 

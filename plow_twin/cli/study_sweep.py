@@ -30,7 +30,7 @@ _COLUMN, _FIRST_COLUMN = 12, 8
 @click.option("--x", "first", required=True, metavar="AXIS", help="PATH=LOW:HIGH:COUNT[:log] or PATH=VALUE,VALUE..")
 @click.option("--y", "second", metavar="AXIS", help="A second parameter, in the same form.")
 @click.option(
-    "--statistic", "statistics", multiple=True, required=True, metavar="PATH", help="E.g. max.ccw.a; repeat it."
+    "--statistic", "statistics", multiple=True, required=True, metavar="PATH", help="E.g. max.ccw.a; may be repeated."
 )
 @click.option("--t-end", metavar="T", type=POSITIVE, required=True, help="Time to simulate [s].")
 @click.option("--tol", type=POSITIVE, default=1e-9, show_default=True, help="Tolerance, relative to the clearance.")

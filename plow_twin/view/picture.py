@@ -106,12 +106,12 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     return reader.status, lost
 
 
-def _collected(reader: RunReader) -> tuple[_Largest, _Largest, _Largest, _Moment | None]:
-    """Return forces [kN], load [kN, kN m] and clearances [mm] over time, and the moment of the largest force."""
+def _collected(reader: RunReader) -> tuple[_Largest, _Largest, _Largest, _Instant | None]:
+    """Return forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force."""
     force, load, clearance = drawn = _Largest(8), _Largest(3), _Largest(6)
     names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}
     first_ns: int | None = None
-    shown: _Moment | None = None
+    shown: _Instant | None = None
     held, gaps = np.zeros(8), np.zeros(8)
     reached: int | None = None  # number of the newest entry
     for record in reader:
@@ -131,7 +131,7 @@ def _collected(reader: RunReader) -> tuple[_Largest, _Largest, _Largest, _Moment
             turn = message.orientation
             now = (message.position[0], message.position[1], 2.0 * math.atan2(turn[2], turn[3]))
             if shown is None or held.max() > shown.force.max():
-                shown = _Moment(now, held, gaps)
+                shown = _Instant(now, held, gaps)
         elif isinstance(message, JointState):
             first_ns = message.stamp_ns if first_ns is None else first_ns
             time_s = (message.stamp_ns - first_ns) * 1e-9
@@ -149,7 +149,7 @@ def _clearance_row(message: JointState) -> NDArray[np.float64]:
     return np.array([1e3 * message.position[message.name.index(name)] for name in wanted])
 
 
-class _Moment(NamedTuple):
+class _Instant(NamedTuple):
     """Pose x, y [m], theta [rad] of the head at a stamp, forces [N] and penetrations [m] of the pairs."""
 
     pose: tuple[float, float, float]
@@ -163,8 +163,8 @@ def _say_nothing(axis: Any, text: str) -> None:
     axis.set(yticks=[])
 
 
-def _draw_section(axis: Any, section: Section, moment: _Moment) -> None:
-    pose, force, largest = moment.pose, moment.force, float(moment.force.max())
+def _draw_section(axis: Any, section: Section, instant: _Instant) -> None:
+    pose, force, largest = instant.pose, instant.force, float(instant.force.max())
     axis.plot(*section.frame_strip().T, color="0.5", label=section.frame_name)
     for number, strip in enumerate(section.head_strips(pose)):
         axis.plot(*strip.T, color="k", lw=1.0, label="" if number else "head")
