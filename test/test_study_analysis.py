@@ -561,7 +561,7 @@ def mutate_many(tmp_path: Path, motion: tuple[np.ndarray, ...], seeds: Iterable[
 
 
 def test_mutated_files_give_an_error_or_counted_loss(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
-    mutate_many(tmp_path, motion, range(150))
+    mutate_many(tmp_path, motion, range(500))
 
 
 @pytest.mark.stress
