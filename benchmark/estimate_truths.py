@@ -76,6 +76,7 @@ GROUPS = {
     "coarse_load": Group("stochastic load, sampled at 100 Hz", stochastic=True),
     "worn": Group("wear of some 0.1 mm in the window", wear_m2_n=5e-13),
     "middle": Group("K 3e7 .. 3e8", stiffness=(3e7, 3e8)),
+    "firm": Group("K 3e8 .. 1e9", stiffness=(3e8, 1e9)),
     "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
     "hard_sensor": Group("hard, with bias, delay, gaps", stiffness=(1e9, 1e11), bias_m=5e-3, delay_s=0.05, gaps=True),
     "forces": Group("with measured forces, 1 kHz", forces_hz=1e3),

@@ -27,6 +27,7 @@ from plow_twin.estimate.fit import link_weights
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.gaps import Gaps, GapsError, tell
 from plow_twin.estimate.laws import Draws, log_odds
+from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import EstimateError, Load, Poses, believed
 from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
 from plow_twin.estimate.similar import Units
@@ -335,6 +336,29 @@ def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
     bounced = Bounced(two, two, np.zeros(3), np.ones(3), (-8.0, 500.0), (0.0, 1.0), np.ones(3), 1.0, 1.0, 0.0, -np.inf)
     text = json.dumps(summarise_bounced(unknowns, poses, bounced, 0, 0).as_dict(), allow_nan=False)
     assert json.loads(text)["stiffness"]["p95"] > 1e9
+
+
+def test_of_more_parts_of_a_path_than_motions_drawn_the_likeliest_clearances_are_told() -> None:
+    """Each drawn motion is told as one that was not drawn is, whatever it was drawn with and however late it is."""
+    rng = np.random.default_rng(5)
+    slopes, curve, common, late = (rng.standard_normal((rows, 150)) for rows in (7, 1, 3, 1))
+    scale, middle = np.array([3e-4, 3e-4, 0.3, 0.3, 0.06, 0.06, 0.06]), np.array([0.02, 0.03, -7.0, 0.0, 1.0, 1.0, 1.0])
+
+    def motions(count: int) -> tuple[np.ndarray, Seen]:
+        points = rng.standard_normal((count, 7))
+        like = points @ slopes + (points[:, :1] * points[:, 2:3]) @ curve + rng.standard_normal((count, 3)) @ common
+        like += 2e-3 * rng.standard_normal((count, 1)) @ (200.0 * late) + rng.standard_normal(like.shape)
+        return middle + scale * points, Seen(like, np.tile(200.0 * late, (count, 1)))
+
+    drawn, seen = motions(120)
+    fresh, others = motions(60)
+    rows = zip(others.like[:, None], others.late[:, None], strict=True)
+    told = np.array([likeliest(drawn, 0.06, seen, Seen(*row))[-1] for row in rows])
+    off = (told - fresh[:, :2]).std(axis=0)
+    of_drawn = (likeliest(drawn, 0.06, seen, motions(1)[1])[:-1] - drawn[:, :2]).std(axis=0)
+    print(off / scale[:2], of_drawn / off)
+    assert (off < 0.15 * scale[:2]).all()
+    assert of_drawn == pytest.approx(off, rel=0.25)
 
 
 def test_the_regression_of_bounces_gives_the_value_at_what_was_measured() -> None:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.laws import Draws, log_odds
+from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches, smooth_width
 from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, OTHER_LAW, SOFTNESS, Unknowns, with_other_law
@@ -62,8 +63,9 @@ _NO_LAG = 4
 _DRAWS, _CLEARANCE = (30, 30, 40), (1.2e-3, 3e-4, 3e-4)
 #: The same of one round more for firm contacts.
 _MORE_DRAWS, _NEARER = 100, 2.5e-4
-#: Distance of the first round from which on the contact is not hard (1.4 at most in six hard ones, 5 to 24 of others).
-_NOT_HARD = 3.0
+#: Distance of the first round from which on the contact is not hard (seeds 46100 to 46209: 0.8 at most in ten hard
+#: ones, 1.3 to 3 in eight of 4.7e8 to 9.2e8 N/m that were taken for hard until then).
+_NOT_HARD = 1.2
 #: Draws of another law, and the steps in ten load periods after which no further one is made; median share of the
 #: critical damping that they have, and the deviation of its logarithm.
 _OTHER_DRAWS, _OTHER_WORK = 60, 1_500_000
@@ -87,8 +89,6 @@ _DAMPING, _GAIN = 0.7, 0.06
 #: left them times a factor, and no nearer than the last. Set on seeds 43200 to 43215 of the benchmark.
 _FIRM_BOUNDS = (2e-6, 2e-2)
 _FIRM_SPREAD, _NARROWED, _NEAREST = 0.5, 1.5, 0.1
-#: Widening of their clearances: thirteen truths erred by 1.2 of what the regression said (seeds 43200 to 43213).
-_WIDENED_FIRM = 1.25
 #: Penetration in m from which on a fit moment by moment tells more, the law too.
 FITTED = 8e-4
 #: Correction of the last round in m from which on nothing has been found.
@@ -240,8 +240,14 @@ def compare(
             # those of the first round were seen at other times: only their phase is set right
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
             drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
-            drawn.q.clear()
-        found = _regress(features[:, 5:], np.array(drawn.targets), measured[5:])
+        else:
+            paths += [eye.paths(q, _OF_DRAWN_S) for q in drawn.q]
+        drawn.q.clear()
+        like, seen, targets = features[:, 5:], measured[5:], np.array(drawn.targets)
+        if near is not None and found is not None:
+            likely = _likeliest(features, targets, np.array(paths), measured, eye.paths(eye.q, _OF_DRAWN_S))
+            like, seen = np.concatenate([like, likely[:-1]], axis=1), np.concatenate([seen, likely[-1]])
+        found = _regress(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
         if near is None and len(features) <= _DRAWS[0] and found.distance > _NOT_HARD:
@@ -251,9 +257,8 @@ def compare(
             if len(rounds) == len(_DRAWS) and count == _DRAWS[-1] and found.value[5] < math.log(FITTED):
                 rounds.append((_MORE_DRAWS, _NEARER))  # no fit follows
     assert found is not None
-    paths += [eye.paths(q, _OF_DRAWN_S) for q in drawn.q]
     # what still moves has not been found
-    deviation = np.hypot(found.deviation[:2], moved) * (1.0 if near is None else _WIDENED_FIRM)
+    deviation = np.hypot(found.deviation[:2], moved)
     deviation[np.abs(moved) > _ASTRAY] = np.inf
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(FITTED):
@@ -353,6 +358,30 @@ class _Drawn:
         """Return what the motions are like, by phase of the load too, and what they were drawn with."""
         of_draw = np.array(self.targets)[:, [5, 6, 7, 8, 9, 0, 1]]
         return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
+
+
+def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
+    """Return by how much the likeliest clearances of each drawn and of the measured motion differ from the reach.
+
+    Shape (n + 1, 2), in m; of what `seen` and `paths`, (lags, k) and (n, lags, k), hold the mean poses are used.
+    """
+    before, after = _NO_LAG - 1, _NO_LAG + 1
+    paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
+    there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
+
+    def motions(features: Array, paths: Array) -> Seen:
+        like = np.concatenate([features[:, :2], features[:, 5:]], axis=1)
+        late = (paths[:, after] - paths[:, before]) / (_OF_DRAWN_S[after] - _OF_DRAWN_S[before])
+        return Seen(
+            np.concatenate([like, paths[:, _NO_LAG, there]], axis=1),
+            np.concatenate([np.zeros_like(like), late[:, there]], axis=1),
+        )
+
+    reach = features[:, :2]
+    drawn = np.concatenate([targets[:, :2] + reach, targets[:, 5:]], axis=1)
+    likely = likeliest(drawn, _GAIN, motions(features, paths), motions(measured[None], seen[None]))
+    off: Array = likely - np.concatenate([reach, measured[None, :2]])
+    return off
 
 
 def _delay(eye: _Eye, features: Array, drawn: list[Array], measured: Array) -> float:

@@ -253,7 +253,7 @@ def _searched(
         if narrow and penetration > HARD:
             # a head that is held to one side reaches as narrowly as a hard wall lets it
             return _without_fit(unknowns, poses, lost, "the head reaches one place, and no hard wall is there"), ()
-        if penetration < SURE:
+        if penetration < SURE and not narrow:
             bounced = compare(forward, unknowns, poses, period)
         if bounced is None and penetration < HARD:
             bounced = compare(forward, unknowns, poses.moved(-first.shared[BIAS]), period, first.shared)
