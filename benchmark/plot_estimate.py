@@ -20,8 +20,8 @@ from plow_twin.estimate.result import NORMAL_P95, State
 
 #: Groups that are drawn, with their colours, in the order of the legend; first seed that nothing was set on.
 STYLES = {
-    "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "hard": "#d62728",
-    "hard_sensor": "#9970ab",
+    "plain": "#1f4e9c", "sensor": "#5aae61", "stochastic": "#dfa526", "middle": "#8c510a", "firm": "#35978f",
+    "hard": "#d62728", "hard_sensor": "#9970ab",
 }  # fmt: skip
 _FRESH = 50_000
 #: Largest error that is drawn at its place [mm].

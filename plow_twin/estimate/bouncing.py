@@ -63,6 +63,8 @@ _NO_LAG = 4
 _DRAWS, _CLEARANCE = (30, 30, 40), (1.2e-3, 3e-4, 3e-4)
 #: The same of one round more for firm contacts.
 _MORE_DRAWS, _NEARER = 100, 2.5e-4
+#: Deviation in m below which clearances are known well enough without it for a fit that follows.
+_ENOUGH_FOR_FIT = 1.2e-4
 #: Distance of the first round from which on the contact is not hard (seeds 46100 to 46209: 0.8 at most in ten hard
 #: ones, 1.3 to 3 in eight of 4.7e8 to 9.2e8 N/m that were taken for hard until then).
 _NOT_HARD = 1.2
@@ -250,15 +252,16 @@ def compare(
         found = _regress(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
+        # what still moves has not been found
+        deviation = np.hypot(found.deviation[:2], moved)
         if near is None and len(features) <= _DRAWS[0] and found.distance > _NOT_HARD:
             return None
         if near is not None:
             drawn.spread = drawn.spread.narrowed(found)
-            if len(rounds) == len(_DRAWS) and count == _DRAWS[-1] and found.value[5] < math.log(FITTED):
-                rounds.append((_MORE_DRAWS, _NEARER))  # no fit follows
+            followed = found.value[5] > math.log(FITTED) and deviation.max() < _ENOUGH_FOR_FIT
+            if len(rounds) == len(_DRAWS) and count == _DRAWS[-1] and not followed:
+                rounds.append((_MORE_DRAWS, _NEARER))
     assert found is not None
-    # what still moves has not been found
-    deviation = np.hypot(found.deviation[:2], moved)
     deviation[np.abs(moved) > _ASTRAY] = np.inf
     law, odds = 0.0, -math.inf
     if found.value[5] < math.log(FITTED):
