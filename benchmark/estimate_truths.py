@@ -54,6 +54,8 @@ class Group:
     shift_m: float = 0.0
     stuck: bool = False
     noisier: float = 1.0
+    #: measured over true x, y, theta
+    sensor_scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
     #: wear coefficient of the truth; the estimate knows of none
     wear_m2_n: float = 0.0
     #: load cells at all pairs: rate, noise, deviation of each one's gain, largest delay of them all
@@ -98,6 +100,16 @@ GROUPS = {
     "jam": Group("packed coal: 4 mm less from a moment on", jam_m=4e-3, model="suspect"),
     "shift": Group("sensor shifted by 3 mm", shift_m=3e-3, sensor="suspect"),
     "stuck": Group("sensor stuck", stuck=True, sensor="suspect"),
+    "scale_xy": Group("x and y 3 % too large", sensor_scale=(1.03, 1.03, 1.0), sensor="suspect"),
+    "scale_theta": Group("theta 2 % too large", sensor_scale=(1.0, 1.0, 1.02), sensor="suspect"),
+    "scale_all": Group("x, y and theta 5 % too large", sensor_scale=(1.05, 1.05, 1.05), sensor="suspect"),
+    "stochastic_scale_xy": Group(
+        "stochastic load, x and y 3 % too large",
+        stochastic=True,
+        load_step=2e-3,
+        sensor_scale=(1.03, 1.03, 1.0),
+        sensor="suspect",
+    ),
     "noisier": Group("sensor 4 times noisier from a moment on", noisier=4.0, sensor="suspect"),
 }
 
@@ -158,7 +170,7 @@ def draw(group: Group, seed: int) -> Truth:
     delay = group.delay_s * rng.uniform()
     bias = group.bias_m * rng.standard_normal(3) * np.array([1.0, 1.0, 3.0])
     motion, clearance, force = _motion(scene, group, np.maximum(t - delay, 0.0), end)
-    q = motion + bias
+    q = motion * group.sensor_scale + bias
     measured = _sensor(group, rng, t, q)
     keep = _kept(group, rng, t, measured)
     knots = np.arange(0.0, end + group.load_step, group.load_step)

@@ -148,6 +148,7 @@ def test_members_are_drawn_with_the_estimate_s_correlation(known: list[tuple[Tru
         pytest.param("kelvin_voigt", marks=pytest.mark.stress),
         pytest.param("jam", marks=pytest.mark.stress),
         "shift",
+        "scale_xy",
         *(
             pytest.param(name, marks=pytest.mark.stress)
             for name in ("exponent", "shape", "scale", "stuck", "noisier", "hard_shape", "hard_kelvin_voigt")

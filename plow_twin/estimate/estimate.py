@@ -93,6 +93,9 @@ UNFINISHED = 1.3
 #: Chi^2 of the four turns of the walls from which on they are turned: of right models (seeds 42000 to 42004, 3 groups
 #: of the benchmark) it was 9 at most, of walls worn askew it was 25 from a sixth of the year of examples/a_year on.
 MOST_ASKEW = 25.0
+#: The same in the chi^2 of the sensor's scales, since each explains the other in part: walls worn askew had 5 and more
+#: (0.3 to 1 times the wear late in a life), scales of 1.05 had 0.4 to 1.6.
+MORE_ASKEW = 3.0
 #: Most that the freedom of the fit adds to the scatter of few swings.
 _MOST_FREED = 3.0
 #: How far gaps may be from each other, and from what the motion says, in standard deviations of theirs.
@@ -309,8 +312,10 @@ def _with_turns(found: tuple[Problem, Fit], verdict: Verdict, period: float) -> 
 
     Walls taken for straight make the clearance too small, by 0.2 mm where pads differ by 1.2 mm.
     """
+    if verdict.sensor and not verdict.by_scale:
+        return found, verdict
     fits = not verdict.model and found[1].finished
-    if verdict.sensor or (fits and askew(*found) < MOST_ASKEW):
+    if fits and askew(*found) < (MORE_ASKEW * verdict.figures["scale"] if verdict.by_scale else MOST_ASKEW):
         return found, verdict
     again = turned(*found)
     other = None if again is None else judge(*again, period)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.arrow import OWN
 from plow_twin.estimate.fit import Fit, Problem, joint_step, pieces
 from plow_twin.estimate.measurements import FEWEST_POSES, Poses
+from plow_twin.estimate.scales import scales_of
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, DAMPING, GAIN, GX, GY, SIZE, SOFTNESS, with_other_law
 
@@ -43,17 +44,20 @@ MOMENTS = 60
 MOST_LAW_STEP, LAW_DAMPING = 5.0, 0.05
 #: Precision of an unknown of which nothing is known.
 _FREE = 1e-6
+#: Chi^2 of the sensor's three scales beside a fit that holds else (right models have 12 at most, see docs/estimate.md).
+MOST_SCALE = 16.0
 #: Quick noise of one part of the window over that of the rest.
 MOST_NOISE_RATIO = 2.0
 
 
 @dataclass
 class Verdict:
-    """What was found; `figures` are the statistics behind it."""
+    """What was found; `figures` are the statistics behind it; `by_scale`: only its scales are against the sensor."""
 
     model: list[str] = field(default_factory=list)
     sensor: list[str] = field(default_factory=list)
     figures: dict[str, float] = field(default_factory=dict)
+    by_scale: bool = False
 
 
 def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
@@ -75,6 +79,7 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
     if verdict.sensor:
         # with a sensor that is wrong nothing can be said about the model
         verdict.model.clear()
+    _scale(problem, fit, verdict)
     return verdict
 
 
@@ -176,6 +181,21 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     if abs(moved) > MOST_LAW_STEP and not verdict.sensor:
         verdict.model.append(
             f"residuals like those of another contact law: {moved:.1f}, expected at most {MOST_LAW_STEP:g}"
+        )
+
+
+def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
+    """Tell whether the sensor's scales are other ones; what a wrong model leaves over is told by other tests."""
+    if not fit.finished:
+        return
+    scales = scales_of(problem, fit)
+    verdict.figures["scale"] = scales.chi2
+    if scales.chi2 > MOST_SCALE and not (verdict.sensor or verdict.model):
+        verdict.by_scale = True
+        x, y, theta = scales.scale.tolist()
+        verdict.sensor.append(
+            f"scales of x, y, theta like {x:.3f}, {y:.3f}, {theta:.3f}: chi^2 {scales.chi2:.0f}, expected at most "
+            f"{MOST_SCALE:g}"
         )
 
 
