@@ -29,7 +29,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record import ring
 from plow_twin.record.bag import BagWriter, Topic
 from plow_twin.record.entries import EntryRecord, OutputRecord
-from plow_twin.record.header import RunHeader
+from plow_twin.record.header import LOSS_RECORD, RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.mcap_file import UnbufferedFile
 from plow_twin.record.messages import JointState
@@ -197,6 +197,11 @@ def test_a_full_queue_is_counted_and_noted_in_the_file(tmp_path: Path) -> None:
     for entry, following in itertools.pairwise(told):
         assert not isinstance(entry, Loss) or isinstance(following, Snapshot)
     assert reader.lost == dict(loss.lost)
+    # of one that was killed the notes are left
+    data = reader.path.read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: data.index(LOSS_RECORD.encode())])
+    cut = RunReader(tmp_path / "cut.mcap")
+    assert [*cut.batches(outputs=False)] and (cut.status, cut.lost) == (FileStatus.TRUNCATED, reader.lost)
     bag = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert bag["custom_data"] == {f"plow_twin_lost {topic}": str(count) for topic, count in loss.lost.items()}
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.record.unused import InputCounts, noted_loss
+from plow_twin.record.unused import InputCounts
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
@@ -21,17 +20,12 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     """
     reader = RunReader(path)
     first = last = None
-    noted: Counter[str] = Counter()
     inputs = InputCounts(reader.header.excitation_source)
     for record in reader:
         first = record.log_time_ns if first is None else first
         last = record.log_time_ns
         if isinstance(record, EntryRecord):
             inputs.add_entry(record.entry)
-            noted += noted_loss(record.entry)
-    # the recorder's closing count is the complete one; without it the notes in place are all there is
-    lost = {topic: count for topic, count in (reader.lost or noted).items() if count}
-    lost |= reader.lost_parts
     header = reader.header
     facts: dict[str, Any] = {
         "file": str(reader.path),
@@ -40,7 +34,7 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
         "duration_s": 0.0 if first is None or last is None else (last - first) * 1e-9,
         "messages": dict(sorted(reader.counts.items())),
         "inputs": inputs.facts(),
-        "lost": lost,
+        "lost": {**reader.lost, **reader.lost_parts},
         "damaged_chunks": reader.damaged_chunks,
         "foreign_parts": {file.name: list(keys) for file, keys in reader.foreign.items()},
         "run_id": header.run_id,
@@ -53,4 +47,4 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
         "build": dict(header.build),
         "parameters": dict(header.parameters),
     }
-    return facts, bool(lost) or reader.status is not FileStatus.COMPLETE
+    return facts, bool(facts["lost"]) or reader.status is not FileStatus.COMPLETE

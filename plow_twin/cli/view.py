@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, counts, progress, quiet_option
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, counts, progress, quiet_option, say_error
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
@@ -131,9 +131,9 @@ def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int]) -> 
 
     whole = status in (FileStatus.COMPLETE, FileStatus.UNREAD)
     if not whole:
-        click.echo(f"plow-twin: {recording}: {status.value}", err=True)
+        say_error(f"plow-twin: {recording}: {status.value}")
     if lost:
-        click.echo(f"plow-twin: {recording}: lost {counts(lost)}", err=True)
+        say_error(f"plow-twin: {recording}: lost {counts(lost)}")
     return not whole or bool(lost)
 
 

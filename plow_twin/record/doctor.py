@@ -31,7 +31,7 @@ from plow_twin.record.metadata_yaml import (
     write_metadata,
 )
 from plow_twin.record.reader import FileStatus, RunReader, run_parts
-from plow_twin.record.unused import InputCounts, noted_loss
+from plow_twin.record.unused import InputCounts
 from plow_twin.stream.journal import Digest, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
@@ -123,7 +123,6 @@ def examine(path: Path) -> RunReport:
     report.parts = [_part(part) for part in reader.parts]
     expected: int | None = None if reader.header.part else 0
     first = last = None
-    noted: Counter[str] = Counter()
     in_a_row = 0  # entries before the expected one without a gap
     inputs = InputCounts(reader.header.excitation_source)
     for batch in reader.batches(outputs=False):
@@ -142,9 +141,7 @@ def examine(path: Path) -> RunReport:
             if entry is None:
                 stamp = int(entries.stamp_ns[index])
                 first, last = stamp if first is None else first, stamp
-            else:
-                noted += noted_loss(entry)
-    report.lost = {topic: count for topic, count in (reader.lost or noted).items() if count}
+    report.lost = dict(reader.lost)
     report.inputs = inputs.facts()
     report.span_s = 0.0 if first is None or last is None else (last - first) * 1e-9
     report.status = reader.status.value

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum
@@ -29,7 +29,7 @@ from plow_twin.record.journal_codec import Dropped, from_message, read_digests
 from plow_twin.record.messages import MESSAGE_TYPES, Message, WrenchStamped
 from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.template import Indexes, Template, read_numbers
-from plow_twin.stream.journal import Entry, Sample
+from plow_twin.stream.journal import Entry, Loss, Sample
 
 #: Journal entries that may wait for the messages sent after them [entries]: bounds the memory.
 _PENDING: Final = 65_536
@@ -57,13 +57,13 @@ class FileStatus(Enum):
 class RunReader:
     """Iterate over the records of a recording, a folder or an `.mcap` file.
 
-    `status`, `damaged_chunks`, `lost` (by topic, as the recorder counted), `stop_reason` (why it stopped early, if it
-    did) and `counts` (records by topic) hold once the iteration has ended; `position` is the share of the files that
-    has been read, 0..1. `path` is the first file, `parts` are all but those `repeated`: files that hold a part once
-    more, with the file that is read for it, and those `foreign`: of another run, by what differs in their headers from
-    most. A part that is no MCAP file counts as a damaged chunk. `missing_parts` counts parts of a folder that are
-    named by `metadata.yaml`, or by those around them, and not there; `lost_parts` has both counts, where there are any.
-    Parts that are removed while others are read are passed over like those that were not there before.
+    `status`, `damaged_chunks`, `lost`, `stop_reason` (why it stopped early, if it did) and `counts` (records by topic)
+    hold once the iteration has ended; `position` is the share of the files that has been read, 0..1. `path` is the
+    first file, `parts` are all but those `repeated`: files that hold a part once more, with the file that is read for
+    it, and those `foreign`: of another run, by what differs in their headers from most. A part that is no MCAP file
+    counts as a damaged chunk. `missing_parts` counts parts of a folder that are named by `metadata.yaml`, or by those
+    around them, and not there; `lost_parts` has both counts, where there are any. Parts that are removed while others
+    are read are passed over like those that were not there before.
 
     With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
     follows each time that all there is has been read.
@@ -82,7 +82,6 @@ class RunReader:
     foreign: dict[Path, tuple[str, ...]] = field(default_factory=dict, init=False)
     status: FileStatus = field(default=FileStatus.UNREAD, init=False)
     damaged_chunks: int = field(default=0, init=False)
-    lost: Mapping[str, int] = field(default_factory=dict, init=False)
     stop_reason: str | None = field(default=None, init=False)
     counts: Counter[str] = field(default_factory=Counter, init=False)
     position: float = field(default=0.0, init=False)
@@ -90,6 +89,8 @@ class RunReader:
     def __post_init__(self) -> None:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
+        self._counted: Counter[str] = Counter()
+        self._noted: dict[int, Loss | Dropped] = {}  # by their places: an entry may stand in two chunks
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
@@ -147,6 +148,14 @@ class RunReader:
         return between + sum(number >= 0 and not known[0] < number < known[-1] for number in named)
 
     @property
+    def lost(self) -> dict[str, int]:
+        """What is not in the recording, by topic, as its recorder counted on closing, or noted until it was killed."""
+        noted: Counter[str] = Counter()
+        for entry in self._noted.values():
+            noted[entry.topic if isinstance(entry, Dropped) else "journal"] += entry.count
+        return dict(self._counted | noted)
+
+    @property
     def lost_parts(self) -> dict[str, int]:
         """Parts that are not there and parts of another run, under their names in `lost`; not those that are 0."""
         missing = self.missing_parts if self.tail is None else 0  # a tail may outlive the oldest ones
@@ -169,9 +178,17 @@ class RunReader:
 
     def batches(self, *, outputs: bool = True) -> Iterator[Batch]:
         """Yield the records in order, many at a time; without `outputs` the journal alone, as fast as can be."""
-        self.status, self.damaged_chunks, self.lost, self.position = FileStatus.UNREAD, 0, {}, 0.0
-        self.stop_reason = None
+        self.status, self.damaged_chunks, self.position, self.stop_reason = FileStatus.UNREAD, 0, 0.0, None
         self.counts.clear()
+        self._counted.clear()
+        self._noted.clear()
+        for batch in self._batches(outputs):
+            for index, entry in batch.entries.rest.items():
+                if isinstance(entry, Loss | Dropped):
+                    self._noted[int(batch.entries.sequence[index])] = entry
+            yield batch
+
+    def _batches(self, outputs: bool) -> Iterator[Batch]:
         merger = _Merger(self, outputs)
         size, before = self.size(), 0
         finished, cut = True, False
@@ -253,10 +270,10 @@ class RunReader:
             return
         self.stop_reason = record.pop(STOPPED_EARLY_KEY, self.stop_reason)
         try:
-            counted = {topic: int(count) for topic, count in record.items()}
+            counted = Counter({topic: int(count) for topic, count in record.items()})
         except ValueError as error:
             raise RecordingError(f"{self.path}: metadata {LOSS_RECORD!r}: {error}, expected counts") from error
-        self.lost = counted  # counted over the whole run: the newest part knows all
+        self._counted = counted  # counted over the whole run: the newest part knows all
 
 
 class _Merger:

@@ -157,7 +157,7 @@ class _Replay:
         self.messages: Mapping[str, Message] | None = None
         self.first_ns: int | None = None
         self.gaps = 0
-        self.noted: Counter[str] = Counter()  # losses, as noted at their place in the journal
+        self.lost_entries = 0  # as noted at their place in the journal
         self.inputs = InputCounts(header.excitation_source)
         self.alarms = AlarmCheck(header, self.all_outputs)
 
@@ -378,11 +378,10 @@ class _Replay:
         self.report.entries += 1
         match record.entry:
             case Loss(count):
-                self.noted["journal"] += count
+                self.lost_entries += count
                 self.alarms.give_up()
                 self.synced = self.outputs_synced = False
-            case Dropped(topic, count):
-                self.noted[topic] += count
+            case Dropped():
                 self.alarms.give_up()
                 self.outputs_synced = False
             case Snapshot() as snapshot:
@@ -485,10 +484,9 @@ class _Replay:
         report.repeated_parts = {file.name: read.name for file, read in reader.repeated.items()}
         report.foreign_parts = {file.name: list(keys) for file, keys in reader.foreign.items()}
         report.stop_reason, report.inputs = reader.stop_reason, self.inputs.facts()
-        report.lost = {topic: count for topic, count in (Counter(reader.lost) | self.noted).items() if count}
-        report.lost |= reader.lost_parts
-        if self.gaps > self.noted["journal"]:
-            report.lost["journal, unaccounted"] = self.gaps - self.noted["journal"]
+        report.lost = {**reader.lost, **reader.lost_parts}
+        if self.gaps > self.lost_entries:
+            report.lost["journal, unaccounted"] = self.gaps - self.lost_entries
         if self.first_ns is not None and self.session.stamp_ns is not None:
             report.span_s = (self.session.stamp_ns - self.first_ns) * 1e-9
         return report

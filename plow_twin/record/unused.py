@@ -11,7 +11,7 @@ from typing import Any
 from plow_twin.record.entries import Entries
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.reader import RunReader
-from plow_twin.stream.journal import Entry, Gaps, Loss, PartOfPose, Pose, Sample, Travel, Unused
+from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Travel, Unused
 
 
 @dataclass
@@ -51,16 +51,6 @@ class InputCounts:
     def _count(self, topic: str, what: str, count: int) -> None:
         if count:
             self.counts.setdefault(topic, Counter())[what] += count
-
-
-def noted_loss(entry: Entry | Dropped) -> Counter[str]:
-    """Return what an entry says was not recorded before it, by topic; entries themselves under `journal`."""
-    match entry:
-        case Dropped(topic, count):
-            return Counter({topic: count})
-        case Loss(count):
-            return Counter({"journal": count})
-    return Counter()
 
 
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:

@@ -92,7 +92,7 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     below = figure.add_subplot(grid[2, 1:], sharex=axis)
     _bands(below, clearance, (scene.clearance.horizontal_m, scene.clearance.vertical_m))
     below.set_xlabel("time since the first stamp [s]")
-    lost = {name: count for name, count in {**reader.lost, **reader.lost_parts}.items() if count}
+    lost = {**reader.lost, **reader.lost_parts}
     told = [f"{name.replace('_', ' ')}: {count}" for name, count in lost.items()]
     if reader.status is not FileStatus.COMPLETE or not told:
         told.insert(0, reader.status.value)

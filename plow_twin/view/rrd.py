@@ -123,6 +123,5 @@ def to_rrd(
 
 def _span_ns(reader: RunReader, duration_s: float, most_rows: int) -> int:
     """Return the span in which a curve keeps two rows [ns]; 0 for a run of few rows."""
-    size = sum(part.stat().st_size for part in reader.parts)
-    rows = size / _BYTES_PER_ROW
+    rows = reader.size() / _BYTES_PER_ROW
     return 0 if rows <= most_rows else max(1, round(2e9 * duration_s / most_rows))

@@ -353,7 +353,7 @@ def _walk_own(
     journalled = Measured()  # where the node estimates
 
     def so_far() -> Analysis:
-        losses = Counter({topic: count for topic, count in reader.lost.items() if count} | reader.lost_parts)
+        losses = Counter({**reader.lost, **reader.lost_parts})
         if walk.missing:
             losses["journal"] = max(walk.missing, losses.get("journal", 0))
         if walk.late:
