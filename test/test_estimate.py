@@ -339,6 +339,20 @@ def test_a_contact_of_any_hardness_gives_finite_numbers() -> None:
     assert json.loads(text)["stiffness"]["p95"] > 1e9
 
 
+@pytest.mark.parametrize(
+    ("deviate", "odds", "model"),
+    [(2.5, -5.0, "suspect"), (2.5, -np.inf, "suspect"), (2.5, -44.0, "ok"), (2.0, -44.0, "ok"), (0.0, -2.0, "suspect")],
+)
+def test_a_motion_like_one_of_another_law_is_none_of_it_where_that_is_unlikely(
+    deviate: float, odds: float, model: str
+) -> None:
+    moved = np.random.default_rng(1).standard_normal((100, 3))
+    two, poses = np.full(2, 1e-3), Poses.of(np.arange(100) * 0.01, 1e-3 * moved)[0]
+    known = (-8.0, 0.5), (0.0, 1.0)
+    bounced = Bounced(two, 0.1 * two, np.zeros(3), np.ones(3), *known, np.ones(3), 1.0, 1.0, deviate, odds)
+    assert summarise_bounced(Unknowns(preset("paper")), poses, bounced, 0, 0).model == model
+
+
 def test_of_more_parts_of_a_path_than_motions_drawn_the_likeliest_clearances_are_told() -> None:
     """Each drawn motion is told as one that was not drawn is, whatever it was drawn with and however late it is."""
     rng = np.random.default_rng(5)
