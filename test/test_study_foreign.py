@@ -227,7 +227,7 @@ def test_a_full_disk_is_named_by_what_was_written(tmp_path: Path) -> None:
     (out / "analysis.json").symlink_to("/dev/full")
     with pytest.raises(OSError, match="No space left on device") as error:
         write_report(found, out)
-    assert error.value.filename == str(out)
+    assert error.value.filename == str(out / "analysis.json")
 
 
 def test_columns_of_any_name_dates_and_rows_of_several_signals_are_read(tmp_path: Path) -> None:
