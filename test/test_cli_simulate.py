@@ -20,6 +20,7 @@ import pytest
 from commands import plow_twin, plow_twin_here
 
 from plow_twin import PAIR_NAMES, simulate
+from plow_twin.record.durable import whole_file
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 
@@ -66,6 +67,12 @@ def test_a_file_is_the_one_before_or_whole_when_the_disk_is_full(suffix: str, tm
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert (done.returncode, done.stderr) == (1, f"plow-twin: {out}: File too large\n")
     assert out.read_bytes() == before and [*tmp_path.iterdir()] == [out]
+
+
+def test_what_a_library_says_of_a_file_is_kept(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="no such codec"), whole_file(tmp_path / "table"):
+        raise OSError("no such codec")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_what_is_no_file_is_written_to_as_it_is(tmp_path: Path) -> None:

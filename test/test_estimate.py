@@ -371,7 +371,6 @@ def test_of_more_parts_of_a_path_than_motions_drawn_the_likeliest_clearances_are
     told = np.array([likeliest(drawn, 0.06, seen, Seen(*row))[-1] for row in rows])
     off = (told - fresh[:, :2]).std(axis=0)
     of_drawn = (likeliest(drawn, 0.06, seen, motions(1)[1])[:-1] - drawn[:, :2]).std(axis=0)
-    print(off / scale[:2], of_drawn / off)
     assert (off < 0.15 * scale[:2]).all()
     assert of_drawn == pytest.approx(off, rel=0.25)
 

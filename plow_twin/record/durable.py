@@ -52,6 +52,8 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if sync:
             sync_path(place.parent)
     except OSError as error:
+        if error.errno is None:  # of a library, with a text of its own
+            raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 

@@ -36,7 +36,6 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     return dispatcher
 
 
-
 @dataclass(frozen=True)
 class Template:
     """The bytes of a message (`data`), where its numbers stand (`places`, shape (count,)), and a mask of the others.

@@ -1,4 +1,4 @@
-"""What the journal of a run says of its inputs, used or not, why and from whom, and of what was not recorded."""
+"""What came on the inputs of a run, by its journal: how much was used, and how much was not, why and from whom."""
 
 from __future__ import annotations
 
