@@ -16,7 +16,7 @@ from typing import Any, Final
 from plow_twin.errors import PlowTwinError
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
-from plow_twin.record.durable import sync_path
+from plow_twin.record.durable import write_whole
 
 #: The file in the folder that the user names.
 FILE_NAME: Final = "wear.json"
@@ -122,7 +122,7 @@ def claim_folder(folder: Path) -> int:
         raise WearStateError(f"{folder}: another twin keeps its wear there, expected a folder for each") from None
     except OSError:  # a file system without locks
         pass
-    beside = _beside(folder)
+    beside = folder / f".{FILE_NAME}.{os.getpid()}"
     try:
         beside.touch()
         beside.unlink()
@@ -135,11 +135,6 @@ def claim_folder(folder: Path) -> int:
 def _unwritable(folder: Path, error: OSError) -> WearStateError:
     reason = error.strerror or str(error)
     return WearStateError(f"wear_state_path: got {str(folder)!r}, expected a folder that can be written to: {reason}")
-
-
-def _beside(folder: Path) -> Path:
-    """Return the file that is written before it takes the place of the old one."""
-    return folder / f".{FILE_NAME}.{os.getpid()}"
 
 
 def wear_content(state: WearState) -> bytes:
@@ -163,17 +158,7 @@ def save_wear(folder: Path, content: bytes) -> None:
         The disk does not take it; the file is the old one, or the new one when the disk does not answer for it.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    path, beside = folder / FILE_NAME, _beside(folder)
-    try:
-        with beside.open("wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        beside.replace(path)
-    except OSError:
-        beside.unlink(missing_ok=True)
-        raise
-    sync_path(folder)
+    write_whole(folder / FILE_NAME, content, sync=True)
 
 
 def _parse(content: bytes, path: Path) -> WearState:
