@@ -80,6 +80,8 @@ def view(
         raise click.UsageError("--png cannot be combined with --out, --web or --follow: it is a picture of a whole run")
     if follow and out is not None and web:
         raise click.UsageError("--follow goes into --out or to --web, not both")
+    if png is not None and exaggerate is not None:
+        raise click.UsageError("--exaggerate cannot be combined with --png: a picture shows the gaps as numbers")
     if png is not None and others:
         raise click.UsageError("--with cannot be combined with --png: a picture shows the run alone")
     if follow:
@@ -87,7 +89,7 @@ def view(
     if png is not None:
         from plow_twin.view.picture import to_png
 
-        lossy = _tell_loss(recording, *to_png(recording, png, exaggerate=exaggerate))
+        lossy = _tell_loss(recording, *to_png(recording, png))
         if not quiet:
             click.echo(f"{png}")
         return DONE_WITH_LOSS if lossy else DONE

@@ -21,7 +21,7 @@ from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.rows import Rows, rows_by_topic
 from plow_twin.stream.journal import Hold, Loss, Pose, Reset, Travel, Unload
-from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, clearances
 from plow_twin.view import layout
 from plow_twin.view.columns import Array, Batches, Curves, Indexes, TimeAxis, buffers
 from plow_twin.view.contact_sets import ContactSets, masks_of, set_color
@@ -38,6 +38,8 @@ _WHITE: Final = (235, 235, 235)
 _TOUCHING: Final = (240, 140, 40)
 _PADS: Final = np.array([name.startswith("pad_") for name in CLEARANCE_NAMES])
 _BEST_PADS: Final = np.array([name in PAD_NAMES for name in CLEARANCE_NAMES])
+#: Columns of the pads' depths, of their 5 % and of their 95 % points.
+_PAD_POINTS: Final = [[CLEARANCE_NAMES.index(f"{name}{point}") for name in PAD_NAMES] for point in ("", "/p05", "/p95")]
 _BOUNDS: Final = [
     CLEARANCE_NAMES.index(f"{way}/{point}") for way in ("horizontal", "vertical") for point in ("p05", "p95")
 ]
@@ -118,10 +120,7 @@ class Drawing:
         self._wrench = np.full(3, np.nan)  # not known yet
         self._worn = False
         self._largest_load = self._named_load = np.zeros(3)
-        self._new_m = np.array(
-            [getattr(scene.clearance, f"{name.partition('/')[0]}_m") for name in np.array(CLEARANCE_NAMES)[~_PADS]]
-        )
-        self._bounds_new_m = np.repeat([scene.clearance.horizontal_m, scene.clearance.vertical_m], 2)
+        self._scene = scene
         self._templates = publication_templates(header.frame_id, header.child_frame_id)
         self._topics = {header.topic(name): name for name in self._templates}
         self._draw_still(scene, source)
@@ -282,14 +281,23 @@ class Drawing:
             case "clearance":
                 total_m = numbers[:, ~_PADS]
                 self.total.add(stamps, steps, 1e3 * total_m)
-                self.growth.add(stamps, steps, 1e6 * (total_m - self._new_m))
+                self.growth.add(stamps, steps, 1e6 * self._growth_m(numbers))
                 self.wear.add(stamps, steps, 1e3 * numbers[:, _PADS])
                 self._bands(stamps, steps, numbers)
                 self._pads(stamps, steps, numbers)
 
+    def _growth_m(self, numbers: Array) -> Array:
+        """Return the growth of the clearances by wear alone [m], with its points, in the order of `layout.GROWTH`.
+
+        It follows from the pads, so that an estimate or a changed parameter does not count as wear.
+        """
+        new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
+        best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)
+        return np.concatenate((best, np.stack((low, high), axis=2).reshape(len(numbers), 4)), axis=1)
+
     def _bands(self, stamps: Indexes, steps: Indexes, numbers: Array) -> None:
         """Draw the areas between the bounds: curves that change between them, row by row."""
-        total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * (numbers[:, _BOUNDS] - self._bounds_new_m)), axis=1)
+        total = np.concatenate((1e3 * numbers[:, _BOUNDS], 1e6 * self._growth_m(numbers)[:, 2:]), axis=1)
         if self._band_end is not None and len(stamps) and self._band_end[0][0] < stamps[0]:
             ends = zip(self._band_end, (stamps, steps, total), strict=True)
             stamps, steps, total = (np.concatenate(pair) for pair in ends)

@@ -2,60 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.alarms import alarms_of
 from plow_twin.record.durable import whole_file
-from plow_twin.record.entries import EntryRecord
-from plow_twin.record.messages import JointState, Odometry
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.stream.journal import Reset, Sample
+from plow_twin.stream.alarms import Thresholds
+from plow_twin.view.envelope import Envelope
+from plow_twin.view.run_curves import Instant, RunCurves
 from plow_twin.view.section import PAIR_COLORS, Section
 
-_MOST_ROWS: Final = 8000
-#: Numbers of entries are those modulo twice that.
-_HALF: Final = 2**31
+#: Room about the end of an arrow for its label [mm].
+_LABEL_ROOM_MM: Final = 50.0
+_LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
 
 
-class _Largest:
-    """Rows in time of which only the largest values of neighbours are kept when there are many."""
+def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int]]:
+    """Draw a recording into a PNG; return how the recording ended and the counts of its losses.
 
-    def __init__(self, width: int) -> None:
-        self.times: list[float] = []
-        self.rows: list[NDArray[np.float64]] = []
-        self._width = width
-        self._ends: list[int] = []  # places of rows to which no line is drawn from the one before
-
-    def add(self, time_s: float, row: NDArray[np.float64]) -> None:
-        self.times.append(time_s)
-        self.rows.append(row)
-        if len(self.rows) >= 2 * _MOST_ROWS:
-            self.rows = [np.where(np.abs(a) >= np.abs(b), a, b) for a, b in zip(*[iter(self.rows)] * 2, strict=True)]
-            self.times = self.times[::2]
-            self._ends = [(place + 1) // 2 for place in self._ends]
-
-    def end(self) -> None:
-        """End the lines: the next row does not go on from the last one."""
-        self._ends.append(len(self.rows))
-
-    def series(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return times and rows, shapes (n,) and (n, width), with a row of NaN where a line ends."""
-        times, rows = np.array(self.times), np.array(self.rows).reshape(-1, self._width)
-        ends = [place for place in self._ends if place < len(times)]
-        return np.insert(times, ends, np.nan), np.insert(rows, ends, np.nan, axis=0)
-
-
-def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[FileStatus, dict[str, int]]:
-    """Draw a recording into a PNG; return how the recording ended, and what of it is lost.
-
-    No line goes over entries that are not there, nor over a reset.
+    No line crosses missing entries or a reset. A long run is drawn as the envelope of its curves: the least and the
+    largest value in bins of one width.
 
     Raises
     ------
@@ -68,35 +42,25 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     reader = RunReader(path)
     scene = reader.header.scene(reader.path)
     section = Section.of(scene)
-    force, load, clearance, shown = _collected(reader)
-    if not (force.rows or load.rows or clearance.rows):
+    curves = RunCurves.of(reader)
+    if not curves:
         raise RecordingError(f"{reader.path}: got no row to draw ({reader.status.value}), expected some")
     figure = Figure(figsize=(15, 8.5), layout="constrained")
     grid = figure.add_gridspec(3, 3)
-    factor = exaggerate or section.exaggeration()
-    upper, lower = figure.add_subplot(grid[:2, 0]), figure.add_subplot(grid[2, 0])
-    if shown is None:
-        for place, what in ((upper, "pose"), (lower, "penetrations")):
-            _say_nothing(place, f"no {what} in the recording")
-            place.set(xticks=[])
-    else:
-        _draw_section(upper, section, shown)
-        _draw_wide(lower, section, shown.penetration, factor)
-    axis = figure.add_subplot(grid[0, 1:])
-    _curves(
-        axis, force, PAIR_NAMES, "largest force [kN]", [tuple(part / 255 for part in color) for color in PAIR_COLORS]
-    )
-    _curves(
-        figure.add_subplot(grid[1, 1:], sharex=axis), load, ("Fx [kN]", "Fy [kN]", "M [kN m]"), "load [kN, kN m]", None
-    )
-    below = figure.add_subplot(grid[2, 1:], sharex=axis)
-    _bands(below, clearance, (scene.clearance.horizontal_m, scene.clearance.vertical_m))
-    below.set_xlabel("time since the first stamp [s]")
+    _draw_instant(figure.add_subplot(grid[:2, 0]), figure.add_subplot(grid[2, 0]), section, curves.instant)
+    force = figure.add_subplot(grid[0, 1:])
+    load, clearance = (figure.add_subplot(grid[row, 1:], sharex=force) for row in (1, 2))
+    colors = [tuple(part / 255 for part in color) for color in PAIR_COLORS]
+    _curves(force, curves.force, PAIR_NAMES, "largest force [kN]", colors)
+    _thresholds(force, alarms_of(reader.header.parameters).alarms["force"].thresholds)
+    _curves(load, curves.load, _LOAD_NAMES, "load [kN, kN m]", None)
+    _clearance(clearance, curves)
+    for axis in (force, load, clearance):
+        for begin, end in curves.held_s:
+            axis.axvspan(begin, end, color="0.85", lw=0, zorder=0)
+    clearance.set_xlabel("time since the first stamp [s]" + ("; grey: without samples" if curves.held_s else ""))
     lost = {**reader.lost, **reader.lost_parts}
-    told = [f"{name.replace('_', ' ')}: {count}" for name, count in lost.items()]
-    if reader.status is not FileStatus.COMPLETE or not told:
-        told.insert(0, reader.status.value)
-    figure.suptitle(f"{reader.path.name}: {', '.join(told)}")
+    figure.suptitle(_title(reader, curves.first_ns, lost))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(out) as stream:
@@ -106,64 +70,37 @@ def to_png(path: Path, out: Path, *, exaggerate: float | None = None) -> tuple[F
     return reader.status, lost
 
 
-def _collected(reader: RunReader) -> tuple[_Largest, _Largest, _Largest, _Instant | None]:
-    """Return forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force."""
-    force, load, clearance = drawn = _Largest(8), _Largest(3), _Largest(6)
-    names = {reader.header.topic(name): name for name in ("contact_forces", "contact_peaks", "head_state", "clearance")}
-    first_ns: int | None = None
-    shown: _Instant | None = None
-    held, gaps = np.zeros(8), np.zeros(8)
-    reached: int | None = None  # number of the newest entry
-    for record in reader:
-        if isinstance(record, EntryRecord):
-            ahead = 1 if reached is None else (record.sequence - reached + _HALF) % (2 * _HALF) - _HALF
-            if ahead > 1 or isinstance(record.entry, Reset):
-                for rows in drawn:
-                    rows.end()
-            reached = record.sequence if ahead > 0 else reached
-            if isinstance(record.entry, Sample):
-                first_ns = record.entry.stamp_ns if first_ns is None else first_ns
-                load.add((record.entry.stamp_ns - first_ns) * 1e-9, np.array(record.entry.wrench) / 1e3)
-            continue
-        name = names.get(record.topic)
-        message = record.message() if name is not None else None
-        if isinstance(message, Odometry):
-            turn = message.orientation
-            now = (message.position[0], message.position[1], 2.0 * math.atan2(turn[2], turn[3]))
-            if shown is None or held.max() > shown.force.max():
-                shown = _Instant(now, held, gaps)
-        elif isinstance(message, JointState):
-            first_ns = message.stamp_ns if first_ns is None else first_ns
-            time_s = (message.stamp_ns - first_ns) * 1e-9
-            if name == "contact_forces":
-                held, gaps = message.effort, message.position
-            elif name == "contact_peaks":
-                force.add(time_s, message.effort / 1e3)
-            else:
-                clearance.add(time_s, _clearance_row(message))
-    return force, load, clearance, shown
+def _title(reader: RunReader, first_ns: int | None, lost: dict[str, int]) -> str:
+    """Return file, scene, date and how the recording ended."""
+    parts = [reader.path.name]
+    scene = reader.header.parameters.get("scene")
+    if isinstance(scene, str) and scene:
+        parts.append(f"scene {Path(scene).name}")
+    if first_ns is not None:
+        parts.append(datetime.fromtimestamp(first_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC"))
+    losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in lost.items()]
+    if reader.status is not FileStatus.COMPLETE or not losses:
+        losses.insert(0, reader.status.value)
+    return ", ".join(parts + losses)
 
 
-def _clearance_row(message: JointState) -> NDArray[np.float64]:
-    wanted = [f"{way}{point}" for way in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
-    return np.array([1e3 * message.position[message.name.index(name)] for name in wanted])
-
-
-class _Instant(NamedTuple):
-    """Pose x, y [m], theta [rad] of the head at a stamp, forces [N] and penetrations [m] of the pairs."""
-
-    pose: tuple[float, float, float]
-    force: NDArray[np.float64]
-    penetration: NDArray[np.float64]
+def _draw_instant(upper: Any, lower: Any, section: Section, instant: Instant | None) -> None:
+    if instant is None:
+        for place, name in ((upper, "pose"), (lower, "penetrations")):
+            _say_nothing(place, f"no {name} in the recording")
+            place.set(xticks=[])
+        return
+    _draw_section(upper, section, instant)
+    _draw_gaps(lower, instant.penetration)
 
 
 def _say_nothing(axis: Any, text: str) -> None:
-    """Say in the place of a drawing that there is nothing to draw."""
+    """Write a text in the place of a drawing."""
     axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes)
     axis.set(yticks=[])
 
 
-def _draw_section(axis: Any, section: Section, instant: _Instant) -> None:
+def _draw_section(axis: Any, section: Section, instant: Instant) -> None:
     pose, force, largest = instant.pose, instant.force, float(instant.force.max())
     axis.plot(*section.frame_strip().T, color="0.5", label=section.frame_name)
     for number, strip in enumerate(section.head_strips(pose)):
@@ -174,57 +111,81 @@ def _draw_section(axis: Any, section: Section, instant: _Instant) -> None:
             color = tuple(part / 255 for part in PAIR_COLORS[pair])
             axis.annotate("", origin + vector, origin, arrowprops={"arrowstyle": "->", "color": color, "lw": 2})
             text = f"{force[pair] / 1e3:.0f} kN"
-            axis.annotate(text, origin + 1.25 * vector, color=color, ha="center", va="center", fontsize=8)
-    axis.set(aspect="equal", title=f"Cross-section [mm], largest force at a stamp: {largest / 1e3:.1f} kN")
+            sideways = abs(vector[0]) > abs(vector[1])
+            side = "center" if not sideways else "left" if vector[0] > 0.0 else "right"
+            axis.annotate(text, origin + 1.1 * vector, color=color, ha=side, va="center", fontsize=8)
+        # annotations do not count for the limits of the axes: the ends of the arrows do
+        axis.update_datalim(
+            np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
+        )
+        axis.autoscale_view()
+    axis.set(aspect="equal", title=f"Cross-section [mm] at the largest force\nof a stamp, {largest / 1e3:.1f} kN")
     axis.margins(0.1)
     axis.legend(loc="upper left", bbox_to_anchor=(0.0, -0.06), ncols=2, fontsize=7)
     _y_upwards(axis)
 
 
 def _y_upwards(axis: Any) -> None:
-    """Let y count upwards: the section has it downwards, as viewers have."""
+    """Let y count upwards: the section has y downwards, as viewers do."""
     axis.invert_yaxis()
     axis.yaxis.set_major_formatter(lambda y, _: f"{0.0 - y:g}")
 
 
-def _draw_wide(axis: Any, section: Section, penetration: NDArray[np.float64], factor: float) -> None:
-    axis.plot(*section.frame_strip().T, color="0.5")
-    walls, touching = section.exaggerated(penetration, factor)
-    for wall, touches in zip(walls, touching, strict=True):
-        axis.plot(*wall.T, color="tab:orange" if touches else "k")
-    axis.set(
-        aspect="equal", title=f"clearance {factor:g} times as wide, walls that touch in orange", xticks=[], yticks=[]
-    )
+def _draw_gaps(axis: Any, penetration: NDArray[np.float64]) -> None:
+    """Draw the gap of each pair as a bar, and its penetration to the other side."""
+    places = np.arange(len(PAIR_NAMES))
+    colors = ["tab:orange" if value > 0.0 else "0.6" for value in penetration]
+    bars = axis.barh(places, 1e3 * penetration, color=colors)
+    axis.bar_label(bars, [f"{1e3 * value:.1f}" for value in penetration], fontsize=7, padding=2)
+    axis.axvline(0.0, color="k", lw=0.8)
+    axis.margins(x=0.15)
+    axis.set_yticks(places, PAIR_NAMES, fontsize=7)
     axis.invert_yaxis()
+    axis.set_xlabel("gap (negative) or penetration at that stamp [mm]")
 
 
-def _curves(axis: Any, rows: _Largest, names: Sequence[str], label: str, colors: Sequence[Any] | None) -> None:
-    times, values = rows.series()
-    for index, name in enumerate(names):
-        if len(values):
-            axis.plot(times, values[:, index], lw=0.7, label=name, color=colors[index] if colors else None)
+def _curves(axis: Any, rows: Envelope, names: Sequence[str], label: str, colors: Sequence[Any] | None) -> None:
     axis.set_ylabel(label)
-    if len(values):
-        _legend_beside(axis)
-    else:
+    if not rows:
         _say_nothing(axis, "not in the recording")
+        return
+    for index, name in enumerate(names):
+        color = colors[index] if colors else f"C{index}"
+        times, least, largest = rows.bands(index)
+        axis.plot(times, largest, lw=0.7, label=name, color=color)
+        if rows.is_binned:
+            axis.plot(times, least, lw=0.7, color=color)
+            axis.fill_between(times, least, largest, color=color, alpha=0.2, lw=0)
+    _legend_beside(axis)
 
 
-def _bands(axis: Any, rows: _Largest, new_m: Sequence[float]) -> None:
-    """Draw the growth of both clearances with its interval: beside millimetres of clearance it would not be seen."""
-    times, values = rows.series()
+def _thresholds(axis: Any, thresholds: Thresholds) -> None:
+    """Draw the thresholds [N] of the alarm on forces, if it has any."""
+    for value, color, name in ((thresholds.warn, "tab:orange", "warning"), (thresholds.error, "tab:red", "error")):
+        if value > 0.0:
+            axis.axhline(value / 1e3, color=color, ls="--", lw=1.0)
+            axis.annotate(name, (1.0, value / 1e3), xycoords=axis.get_yaxis_transform(), color=color, fontsize=7,
+                          ha="right", va="bottom")  # fmt: skip
+
+
+def _clearance(axis: Any, curves: RunCurves) -> None:
+    """Draw both clearances with their intervals, and where they changed by something else than wear."""
+    axis.set_ylabel("clearance with its\n5..95 % interval [mm]")
+    if not curves.clearance:
+        _say_nothing(axis, "not in the recording")
+        return
     for index, name in enumerate(("horizontal", "vertical")):
-        if len(values):
-            value, low, high = 1e3 * (values[:, 3 * index : 3 * index + 3].T - 1e3 * new_m[index])
-            line = axis.plot(times, value, label=f"{name},\n{values[-1, 3 * index]:.3f} mm at the end")[0]
-            axis.fill_between(times, low, high, alpha=0.25, color=line.get_color())
-    axis.set_ylabel("growth of the clearance,\n5..95 % [um]")
-    if len(values):
-        _legend_beside(axis)
-    else:
-        _say_nothing(axis, "not in the recording")
+        times, _, value = curves.clearance.bands(3 * index)
+        low, high = curves.clearance.bands(3 * index + 1)[1], curves.clearance.bands(3 * index + 2)[2]
+        line = axis.plot(times, value, label=f"{name},\n{value[-1]:.3f} mm at the end")[0]
+        axis.fill_between(times, low, high, alpha=0.25, color=line.get_color(), lw=0)
+    for time_s, reason in curves.changes:
+        axis.axvline(time_s, color="0.4", ls=":", lw=1.0)
+        axis.annotate(reason, (time_s, 1.0), xycoords=axis.get_xaxis_transform(), fontsize=7, rotation=90,
+                      ha="right", va="top", color="0.3")  # fmt: skip
+    _legend_beside(axis)
 
 
 def _legend_beside(axis: Any) -> None:
-    """Name the curves beside the axis, where no curve is."""
+    """Put the legend beside the axes."""
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7)

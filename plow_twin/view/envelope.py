@@ -1,0 +1,120 @@
+"""Curves of any length for a picture: every row, or the least and the largest value in bins of equal width."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indexes = NDArray[np.int64]
+
+#: Rows up to which a curve keeps each of them.
+MOST_ROWS: Final = 8000
+#: Bins at most, about one for each pixel of an axis: narrower bins would draw beats between their width and a period.
+_MOST_BINS: Final = 700
+
+
+class Envelope:
+    """Rows of `width` numbers over time, in bounded memory.
+
+    Up to `most_rows` rows are kept as they are. Beyond that, time is divided into bins of one width over the whole
+    span, and each bin keeps the least and the largest value of each column, so that no peak is lost and old rows look
+    like new ones.
+    """
+
+    def __init__(self, width: int, most_rows: int = MOST_ROWS, most_bins: int = _MOST_BINS) -> None:
+        self._most_rows, self._most_bins = most_rows, most_bins
+        self._segment = 0
+        #: width of a bin [s]; 0: every row is kept
+        self._bin_s = 0.0
+        # segment (n,), time [s] or number of the bin (n,), least and largest values (n, width)
+        self._kept = _Rows(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, width)), np.zeros((0, width)))
+        self._added: list[_Rows] = []
+        self._added_rows = 0
+
+    def __bool__(self) -> bool:
+        return bool(self._added_rows or len(self._kept.place))
+
+    def add(self, times_s: Array, values: Array) -> None:
+        """Add rows, shapes (n,) and (n, width)."""
+        if len(times_s):
+            segment = np.full(len(times_s), self._segment, np.int64)
+            self._added.append(_Rows(segment, np.array(times_s, np.float64), values, values))
+            self._added_rows += len(times_s)
+        if self._added_rows > self._most_rows:
+            self._merge()
+
+    def break_line(self) -> None:
+        """Draw no line from the rows so far to those that follow."""
+        self._segment += 1
+
+    @property
+    def is_binned(self) -> bool:
+        """Whether bins stand for the rows."""
+        self._merge()
+        return self._bin_s > 0.0
+
+    def bands(self, column: int) -> tuple[Array, Array, Array]:
+        """Return times [s], least and largest values of a column, shape (n,) each, with NaN between two segments.
+
+        The time of a bin is its middle; least and largest value of a row that is kept are the same.
+        """
+        self._merge()
+        rows = self._kept
+        times = (rows.place + 0.5) * self._bin_s if self._bin_s else rows.place
+        breaks = np.flatnonzero(np.diff(rows.segment)) + 1
+        times, least, largest = (
+            np.insert(part, breaks, np.nan) for part in (times, rows.least[:, column], rows.largest[:, column])
+        )
+        return times, least, largest
+
+    def _merge(self) -> None:
+        added = _Rows.joined(self._added) if self._added else None
+        self._added, self._added_rows = [], 0
+        if added is None:
+            return
+        if self._bin_s:
+            added = added.binned(self._bin_s)
+        self._kept = _Rows.joined([self._kept, added])
+        if not self._bin_s:
+            if len(self._kept.place) <= self._most_rows:
+                return
+            self._bin_s = max(2.0 * float(np.ptp(self._kept.place)) / self._most_bins, 1e-9)
+            self._kept = self._kept.binned(self._bin_s)
+        self._kept = self._kept.merged()
+        # segments stay apart, however many there are
+        while len(self._kept.place) > self._most_bins and np.ptp(self._kept.place) > 1.0:
+            self._bin_s *= 2.0
+            self._kept = self._kept.binned(2.0).merged()
+
+
+class _Rows:
+    """Rows with their segment and their place: a time [s], or the number of a bin."""
+
+    def __init__(self, segment: Indexes, place: Array, least: Array, largest: Array) -> None:
+        self.segment, self.place, self.least, self.largest = segment, place, least, largest
+
+    @classmethod
+    def joined(cls, parts: list[_Rows]) -> _Rows:
+        """Return the rows of all parts, one part after the other."""
+        return cls(
+            np.concatenate([part.segment for part in parts]),
+            np.concatenate([part.place for part in parts]),
+            np.concatenate([part.least for part in parts]),
+            np.concatenate([part.largest for part in parts]),
+        )
+
+    def binned(self, width: float) -> _Rows:
+        """Return the rows with the numbers of bins of this width as their places."""
+        return _Rows(self.segment, np.floor(self.place / width), self.least, self.largest)
+
+    def merged(self) -> _Rows:
+        """Return one row for each bin of a segment."""
+        order = np.lexsort((self.place, self.segment))
+        segment, place = self.segment[order], self.place[order]
+        first = np.flatnonzero(np.r_[True, (np.diff(segment) != 0) | (np.diff(place) != 0)])
+        least = np.minimum.reduceat(self.least[order], first)
+        largest = np.maximum.reduceat(self.largest[order], first)
+        return _Rows(segment[first], place[first], least, largest)

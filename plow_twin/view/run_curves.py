@@ -1,0 +1,156 @@
+"""The curves of a whole recording, collected batch by batch for one picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.record.entries import Batch, Holes
+from plow_twin.record.outputs import publication_templates
+from plow_twin.record.reader import RunReader
+from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.stream.journal import Estimated, Hold, Reset, SetModel, SetWear, Unload
+from plow_twin.stream.outputs import CLEARANCE_NAMES
+from plow_twin.view.envelope import Envelope
+
+Array = NDArray[np.float64]
+
+#: Columns of the clearances: horizontal and its 5 % and 95 % points, then vertical.
+_CLEARANCE_COLUMNS: Final = np.array(
+    [CLEARANCE_NAMES.index(f"{axis}{point}") for axis in ("horizontal", "vertical") for point in ("", "/p05", "/p95")]
+)
+_NS: Final = 1e-9
+#: Events and held stretches beyond this number would cover the picture.
+_MOST_MARKS: Final = 40
+
+
+class Instant(NamedTuple):
+    """Pose x, y [m], theta [rad] of the head at a stamp, forces [N] and penetrations [m] of the pairs."""
+
+    pose: tuple[float, float, float]
+    force: Array
+    penetration: Array
+
+
+@dataclass
+class RunCurves:
+    """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
+
+    Times count from `first_ns`, the first stamp of a sample or message [s]. `held_s` are the stretches computed without
+    samples; `changes` are the instants at which the clearance changed by something else than wear, with the reason.
+    """
+
+    first_ns: int | None = None
+    force: Envelope = field(default_factory=lambda: Envelope(PAIR_COUNT))
+    load: Envelope = field(default_factory=lambda: Envelope(3))
+    clearance: Envelope = field(default_factory=lambda: Envelope(len(_CLEARANCE_COLUMNS)))
+    instant: Instant | None = None
+    held_s: list[tuple[float, float]] = field(default_factory=list)
+    changes: list[tuple[float, str]] = field(default_factory=list)
+    _estimated: bool = False
+    _held_since_ns: int | None = None
+    _newest_ns: int | None = None
+
+    @classmethod
+    def of(cls, reader: RunReader) -> RunCurves:
+        """Read a whole recording; no line crosses missing entries or a reset."""
+        curves = cls()
+        templates = publication_templates(reader.header.frame_id, reader.header.child_frame_id)
+        topics = {reader.header.topic(name): name for name in templates}
+        holes = Holes()
+        for batch in reader.batches():
+            missing = holes.take(batch.entries)
+            resets = {index for index, entry in batch.entries.others.items() if isinstance(entry, Reset)}
+            places = sorted(resets | set(missing))
+            for place, part in zip((None, *places), batch.parted(places), strict=True):
+                if place is not None:
+                    curves._break_lines()
+                curves._entries(part)
+                curves._messages(rows_by_topic(part.outputs, topics, templates))
+        curves._end_of_held(curves._newest_ns)
+        return curves
+
+    def __bool__(self) -> bool:
+        return bool(self.force or self.load or self.clearance)
+
+    def _break_lines(self) -> None:
+        for envelope in (self.force, self.load, self.clearance):
+            envelope.break_line()
+
+    def _seconds(self, stamps_ns: NDArray[np.int64]) -> Array:
+        if self.first_ns is None and len(stamps_ns):
+            self.first_ns = int(stamps_ns[0])
+        times: Array = np.asarray((stamps_ns - (self.first_ns or 0)) * _NS, np.float64)
+        return times
+
+    def _entries(self, batch: Batch) -> None:
+        stamps, wrench = batch.entries.samples()
+        self.load.add(self._seconds(stamps), wrench / 1e3)
+        samples = np.flatnonzero(batch.entries.sample)
+        for index, entry in sorted(batch.entries.others.items()):
+            match entry:
+                case Hold(stamp_ns) | Unload(stamp_ns):
+                    before = batch.entries.stamp_ns[samples[: np.searchsorted(samples, index)]]
+                    self._newest_ns = int(before[-1]) if len(before) else self._newest_ns
+                    self._end_of_held(self._next_sample(before))
+                    if self._held_since_ns is None:
+                        self._held_since_ns = stamp_ns if self._newest_ns is None else self._newest_ns
+                    self._newest_ns = stamp_ns
+                case Estimated(end_ns=end_ns) if not self._estimated:
+                    self._estimated = True
+                    self._change(end_ns, "first estimate")
+                case SetModel(stamp_ns):
+                    self._change(stamp_ns, "parameters set")
+                case SetWear(stamp_ns):
+                    self._change(stamp_ns, "wear set")
+        if len(stamps):
+            self._end_of_held(self._next_sample(stamps))
+            self._newest_ns = int(stamps[-1])
+
+    def _next_sample(self, stamps: NDArray[np.int64]) -> int | None:
+        """Return the first of these stamps behind the held stretch, if one began."""
+        behind = stamps[stamps > (self._newest_ns or 0)]
+        return int(behind[0]) if len(behind) else None
+
+    def _end_of_held(self, stamp_ns: int | None) -> None:
+        if self._held_since_ns is None or stamp_ns is None:
+            return
+        first = self.first_ns or 0
+        if len(self.held_s) < _MOST_MARKS:
+            self.held_s.append(((self._held_since_ns - first) * _NS, (stamp_ns - first) * _NS))
+        self._held_since_ns = None
+
+    def _change(self, stamp_ns: int, reason: str) -> None:
+        if self.first_ns is not None and len(self.changes) < _MOST_MARKS:
+            self.changes.append(((stamp_ns - self.first_ns) * _NS, reason))
+
+    def _messages(self, found: dict[str, Rows]) -> None:
+        if "contact_peaks" in found:
+            rows = found["contact_peaks"]
+            self.force.add(self._seconds(rows.stamp_ns), rows.numbers[:, 2 * PAIR_COUNT :] / 1e3)
+        if "clearance" in found:
+            rows = found["clearance"]
+            self.clearance.add(self._seconds(rows.stamp_ns), 1e3 * rows.numbers[:, _CLEARANCE_COLUMNS])
+        if "contact_forces" in found and "head_state" in found:
+            for instant in _largest(found["contact_forces"], found["head_state"]):
+                if self.instant is None or instant.force.max() > self.instant.force.max():
+                    self.instant = instant
+
+
+def _largest(contact: Rows, head: Rows) -> Iterator[Instant]:
+    """Yield the instant of the largest force among those with a pose of the same publication."""
+    at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
+    both = np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns)
+    if not both.size:
+        return
+    force = contact.numbers[at[both], 2 * PAIR_COUNT :]
+    row = int(force.max(axis=1).argmax())
+    x, y, *turn = head.numbers[both[row], :4].tolist()
+    penetration = contact.numbers[at[both[row]], :PAIR_COUNT]
+    yield Instant((x, y, 2.0 * math.atan2(turn[0], turn[1])), force[row], penetration)

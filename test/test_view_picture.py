@@ -1,0 +1,111 @@
+"""The picture of a recording: long runs as envelopes, clearances in millimetres, annotations inside their axes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.backends import backend_agg
+from matplotlib.figure import Figure
+from matplotlib.text import Annotation
+from record_support import BASE_NS, STEP_NS, paper_sample, record_run
+
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.stream.journal import Entry, Estimated, Hold, SetModel
+from plow_twin.view.envelope import Envelope
+from plow_twin.view.picture import to_png
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Receive the figures that are drawn."""
+    kept: list[Figure] = []
+
+    class Kept(backend_agg.FigureCanvasAgg):
+        def __init__(self, figure: Figure) -> None:
+            kept.append(figure)
+            super().__init__(figure)
+
+    monkeypatch.setattr(backend_agg, "FigureCanvasAgg", Kept)
+    return kept
+
+
+def test_an_hour_of_load_fills_the_same_band_everywhere() -> None:
+    envelope = Envelope(1)
+    times = np.arange(72_000) / 20.0
+    for part in np.array_split(times, 300):  # as batches of a recording come
+        envelope.add(part, np.sin(2.0 * part)[:, None])
+    at, least, largest = envelope.bands(0)
+    assert 300 <= len(at) <= 700
+    widths = np.diff(at)
+    np.testing.assert_allclose(widths, widths[0])
+    assert (largest[:-1] > 0.99).all() and (least[:-1] < -0.99).all()  # all but the last hold a whole period
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=12), st.integers(0, 2**31))
+def test_an_envelope_loses_no_extreme_and_joins_no_segments(sizes: list[int], seed: int) -> None:
+    random = np.random.default_rng(seed)
+    envelope = Envelope(2, most_rows=32, most_bins=8)
+    parts = []
+    for size in sizes:
+        times, values = np.sort(random.uniform(-5.0, 100.0, size)), random.normal(size=(size, 2))
+        for chosen in np.array_split(np.arange(size), 3):
+            envelope.add(times[chosen], values[chosen])
+        envelope.break_line()
+        parts.append(values)
+    everything = np.concatenate(parts)
+    for column in range(2):
+        at, least, largest = envelope.bands(column)
+        assert np.nanmax(largest) == everything[:, column].max() and np.nanmin(least) == everything[:, column].min()
+    assert np.isnan(at).sum() == len(sizes) - 1
+    if len(everything) <= 32:
+        assert len(at) == len(everything) + len(sizes) - 1
+
+
+def test_an_estimate_and_a_changed_parameter_are_marked_and_are_no_wear(tmp_path: Path, figures: list[Figure]) -> None:
+    first = [paper_sample(index) for index in range(400)]
+    stamp = BASE_NS + 400 * STEP_NS
+    estimated = Estimated(BASE_NS, stamp, 400, 40, (), (1e-3, 5e-4, 1.5e-3, 0.0, 0.0, 0.0), "{}")
+    changed = SetModel(stamp + 100 * STEP_NS, '{"clearance.horizontal_m": 0.031}')
+    entries: list[Entry] = [*first, estimated, *(paper_sample(index) for index in range(400, 500)), changed]
+    entries += [paper_sample(index) for index in range(500, 900)]
+    run = record_run(tmp_path / "run", entries)
+    to_png(run.folder, tmp_path / "run.png")
+    clearance = figures[0].axes[4]
+    assert clearance.get_ylabel().endswith("[mm]")
+    horizontal = np.asarray(clearance.lines[0].get_ydata(), float)
+    np.testing.assert_allclose(np.unique(horizontal.round(6)), [25.0, 26.0, 31.0])  # a changed model ends the estimate
+    marks = {text.get_text(): text.xy[0] for text in clearance.texts if isinstance(text, Annotation)}
+    assert marks == {"first estimate": pytest.approx(0.4), "parameters set": pytest.approx(0.5)}
+
+
+def test_a_stretch_without_samples_is_shaded(tmp_path: Path, figures: list[Figure]) -> None:
+    held = [Hold(BASE_NS + (200 + index) * STEP_NS) for index in range(300)]
+    run = record_run(
+        tmp_path / "run",
+        [*(paper_sample(index) for index in range(200)), *held, *(paper_sample(index) for index in range(500, 700))],
+    )
+    to_png(run.folder, tmp_path / "run.png")
+    for axis in figures[0].axes[2:]:
+        (shade,) = axis.patches
+        assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((0.199, 0.5))
+
+
+def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the_axes(
+    tmp_path: Path, figures: list[Figure]
+) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(3000)))
+    to_png(run.folder, tmp_path / "run.png")
+    section = figures[0].axes[0]
+    values = [text for text in section.texts if text.get_text().endswith("kN")]
+    largest = float(section.get_title().split()[-2])
+    assert max(float(text.get_text().split()[0]) for text in values) == pytest.approx(largest, abs=0.51)
+    assert 1 <= len(values) <= PAIR_COUNT
+    x, y = sorted(section.get_xlim()), sorted(section.get_ylim())
+    for text in values:
+        at = text.get_position()
+        assert x[0] < at[0] < x[1] and y[0] < at[1] < y[1] and math.isfinite(at[0])
