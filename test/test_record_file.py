@@ -139,7 +139,10 @@ def test_mcap_reader_finds_ros2_conventions(run: Run) -> None:
         for channel in summary.channels.values():
             assert channel.message_encoding == "cdr"
             assert channel.metadata["topic_type_hash"].startswith("RIHS01_")
-            assert yaml.safe_load(channel.metadata["offered_qos_profiles"])[0]["reliability"] == "reliable"
+            (offered,) = yaml.safe_load(channel.metadata["offered_qos_profiles"])
+            assert offered["reliability"] == "reliable"
+            if "/journal/" not in channel.topic:
+                assert (offered["depth"], offered["durability"]) == (1000, "volatile")
         previous = 0
         for _, _, message in reader.iter_messages():
             assert message.log_time >= previous

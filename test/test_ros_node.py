@@ -18,6 +18,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import psutil
 import pytest
+import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.msg import Transition
@@ -43,6 +44,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.outputs import CLEARANCE_NAMES
+from plow_twin.stream.topics import TOPICS
 
 T0 = 1_795_000_000_000_000_000
 MS = 1_000_000
@@ -279,6 +281,20 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(t
         answer = probe.call(Trigger, f"{running.namespace}/plow_twin/mark", Trigger.Request())
         assert answer.success and str(tmp_path / "run_2") in answer.message
         probe.until_figure("recorder", "marks", "2")
+        there = {
+            topic.name: probe.node.get_publishers_info_by_topic(f"{running.namespace}/{topic.name}") for topic in TOPICS
+        }
+        offered = {name: infos[0].qos_profile.durability.name.lower() for name, infos in there.items() if infos}
+    stated = yaml.safe_load((tmp_path / "run" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    profiles = {
+        found["topic_metadata"]["name"].rpartition("/")[2]: found["topic_metadata"]["offered_qos_profiles"][0]
+        for found in stated["topics_with_message_count"]
+    }
+    # what the recording states is what the graph shows
+    recorded = {name: profiles[name]["durability"] for name in profiles.keys() & offered.keys()}
+    assert recorded == {name: offered[name] for name in recorded}
+    assert {*recorded.values()} == {"volatile", "transient_local"}
+    assert (profiles["alarms"]["depth"], profiles["contact_forces"]["depth"]) == (1, 1000)
     before, after = replay(tmp_path / "run"), replay(tmp_path / "run_2")
     assert (before.exit_code, after.exit_code) == (0, 0)
     # at the alarm and not at the end; what follows it lies in the second one

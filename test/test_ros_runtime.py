@@ -38,7 +38,7 @@ from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
 from plow_twin.ros.messages import read_wrench
 from plow_twin.ros.node import TwinNode
-from plow_twin.ros.qos import OUTPUT, sensor_input
+from plow_twin.ros.qos import OUTPUTS, sensor_input
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.intake import Verdict
@@ -273,7 +273,7 @@ def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
         heard: list[int] = []
         subscription = node.create_subscription(TwistStamped, "burst", lambda _: None, sensor_input(1000), raw=True)
         queue = InputQueue(node, subscription, lambda batch: heard.extend(taken.number for taken in batch))
-        publisher = node.create_publisher(TwistStamped, "burst", OUTPUT)
+        publisher = node.create_publisher(TwistStamped, "burst", OUTPUTS["contact_forces"])
         give_up = time.monotonic() + 30.0
 
         def send(count: int) -> None:

@@ -11,16 +11,15 @@ from plow_twin.live import diagnostics
 from plow_twin.live.bridge.feeder import Feeder
 from plow_twin.live.bridge.source import Bridge, BridgeError
 from plow_twin.live.load_model import read_load_model
-from plow_twin.live.parameters import ESTIMATES, Settings
+from plow_twin.live.parameters import Settings
 from plow_twin.live.part import Part
-from plow_twin.live.publishing import QUALITY
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
 from plow_twin.record.mapping import Role, read_map, stamps_by
 from plow_twin.record.messages import DiagnosticStatus, JointState
-from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.stream.outputs import Publication
+from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
 #: Longest wait for a message [s]: a request to stop is seen within it.
@@ -65,9 +64,7 @@ class BridgeFront:
         on_error: Callable[[str], None],
     ) -> None:
         self.name = NAME
-        self.topics: Mapping[str, str] = {
-            topic: f"/{topic}" for topic in (*PUBLICATION_TOPICS, QUALITY, "status", "alarms", *ESTIMATES)
-        }
+        self.topics: Mapping[str, str] = {topic.name: f"/{topic.name}" for topic in TOPICS}
         self.follows_samples = bridge.ends
         self._bridge, self._settings, self._say = bridge, settings, say
         self.say_error = on_error

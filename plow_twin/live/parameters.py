@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import PlowTwinError, Problem
+from plow_twin.stream.topics import Cadence, names_of
 
 #: Topics of the estimate and of what follows from it.
-ESTIMATES: Final = ("estimate", "force_intervals", "forecast")
+ESTIMATES: Final = names_of(Cadence.ESTIMATE)
 
 
 class Effect(Enum):

@@ -364,7 +364,8 @@ def _copy(messages: Messages, reader: ChunkReader, file: McapFile, numbers: dict
         if number not in numbers:
             kind = channel.message_type
             known = kind in MESSAGE_TYPES
-            qos = {"offered_qos_profiles": qos_text(kind), "topic_type_hash": type_hash(kind)} if known else {}
+            offered = qos_text(channel.topic.rpartition("/")[2])
+            qos = {"offered_qos_profiles": offered, "topic_type_hash": type_hash(kind)} if known else {}
             numbers[number] = file.channel(channel.topic, kind, channel.schema, channel.metadata or qos)
         builder.add(
             numbers[number],

@@ -11,8 +11,8 @@ from typing import Any, Final
 from plow_twin.errors import RecordingError
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.durable import sync_path
-from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.scene_file.yaml_text import load_yaml as read_yaml
+from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
@@ -31,10 +31,12 @@ class TopicCount:
     type_hash: str = ""
 
 
-def qos_profile(message_type: str) -> dict[str, Any]:
-    """Return the QoS that the node offers: reliable, and latched for the status."""
-    latched = message_type == DiagnosticStatus.TYPE
-    return offered(True, latched, 1 if latched else 10)
+def qos_profile(base_name: str) -> dict[str, Any]:
+    """Return the QoS that the node offers on a topic; a usual one where it sends none of that base name."""
+    for topic in TOPICS:
+        if topic.name == base_name:
+            return offered(True, topic.latched, topic.depth)
+    return offered(True, False, 10)
 
 
 def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
@@ -52,9 +54,9 @@ def offered(reliable: bool, latched: bool, depth: int) -> dict[str, Any]:
     }
 
 
-def qos_text(message_type: str) -> str:
-    """Return the QoS as the text that a channel of the file carries."""
-    return dump_yaml([qos_profile(message_type)]).strip()
+def qos_text(base_name: str) -> str:
+    """Return the QoS of a topic as the text that a channel of the file carries."""
+    return dump_yaml([qos_profile(base_name)]).strip()
 
 
 def load_yaml(text: str) -> Any:
@@ -116,7 +118,7 @@ def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[
                 "name": topic.topic,
                 "type": topic.message_type,
                 "serialization_format": "cdr",
-                "offered_qos_profiles": load_yaml(topic.qos) if topic.qos else [qos_profile(topic.message_type)],
+                "offered_qos_profiles": load_yaml(topic.qos) if topic.qos else [qos_profile("")],
                 "type_description_hash": topic.type_hash or type_hash(topic.message_type),
             },
             "message_count": topic.count,

@@ -12,6 +12,7 @@ from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.record.messages import JointState, Message, Odometry
 from plow_twin.record.template import Template, compiled
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
+from plow_twin.stream.topics import Cadence, names_of
 
 if TYPE_CHECKING:
     from plow_twin.stream.outputs import Publication, Publications
@@ -19,12 +20,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 #: Base names of the topics that follow from the journal alone.
-PUBLICATION_TOPICS: Final = ("contact_forces", "contact_peaks", "head_state", "clearance", "wear_rate")
+PUBLICATION_TOPICS: Final = names_of(Cadence.EACH, Cadence.SLOW)
 #: Names of `quality`: 1 where a publication was computed without a sample, and where late samples have been worked in.
 QUALITY_NAMES: Final = ("held", "corrected")
 
 #: Those of them that not every publication has.
-SLOW_TOPICS: Final = frozenset({"clearance", "wear_rate"})
+SLOW_TOPICS: Final = frozenset(names_of(Cadence.SLOW))
 
 
 def publication_messages(publication: Publication, frame_id: str, child_frame_id: str) -> dict[str, Message]:

@@ -57,13 +57,14 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.session import Session
+from plow_twin.stream.topics import TOPICS
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
 
 #: Topics that depend on the publication before: after a lost message they can be compared again from the next
 #: snapshot on.
-_CUMULATIVE: Final = frozenset({"contact_peaks", "clearance", "wear_rate"})
+_CUMULATIVE: Final = frozenset(topic.name for topic in TOPICS if topic.cumulative)
 #: By place in `PUBLICATION_TOPICS`.
 _IS_CUMULATIVE: Final = np.array([name in _CUMULATIVE for name in PUBLICATION_TOPICS])
 _SEQUENCE_MASK: Final = 0xFFFFFFFF

@@ -27,6 +27,7 @@ from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
 from plow_twin.stream.journal import Entry, Sample
 from plow_twin.stream.outputs import Publication, Publications
+from plow_twin.stream.topics import TOPICS
 
 #: Folder in a run's folder with what was recorded beside it; further ones are `beside_2`, ...
 BESIDE: Final = "beside"
@@ -40,14 +41,15 @@ class _Part:
 
     path: Path
     file: McapFile
-    channels: dict[str, tuple[int, str]] = field(default_factory=dict)
+    #: number, message type and QoS text of each channel by its topic
+    channels: dict[str, tuple[int, str, str]] = field(default_factory=dict)
     #: numbers of the publications' channels by base name of the topic
     sent: dict[str, int] = field(default_factory=dict)
 
     def facts(self) -> PartFacts:
         counts = [
-            TopicCount(topic, message_type, self.file.counts[number])
-            for topic, (number, message_type) in self.channels.items()
+            TopicCount(topic, message_type, self.file.counts[number], qos)
+            for topic, (number, message_type, qos) in self.channels.items()
         ]
         return PartFacts(self.path.name, *self.file.times, counts)
 
@@ -83,6 +85,7 @@ class RunWriter:
         self._journal, self._outputs = ChunkBuilder("zstd"), ChunkBuilder("lz4")
         self._sample = sample_template(header.frame_id)
         self._templates = publication_templates(header.frame_id, header.child_frame_id)
+        self._base_names = {header.topic(topic.name): topic.name for topic in TOPICS}
         self._done: list[PartFacts] = []
         self._bytes_before = 0
         warm_up()
@@ -196,9 +199,10 @@ class RunWriter:
     def _channel(self, topic: str, message_type: str) -> int:
         known = self._part.channels.get(topic)
         if known is None:
-            qos = {"offered_qos_profiles": qos_text(message_type), "topic_type_hash": type_hash(message_type)}
-            number = self._part.file.channel(topic, message_type, schema_text(message_type).encode(), qos)
-            known = self._part.channels[topic] = (number, message_type)
+            qos = qos_text(self._base_names.get(topic, ""))
+            metadata = {"offered_qos_profiles": qos, "topic_type_hash": type_hash(message_type)}
+            number = self._part.file.channel(topic, message_type, schema_text(message_type).encode(), metadata)
+            known = self._part.channels[topic] = (number, message_type, qos)
         if known[1] != message_type:
             raise RecordingError(f"{topic}: got a {message_type}, expected a {known[1]} as before")
         return known[0]

@@ -39,7 +39,7 @@ from plow_twin.model.scene import Clearance, Scene
 from plow_twin.ros.connections import WithoutEvents
 from plow_twin.ros.main import make_executor
 from plow_twin.ros.messages import set_stamp
-from plow_twin.ros.qos import LATCHED, sensor_input
+from plow_twin.ros.qos import OUTPUTS, sensor_input
 from plow_twin.ros.start import RosArgumentsError, start_ros, without_ros
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
@@ -101,7 +101,7 @@ class ExcitationPublisher(WithoutEvents):
         self.latest_s = 0.0
         #: times that the twin did not answer within the time allowed
         self.stalls = 0
-        self.create_subscription(DiagnosticStatus, "status", self._on_status, LATCHED)
+        self.create_subscription(DiagnosticStatus, "status", self._on_status, OUTPUTS["status"])
         self._answers = (
             self.create_subscription(JointState, "contact_peaks", self._on_answer, sensor_input(1000), raw=True)
             if fast

@@ -20,10 +20,11 @@ from plow_twin.live.wear_keeper import KeptWear
 from plow_twin.record.messages import DiagnosticStatus, JointState
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.messages import ros_joint_state, ros_status
-from plow_twin.ros.publishers import TOPICS, OutputPublishers
-from plow_twin.ros.qos import LATCHED
+from plow_twin.ros.publishers import OutputPublishers
+from plow_twin.ros.qos import OUTPUTS
 from plow_twin.ros.subscriptions import Subscriptions
 from plow_twin.stream.outputs import Publication
+from plow_twin.stream.topics import TOPICS
 
 #: Services by name, each a method of `Services`.
 SERVICES: Final = (
@@ -68,9 +69,7 @@ class RosFront:
     ) -> None:
         self._node = node
         self.name: str = node.get_fully_qualified_name()
-        self.topics: Mapping[str, str] = {
-            topic: node.resolve_topic_name(topic) for topic in (*TOPICS, "status", "alarms", *ESTIMATES)
-        }
+        self.topics: Mapping[str, str] = {topic.name: node.resolve_topic_name(topic.name) for topic in TOPICS}
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.changed = changed
         #: one thread at a time has to do with the twin
@@ -89,13 +88,13 @@ class RosFront:
             node, settings.frame_id, settings.child_frame_id, kept=runtime.recording is not None
         )
         made.callback(self._publishers.close)
-        self._alarms = node.create_publisher(RosDiagnosticStatus, "alarms", LATCHED)
+        self._alarms = node.create_publisher(RosDiagnosticStatus, "alarms", OUTPUTS["alarms"])
         made.callback(node.destroy_publisher, self._alarms)
         self._estimates: dict[str, Any] = {}
         wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
         for topic, one in zip(ESTIMATES, wanted, strict=True):
             if settings.estimate and one:
-                self._estimates[topic] = node.create_publisher(RosJointState, topic, LATCHED)
+                self._estimates[topic] = node.create_publisher(RosJointState, topic, OUTPUTS[topic])
                 made.callback(node.destroy_publisher, self._estimates[topic])
         self._loop = loop = InputLoop(self.turns, self._failed)
         made.callback(loop.close)

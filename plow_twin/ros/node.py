@@ -30,7 +30,7 @@ from plow_twin.ros.connections import LOOK_S, Connections, WithoutEvents
 from plow_twin.ros.front import SERVICES, RosFront
 from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
-from plow_twin.ros.qos import DIAGNOSTICS, LATCHED
+from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS
 
 #: Reports between two times that a lasting trouble is logged.
 _SAY_AGAIN: Final = 5
@@ -67,7 +67,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._table = ParameterServer(self, lambda: self.runtime is None, self._parameter_changed, self._refusals)
         for refused in apply_realtime(self._table.settings):
             self.get_logger().warning(f"refused by the system: {refused}")
-        self._status = self.create_publisher(DiagnosticStatus, "status", LATCHED)
+        self._status = self.create_publisher(DiagnosticStatus, "status", OUTPUTS["status"])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         for name in SERVICES:
             # for good: a request that waits when its service is destroyed ends rclpy's executor

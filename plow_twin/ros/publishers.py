@@ -11,17 +11,16 @@ from sensor_msgs.msg import JointState as RosJointState
 
 from plow_twin.live.publishing import QUALITY
 from plow_twin.record.messages import JointState
-from plow_twin.record.outputs import PUBLICATION_TOPICS
 from plow_twin.record.sending import PublicationBytes
 from plow_twin.ros.messages import ros_joint_state
-from plow_twin.ros.qos import KEPT_OUTPUT, OUTPUT
+from plow_twin.ros.qos import OUTPUTS
 from plow_twin.ros.rcl import Sender
 from plow_twin.stream.outputs import Publication
+from plow_twin.stream.topics import JOINT_STATE, ODOMETRY, Cadence, topics_of
 
-#: Output topics that follow from the motion, with their types.
-TOPICS: Final[dict[str, type]] = {
-    topic: RosOdometry if topic == "head_state" else RosJointState for topic in (*PUBLICATION_TOPICS, QUALITY)
-}
+_CLASSES: Final[dict[str, type]] = {JOINT_STATE: RosJointState, ODOMETRY: RosOdometry}
+#: Topics of a publication, with the classes of their messages.
+PUBLISHED: Final = {topic.name: _CLASSES[topic.type] for topic in topics_of(Cadence.EACH, Cadence.SLOW, Cadence.MARKED)}
 
 
 class OutputPublishers:
@@ -40,9 +39,7 @@ class OutputPublishers:
     def __init__(self, node: Node, frame_id: str, child_frame_id: str, *, kept: bool) -> None:
         self._node = node
         self._publishers = {
-            # sent on change only: a late reader gets those of before
-            topic: node.create_publisher(kind, topic, KEPT_OUTPUT if topic == QUALITY else OUTPUT)
-            for topic, kind in TOPICS.items()
+            topic: node.create_publisher(kind, topic, OUTPUTS[topic]) for topic, kind in PUBLISHED.items()
         }
         self._bytes, self._kept = PublicationBytes(frame_id, child_frame_id), kept
         self._senders = [Sender(self._publishers[topic], part) for topic, part in self._bytes.parts]

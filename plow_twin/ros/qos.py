@@ -1,4 +1,4 @@
-"""Quality of service of each kind of topic; `qos_overrides` parameters override that of the inputs."""
+"""Quality of service of the topics: of the outputs from their table, of the inputs to be overridden by parameters."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from typing import Final
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from plow_twin.stream.topics import TOPICS, Topic
 
 #: What the user may override by parameters `qos_overrides.<topic>.subscription.<policy>`.
 OVERRIDABLE: Final = QoSOverridingOptions(
@@ -18,20 +20,16 @@ def sensor_input(depth: int) -> QoSProfile:
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-#: Outputs: reliable, with room for a reader that looks once a second at 1 kHz.
-OUTPUT: Final = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-#: A late reader gets the last message.
-LATCHED: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-#: As the outputs, and a late reader gets those of before.
-KEPT_OUTPUT: Final = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
+def offered(topic: Topic) -> QoSProfile:
+    """Return the quality of service of an output: reliable, the rest as its table says."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=topic.depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+#: Of each output by its base name.
+OUTPUTS: Final = {topic.name: offered(topic) for topic in TOPICS}
 DIAGNOSTICS: Final = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE)

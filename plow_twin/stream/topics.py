@@ -1,0 +1,133 @@
+"""The topics that a live twin sends: one table, from which all that sends, records, compares or lists them follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+STATUS: Final = "diagnostic_msgs/msg/DiagnosticStatus"
+#: Messages that a publisher keeps for readers: a reader that looks once a second at 1 kHz misses none.
+_DEPTH: Final = 1000
+
+
+class Cadence(Enum):
+    """When a message is sent."""
+
+    #: with each publication
+    EACH = "each publication"
+    #: with the first publication in each 0.1 s of stamps
+    SLOW = "each 0.1 s of stamps"
+    #: with each publication that is marked, and with the first one after it
+    MARKED = "marked publications"
+    #: with each estimate
+    ESTIMATE = "each estimate"
+    #: when what it tells has changed
+    CHANGE = "on change"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic.
+
+    Attributes
+    ----------
+    name, type : str
+        Base name, and ROS 2 message type.
+    cadence : Cadence
+        When it is sent.
+    content : str
+        What its message holds, in words and with units.
+    cumulative : bool
+        Whether its message depends on the publication before: a replay cannot compare it after a lost message.
+    latched : bool
+        Whether a late reader gets what was sent before (`transient_local`).
+    depth : int
+        How many messages the publisher keeps.
+    """
+
+    name: str
+    type: str
+    cadence: Cadence
+    content: str
+    cumulative: bool = False
+    latched: bool = False
+    depth: int = _DEPTH
+
+
+TOPICS: Final = (
+    Topic(
+        "contact_forces", JOINT_STATE, Cadence.EACH,
+        "position = penetration [m] (negative: gap), velocity = its rate [m/s], effort = force [N], all at the stamp",
+    ),
+    Topic(
+        "contact_peaks", JOINT_STATE, Cadence.EACH,
+        "position = touches since configure, velocity = impulse [N s] and effort = largest force [N] since the last "
+        "message; after late samples since the time that the model went back to",
+        cumulative=True,
+    ),
+    Topic(
+        "head_state", ODOMETRY, Cadence.EACH,
+        "pose in `frame_id`, twist in the head's own axes; covariances zero: not known",
+    ),
+    Topic(
+        "clearance", JOINT_STATE, Cadence.SLOW,
+        "position [m] of `horizontal`, `vertical`, then `pad_<pair>` (wear depth), then `<name>/p05`, `<name>/p95` of "
+        "each; first message in each 0.1 s of stamps",
+        cumulative=True,
+    ),
+    Topic(
+        "wear_rate", JOINT_STATE, Cadence.SLOW,
+        "velocity = growth of each pad's wear since the last such message [m/s]; with `clearance`",
+        cumulative=True,
+    ),
+    Topic(
+        "quality", JOINT_STATE, Cadence.MARKED,
+        "position of `held` (the state at the stamp was computed without a sample) and `corrected` (late samples have "
+        "been worked in), 1 or 0, with the stamp of the forces they speak of; sent with each such message and with the "
+        "first one after",
+        latched=True,
+    ),
+    Topic(
+        "estimate", JOINT_STATE, Cadence.ESTIMATE,
+        "only with the parameter `estimate`: position of `horizontal`, `vertical` [m], `stiffness`, `damping`, "
+        "`gain_fx`, `gain_fy`, `gain_m` [1], `bias_x`, `bias_y` [m], `bias_theta` [rad], `delay` [s], each followed by "
+        "its `<name>/p05`, `<name>/p95`; the stamp is the end of the window; without names where the estimate is "
+        "withdrawn",
+        latched=True, depth=1,
+    ),
+    Topic(
+        "force_intervals", JOINT_STATE, Cadence.ESTIMATE,
+        "only with `estimate` and `estimate_forces`: `<pair>`, `<pair>/p05`, `<pair>/p95` (median, 5 % and 95 % points "
+        "over twins drawn from the estimate), velocity = impulse [N s] and effort = largest force [N] in the last "
+        "`estimate_interval` before the stamp, which is the end of the window; without names where there are none",
+        latched=True, depth=1,
+    ),
+    Topic(
+        "forecast", JOINT_STATE, Cadence.ESTIMATE,
+        "only with `estimate` and `forecast_limits`: position of `seconds`, `metres`, `passes`, `shifts`, each as "
+        "`/p10`, `/p50`, `/p90`, of operation until a clearance reaches its limit (left out where that is beyond the "
+        "horizon), then `not_reached_in_horizon` and, with `forecast_stop`, `probability_before_stop` [1]; without "
+        "names where the estimate is withdrawn",
+        latched=True, depth=1,
+    ),
+    Topic(
+        "alarms", STATUS, Cadence.CHANGE,
+        "the alarms: value, `<name>_level` and `<name>_latched` of `force` [N], `clearance` [m], `clearance_rate`, "
+        "`wear_rate` [m/s], and `residual` [m] where it has a threshold",
+        latched=True, depth=1,
+    ),
+    Topic("status", STATUS, Cadence.CHANGE, "what the node is doing", latched=True, depth=1),
+)  # fmt: skip
+
+
+def topics_of(*cadences: Cadence) -> tuple[Topic, ...]:
+    """Return the topics that are sent at one of some cadences, in the order of the table."""
+    return tuple(topic for topic in TOPICS if topic.cadence in cadences)
+
+
+def names_of(*cadences: Cadence) -> tuple[str, ...]:
+    """Return the base names of the same topics."""
+    return tuple(topic.name for topic in topics_of(*cadences))
