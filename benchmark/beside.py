@@ -3,7 +3,7 @@
     python benchmark/beside.py COMMIT [--rounds 5]
 
 Each round starts one process in a worktree of the commit and one in this checkout; a process warms up, repeats each
-case and reports its fastest time. The table (medians over the rounds, and their ratio) goes to docs/benchmark_log.md.
+case and reports its fastest time. The table (medians over the rounds, and their ratio) is benchmark/results/beside.md.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs" / "benchmark_log.md"
-BEGIN, END = "<!-- beside: begin -->", "<!-- beside: end -->"
+PAGE = ROOT / "benchmark" / "results" / "beside.md"
 #: Only what both commits offer: runs as in README.
 _WORK = """
 import json, sys, time
@@ -79,7 +78,7 @@ def table(commit: str, now: list[dict[str, float]], before: list[dict[str, float
 
 
 def main() -> None:
-    """Measure and rewrite the table of the page."""
+    """Measure and write the table."""
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     arguments.add_argument("commit")
     arguments.add_argument("--rounds", type=int, default=5)
@@ -98,9 +97,7 @@ def main() -> None:
             _git("worktree", "remove", "--force", str(tree))
     text = table(commit, now, before)
     print(text)
-    page = PAGE.read_text(encoding="utf-8")
-    head, _, rest = page.partition(BEGIN)
-    PAGE.write_text(f"{head}{BEGIN}\n\n{text}\n\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+    PAGE.write_text(f"{text}\n", encoding="utf-8")
 
 
 def _git(*words: str) -> str:

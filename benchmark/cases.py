@@ -7,7 +7,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -154,10 +154,18 @@ def write_csv(path: Path, rows: Iterable[Row]) -> None:
             writer.writerow([_text(getattr(row, name)) for name in names])
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    """Read a table as dictionaries of texts."""
+def read_rows(path: Path) -> list[Row]:
+    """Read a table that `write_csv` has written."""
     with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+        lines = list(csv.DictReader(file))
+    return [Row(**{spec.name: _value(spec, line[spec.name]) for spec in fields(Row)}) for line in lines]
+
+
+def _value(spec: Field[Any], text: str) -> Any:
+    kind = str(spec.type)
+    if not text and "None" in kind:
+        return None
+    return int(text) if kind.startswith("int") else float(text) if kind.startswith("float") else text
 
 
 def _text(value: Any) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import click
 import numpy as np
 from estimate import load_rows
+from estimate_pages import filter_table
 from estimate_truths import GROUPS, Truth, draw
 from filterpy.kalman import EnsembleKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
@@ -204,22 +204,6 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     return row
 
 
-def summary(rows: Sequence[dict[str, Any]]) -> str:
-    """Return the table of the page."""
-    lines = ["| group | filter | truths | RMSE gx, gy [mm] | coverage gx, gy | CPU [s] |", "|---|---|---|---|---|---|"]
-    for name, method in dict.fromkeys((row["group"], row["method"]) for row in rows):
-        own = [row for row in rows if (row["group"], row["method"]) == (name, method) and "failed" not in row]
-        errors = np.array([[row["h_error_m"], row["v_error_m"]] for row in own]).reshape(-1, 2)
-        rmse = 1e3 * np.sqrt((errors**2).mean(axis=0))
-        inside = np.mean([[row["h_inside"], row["v_inside"]] for row in own], axis=0)
-        cpu_s = np.mean([row["cpu_s"] for row in own])
-        lines.append(
-            f"| {GROUPS[name].title} | {method.upper()} | {len(own)} | {rmse[0]:.3f}, {rmse[1]:.3f} | "
-            f"{inside[0]:.2f}, {inside[1]:.2f} | {cpu_s:.1f} |"
-        )
-    return "\n".join(lines)
-
-
 @click.command()
 @click.option("--group", "groups", multiple=True, type=click.Choice(list(GROUPS)), default=("plain",))
 @click.option("--truths", default=5, show_default=True)
@@ -236,7 +220,7 @@ def main(groups: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
                     rows.append(run_one(name, method, number))
                     with out.open("a", encoding="utf-8") as file:
                         file.write(json.dumps(rows[-1]) + "\n")
-    click.echo(summary([row for row in rows if row["group"] in groups]))
+    click.echo(filter_table([row for row in rows if row["group"] in groups]))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Measure run time against error, side by side with the peers, and write the table, the picture and the page's figures.
+"""Measure run time against error beside the peers; write the table, the picture and the figures of the pages.
 
 One run: `make bench`. Everything is measured on one core unless a row says otherwise.
 """
@@ -27,7 +27,6 @@ from rich.progress import MofNCompleteColumn, Progress, SpinnerColumn, TextColum
 
 RESULTS = Path(__file__).resolve().parent / "results"
 PICTURE = ROOT / "docs" / "images" / "work_precision.png"
-PAGE = ROOT / "docs" / "benchmark_log.md"
 PEERS: dict[str, Callable[[str], Iterator[Case]]] = {
     "own": work_precision.own_cases,
     "lean": work_precision.lean_cases,
@@ -117,14 +116,14 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
 
 
 def _publish(rows: list[Row], measured: str) -> None:
-    """Draw the picture and replace the measured part of the page."""
+    """Draw the picture, write all tables beside the rows, and renew the figures of the pages."""
+    import pages
     import plot
 
     plot.draw(rows, PICTURE)
-    text = PAGE.read_text(encoding="utf-8")
-    before, _, rest = text.partition(summary.BEGIN)
-    _, _, after = rest.partition(summary.END)
-    PAGE.write_text(f"{before}{summary.BEGIN}\n\n{measured}\n\n{summary.END}{after}", encoding="utf-8")
+    (RESULTS / f"{machine_name()}.md").write_text(f"{summary.TITLE}\n\n{measured}\n", encoding="utf-8")
+    pages.NEWEST.write_text(f"{machine_name()}\n", encoding="utf-8")
+    pages.main()
 
 
 def _versions() -> dict[str, str]:

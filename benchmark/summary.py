@@ -1,4 +1,4 @@
-"""From the table's rows to the figures in `docs/benchmark_log.md`."""
+"""From the rows of a run to all its tables, `benchmark/results/<machine>.md`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from levels import LEVELS, OUTPUTS, OWN, PEERS, Reached, fastest
 from random_rows import AMPLIFIES, exponent_of
 from work_precision import OURS_BARE, SECTION
 
-BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
+TITLE = "# All tables of one run of `make bench`"
 _WORDS = {0.1: "output each 0.1 s", 1e-3: "output each 1 ms"}
 
 

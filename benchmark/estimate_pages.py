@@ -1,0 +1,137 @@
+"""Tables of the estimate's results for the pages, from `benchmark/results/estimate.jsonl`.
+
+`TRUTHS` names the seeds of each group on which no threshold was set; a page counts these and no others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from estimate import RESULTS, load_rows, summary
+from estimate_truths import GROUPS
+from scipy.stats import beta
+
+from plow_twin.estimate.result import State
+
+#: Groups of the page, in its order, each with its first seeds and numbers of truths.
+TRUTHS: dict[str, tuple[tuple[int, int], ...]] = {
+    "plain": ((54000, 50),),
+    "sensor": ((54000, 50),),
+    "stochastic": ((52000, 60),),
+    "middle": ((54000, 8), (56100, 16), (61000, 16), (64000, 15)),
+    "firm": ((64000, 35),),
+    "hard": ((50000, 23), (54000, 10), (60000, 30), (63000, 20)),
+    "hard_sensor": ((50000, 23), (54000, 10)),
+    "noisy": ((54000, 8),),
+    "slow": ((52000, 8),),
+    "kelvin_voigt": ((57000, 16),),
+    "exponent": ((54000, 4), (57000, 8)),
+    "shape": ((54000, 4), (57000, 8)),
+    "scale": ((54000, 4),),
+    "jam": ((54000, 4),),
+    "shift": ((54000, 4),),
+    "stuck": ((54000, 4),),
+    "noisier": ((54000, 4),),
+    "hard_shape": ((50000, 6),),
+    "hard_kelvin_voigt": ((50000, 23), (54000, 10), (60000, 30)),
+}
+_LEVEL = 0.95
+
+
+def truths(group: str, seeds: Sequence[tuple[int, int]]) -> list[dict[str, Any]]:
+    """Return the newest row of each truth of a group."""
+    wanted = {seed for first, count in seeds for seed in range(first, first + count)}
+    rows = load_rows(RESULTS / "estimate.jsonl")
+    newest = {row["seed"]: row for row in rows if row["group"] == group and row["seed"] in wanted}
+    return [row for row in newest.values() if "not_drawn" not in row]
+
+
+def right_models() -> str:
+    """Return errors and coverage of the truths that the model describes."""
+    lines = [
+        "| group | truths | RMSE gx, gy [mm] | estimated gx, gy | 90 % interval holds gx | gy | "
+        "median width [mm] | flagged | range of motion [mm] | CPU [s], most |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for group, seeds in TRUTHS.items():
+        if (GROUPS[group].model, GROUPS[group].sensor) != ("ok", "ok"):
+            continue
+        rows = truths(group, seeds)
+        one = summary(group, rows)
+        known = [[row for row in rows if row[f"{axis}_state"] == State.ESTIMATED.value] for axis in "hv"]
+        held = [coverage([bool(row[f"{axis}_inside"]) for row in own]) for axis, own in zip("hv", known, strict=True)]
+        lines.append(
+            f"| {GROUPS[group].title} | {len(rows)} | {one['h_rmse_mm']:.3f}, {one['v_rmse_mm']:.3f} | "
+            f"{len(known[0])}, {len(known[1])} | {held[0]} | {held[1]} | "
+            f"{one['h_width_mm']:.2f}, {one['v_width_mm']:.2f} | {sum(map(_flagged, rows))} | "
+            f"{one['h_range_rmse_mm']:.1f}, {one['v_range_rmse_mm']:.1f} | "
+            f"{one['cpu_s']:.1f}, {one['cpu_s_most']:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def wrong_models() -> str:
+    """Return how often each deviation from the model is flagged."""
+    lines = ["| deviation of the truth from the model | truths | flagged | share, 95 % interval |", "|---|---|---|---|"]
+    for group, seeds in TRUTHS.items():
+        if (GROUPS[group].model, GROUPS[group].sensor) != ("ok", "ok"):
+            rows = truths(group, seeds)
+            told = [_flagged(row) for row in rows]
+            lines.append(f"| {GROUPS[group].title} | {len(rows)} | {sum(told)} | {coverage(told)} |")
+    return "\n".join(lines)
+
+
+def _flagged(row: dict[str, Any]) -> bool:
+    return "suspect" in (row["model"], row["sensor"])
+
+
+def coverage(held: Sequence[bool]) -> str:
+    """Return a share with its interval after Clopper and Pearson."""
+    count, total = sum(held), len(held)
+    if not total:
+        return "-"
+    tail = (1.0 - _LEVEL) / 2.0
+    low = float(beta.ppf(tail, count, total - count + 1)) if count else 0.0
+    high = float(beta.ppf(1.0 - tail, count + 1, total - count)) if count < total else 1.0
+    return f"{count / total:.2f} ({low:.2f} to {high:.2f})"
+
+
+def commands() -> str:
+    """Return the calls that run these truths again."""
+    calls: dict[tuple[int, int], list[str]] = {}
+    for group, seeds in TRUTHS.items():
+        for first, count in seeds:
+            calls.setdefault((first, count), []).append(group)
+    lines = []
+    for (first, count), groups in calls.items():
+        named = " ".join(f"--group {group}" for group in groups)
+        lines.append(f"python benchmark/estimate.py {named} --truths {count} --seed {first}")
+    return "\n".join(["```", *lines, "```"])
+
+
+def filter_table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return errors and coverage of the two filters, by group."""
+    lines = ["| group | filter | truths | RMSE gx, gy [mm] | coverage gx, gy | CPU [s] |", "|---|---|---|---|---|---|"]
+    for name, method in dict.fromkeys((row["group"], row["method"]) for row in rows):
+        own = [row for row in rows if (row["group"], row["method"]) == (name, method) and "failed" not in row]
+        errors = np.array([[row["h_error_m"], row["v_error_m"]] for row in own]).reshape(-1, 2)
+        rmse = 1e3 * np.sqrt((errors**2).mean(axis=0))
+        inside = np.mean([[row["h_inside"], row["v_inside"]] for row in own], axis=0)
+        cpu_s = np.mean([row["cpu_s"] for row in own])
+        lines.append(
+            f"| {GROUPS[name].title} | {method.upper()} | {len(own)} | {rmse[0]:.3f}, {rmse[1]:.3f} | "
+            f"{inside[0]:.2f}, {inside[1]:.2f} | {cpu_s:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def filters() -> str:
+    """Return the two filters on the estimate's truths."""
+    return filter_table(load_rows(RESULTS / "filter_peers.jsonl"))
+
+
+FIGURES: dict[str, Callable[[], str]] = {
+    "right_models": right_models, "wrong_models": wrong_models, "estimate_commands": commands, "filters": filters,
+}  # fmt: skip

@@ -1,0 +1,171 @@
+"""Write the figures of the pages from the stored results: `python benchmark/pages.py`, after any part of the benchmark.
+
+A page says where a figure belongs by `<!-- figures: NAME -->` and `<!-- end -->`; what stands between is replaced by
+the text that `FIGURES[NAME]` makes from the files of `benchmark/results`.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import estimate_pages
+import lives
+import month
+import targets
+from bench_scenes import ROOT
+from cases import Row, read_rows
+from ensemble_rows import core_row
+from levels import OWN, PEERS, fastest
+from work_precision import OURS_BARE, OURS_CALL
+
+RESULTS = ROOT / "benchmark" / "results"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+#: Holds the name of the machine of the newest complete run, whose table the pages quote.
+NEWEST = RESULTS / "newest.txt"
+_BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_PEERS = (
+    "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",
+)  # fmt: skip
+
+
+def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Return a table of Markdown."""
+    body = ["| " + " | ".join(line) + " |" for line in (head, *lines)]
+    return "\n".join([body[0], "|" + "---|" * len(head), *body[1:]])
+
+
+def solver_rows() -> list[Row]:
+    """Return the rows of the newest complete run of `make bench`."""
+    return read_rows(RESULTS / f"{NEWEST.read_text(encoding='utf-8').strip()}.csv")
+
+
+def speed() -> str:
+    """Return the time for 20 s of impacts at three errors, the peers' as multiples."""
+    rows = solver_rows()
+    lines = []
+    for level in (1e-3, 1e-6, 1e-9):
+        own = _own_ms(rows, "kv", 0.1, level, OURS_BARE)
+        peers = [_times(rows, "kv", 0.1, level, peer, own) for peer in _PEERS]
+        lines.append([f"{level:g}", f"{own:.2f} ms", *peers])
+    return table(["error / clearance [1]", "plow_twin", *_PEERS], lines)
+
+
+def located() -> str:
+    """Return the same beside the two peers that locate every change of contact, on both bench scenes."""
+    rows = solver_rows()
+    lines = []
+    for scene in ("kv", "hc"):
+        for output_s, output in ((0.1, "0.1 s"), (1e-3, "1 ms")):
+            for level in (1e-6, 1e-9):
+                where = scene, output_s, level
+                own = _own_ms(rows, *where, OURS_BARE)
+                peers = [_times(rows, *where, peer, own) for peer in ("heyoka", "compiled DOP853, events located")]
+                whole = _times(rows, *where, "heyoka", _own_ms(rows, *where, OURS_CALL))
+                lines.append([scene.upper(), f"{level:g}", output, f"{own:.2f} ms", *peers, whole])
+    head = ["scene", "error", "output every", "plow_twin", "heyoka", "DOP853", "heyoka / whole call of `simulate`"]
+    return table(head, lines)
+
+
+def work() -> str:
+    """Return what one core does."""
+    rows = solver_rows()
+    (one,) = [row for row in rows if row.section == "sampled_load" and "256" not in row.scene]
+    many = [row for row in rows if row.section == "sampled_load" and "256" in row.scene]
+    pairs = core_row(rows)
+    hours = {row.scene: row for row in rows if row.section == "machine_time" and row.simulated_s == 3600.0}
+    starts = [row.wall_ms for row in rows if row.section == "start"]
+    assert pairs is not None and pairs.wall_ms is not None and None not in starts
+    lines = [
+        ["one live twin under samples at 1 kHz", f"{one.value:.0f} times real time"],
+        *([row.scene.partition(", ")[2], f"{row.value:.2f} of a core"] for row in many),
+        ["1,000 pairs of clearances, 20 s each, every one within 1e-4", f"{1e-3 * pairs.wall_ms:.2f} s"],
+        ["an hour of the bench scene", f"{1e-3 * (hours['kv'].wall_ms or 0.0):.1f} s"],
+        *([f"an hour {name}", f"{row.wall_ms:.2g} ms"] for name, row in hours.items() if name != "kv"),
+        ["first start of a live twin, with compiling", f"{1e-3 * (starts[0] or 0.0):.0f} s"],
+        ["later starts", f"{1e-3 * (starts[1] or 0.0):.1f} s"],
+    ]
+    return table(["work on one core", "takes"], lines)
+
+
+def missed() -> str:
+    """Return the targets of the solver that were not reached."""
+    rows = [verdict for verdict in targets.verdicts(solver_rows()) if not verdict.reached]
+    return table(["target not reached", "measured", "wanted"], [[row.work, _short(row), row.wanted] for row in rows])
+
+
+def random_scenes() -> str:
+    """Return the largest error of random scenes that amplify little."""
+    rows = [verdict for verdict in targets.verdicts(solver_rows()) if "random scenes" in verdict.work]
+    return table(["scenes", "measured", "target"], [[row.work, row.measured, row.wanted] for row in rows])
+
+
+def stored(name: str) -> Callable[[], str]:
+    """Return the function that shows a small table of results as it is stored."""
+
+    def shown() -> str:
+        with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+            head, *lines = csv.reader(file)
+        return table(head, lines)
+
+    return shown
+
+
+def life_table() -> str:
+    """Return the forecasts of synthetic lives."""
+    return lives.summary(_lines("lives.jsonl"))
+
+
+def month_table() -> str:
+    """Return the forecasts after a month of measurements, by kilometres a day."""
+    rows = _lines("month.jsonl")
+    days = list(dict.fromkeys(row["day_m"] for row in rows))
+    tables = [month.summary([row for row in rows if row["day_m"] == day]).splitlines() for day in days]
+    head = [f"| km a day {tables[0][0]}", f"|---{tables[0][1]}"]
+    return "\n".join(head + [f"| {1e-3 * day:g} {own[2]}" for day, own in zip(days, tables, strict=True)])
+
+
+FIGURES: dict[str, Callable[[], str]] = {
+    "speed": speed, "located": located, "work": work, "missed": missed,
+    "random_scenes": random_scenes, "lives": life_table, "month": month_table, **estimate_pages.FIGURES,
+    **{name: stored(name) for name in ("live_node", "replay", "estimate_forces", "estimate_scales", "estimate_live")},
+}  # fmt: skip
+
+
+def with_figures(text: str) -> str:
+    """Return a page with the figures of the stored results."""
+    return _BLOCK.sub(lambda block: f"{block[1]}\n{FIGURES[block[2]]()}\n\n{block[3]}", text)
+
+
+def main() -> None:
+    """Rewrite the pages that quote figures."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        page.write_text(with_figures(text), encoding="utf-8")
+
+
+def _own_ms(rows: Sequence[Row], scene: str, output_s: float, level: float, solver: str) -> float:
+    reached = fastest(rows, scene, output_s, level, OWN[solver])
+    assert reached is not None
+    return reached.wall_ms
+
+
+def _times(rows: Sequence[Row], scene: str, output_s: float, level: float, peer: str, own_ms: float) -> str:
+    reached = fastest(rows, scene, output_s, level, PEERS[peer])
+    return "not reached" if reached is None else f"{reached.wall_ms / own_ms:.1f} x"
+
+
+def _short(verdict: targets.Verdict) -> str:
+    ratio = re.search(r"\*\*([\d.]+x)\*\*", verdict.measured)
+    return ratio[1] if ratio else verdict.measured
+
+
+def _lines(name: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (RESULTS / name).read_text(encoding="utf-8").splitlines() if line]
+
+
+if __name__ == "__main__":
+    main()
