@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib import import_module as _import_module
 from typing import TYPE_CHECKING as _TYPE_CHECKING
-from warnings import warn as _warn
 
 if _TYPE_CHECKING:
     from plow_twin.errors import ArgumentError as ArgumentError
@@ -97,14 +96,9 @@ _NAMES = {
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
 #: For a star: names that `__getattr__` finds are not in the module before.
 __all__ = [*_HOMES]
-#: Names of version 0.1, and what they are now.
-_RENAMED = {"Twins": "TwinBatch", "AdvanceTogether": "AdvanceBatch"}
 
 
 def __getattr__(name: str) -> object:
-    if name in _RENAMED:
-        _warn(f"plow_twin.{name} is now plow_twin.{_RENAMED[name]}", DeprecationWarning, stacklevel=2)
-        name = _RENAMED[name]
     if name not in _HOMES:
         raise AttributeError(f"module 'plow_twin' has no attribute {name!r}")
     found = getattr(_import_module(_HOMES[name]), name)

@@ -252,7 +252,7 @@ def test_the_energy_balance_closes() -> None:
     assert end - start == pytest.approx(given - taken, abs=1e-6 * balance["turnover_j"])
     assert balance["dissipated_j"] > 1.0 and balance["friction_work_j"] == 0.0
     assert 0.0 <= balance["relative_imbalance"] < 1e-6 and len(balance["momentum_imbalance"]) == 3
-    shown = plow_twin_here(*RUN, "--audit").stdout
+    shown = plow_twin_here(*RUN, "--energy-balance").stdout
     assert "balance of energy" in shown and "largest imbalance" in shown
 
 

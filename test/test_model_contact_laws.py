@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.optimize import brentq
 
 from plow_twin import Clearance, Contact, Frame, Head, Scene, SceneError
 from plow_twin.kernel.compiler import kernel
@@ -16,7 +15,6 @@ from plow_twin.kernel.simd import row, set_row
 from plow_twin.model import contact
 from plow_twin.model.contact import power_term, power_terms, root_terms
 from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, exact_damping_number
-from plow_twin.model.root import bracketed_root
 
 
 @kernel(entry=True)
@@ -51,16 +49,6 @@ def test_nearly_elastic_damping_is_its_series() -> None:
     for x in 10.0 ** np.linspace(-15.0, -4.0, 45):
         e = 1.0 - x
         assert exact_damping_number(e) == pytest.approx(1.5 * (1.0 - e) * (2.0 - e), rel=1e-6)
-
-
-@given(st.floats(0.01, 0.99), st.floats(-8.0, 8.0))
-def test_a_root_is_scipy_s_to_the_last_bit(root: float, shape: float) -> None:
-    """Recordings are replayed bit for bit, so the numbers may not depend on who finds them."""
-
-    def function(x: float) -> float:
-        return (x - root) * math.exp(shape * x)
-
-    assert bracketed_root(function, 0.0, 1.0, rtol=1e-15) == brentq(function, 0.0, 1.0, xtol=1e-300, rtol=1e-15)
 
 
 def test_limits_of_restitution_stay_finite() -> None:

@@ -46,7 +46,7 @@ MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "
 LIBRARIES = {
     "build": {"numba", "llvmlite"},
     "kernel": {"numba", "llvmlite"},
-    "model": set(),
+    "model": {"scipy"},
     "solve": {"scipy"},
     "estimate": {"scipy"},
     "run": set(),

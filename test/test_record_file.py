@@ -33,7 +33,7 @@ from plow_twin.record.compression import decompress, independent_blocks
 from plow_twin.record.entries import EntryRecord, OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped, from_message, read_digests, to_message
-from plow_twin.record.messages import JointState, Odometry, Text, WrenchStamped
+from plow_twin.record.messages import Integers, JointState, Odometry, Text, WrenchStamped
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.stream.journal import (
@@ -49,6 +49,7 @@ from plow_twin.stream.journal import (
     Unused,
 )
 
+JOURNAL = {Sample: "samples", Digest: "digests"}
 stamps = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 entries = st.one_of(
@@ -115,7 +116,7 @@ def test_rosbags_reads_the_folder(run: Run) -> None:
     with AnyReader([run.folder]) as reader:
         assert {c.topic: c.msgcount for c in reader.connections} == Counter(
             [topic for topic, _ in run.outputs]
-            + [f"/plow_twin/journal/{'samples' if isinstance(e, Sample) else 'entries'}" for e in run.entries]
+            + [f"/plow_twin/journal/{JOURNAL.get(type(e), 'entries')}" for e in run.entries]
         )
         chosen = [c for c in reader.connections if c.topic == "/contact_forces"]
         received = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages(chosen)]
@@ -326,28 +327,29 @@ def test_a_sample_that_is_not_finite_is_refused(tmp_path: Path) -> None:
         from_message(message)
 
 
-def test_digests_are_read_in_compiled_code_as_from_their_text_or_left_to_it() -> None:
-    figures = "0123456789abcdef"
-    stamps = ["0", "-0", "-7", str(BASE_NS), str(2**63 - 1), str(-(2**63) + 1), str(2**63), "9" * 19, "9" * 20, "", "-"]
-    texts = [f'{{"kind": "digest", "stamp_ns": {stamp}, "digest": "{figures}"}}' for stamp in stamps]
-    texts += [
-        texts[3].replace(figures, other) for other in (figures[1:], figures + "0", figures.upper(), figures[::-1])
-    ]
-    texts += [texts[3][:-1], texts[3] + " ", texts[3].replace("digest", "hold", 1), texts[3].replace(": ", ":")]
-    data = [encode(Text(text)) for text in texts]
-    data += [data[3][:place] + bytes([data[3][place] ^ 1]) + data[3][place + 1 :] for place in range(len(data[3]))]
-    lengths = np.array([len(part) for part in data])
-    stamp_ns, digests = np.zeros(len(data), np.int64), np.zeros(len(data), np.uint64)
-    found, none, every = np.zeros(len(data), bool), np.zeros(len(data), bool), np.arange(len(data))
+@given(st.lists(st.tuples(stamps, st.integers(0, 2**64 - 1)), max_size=5))
+def test_digests_are_read_many_at_a_time_as_one_by_one(given_digests: list[tuple[int, int]]) -> None:
+    messages = [to_message(Digest(stamp_ns, f"{digest:016x}"), "") for stamp_ns, digest in given_digests]
+    data = [encode(message) for message in messages]
+    lengths = np.array([len(part) for part in data], np.int64)
     buffer = np.frombuffer(b"".join(data), np.uint8)
-    read_digests(buffer, np.cumsum(lengths) - lengths, lengths, none, every, stamp_ns, digests, found)
-    for index in np.flatnonzero(found).tolist():
-        expected = from_message(decode(data[index], Text.TYPE))
-        assert expected == Digest(int(stamp_ns[index]), f"{digests[index]:016x}"), texts[index : index + 1]
-    # of the texts those that are written so, with a stamp of 64 bits and 16 figures
-    assert np.flatnonzero(found[: len(texts)]).tolist() == [0, 1, 2, 3, 4, 5, 14]
-    # flipped bits: other stamps and digests, bytes that say nothing, and else no digest
-    assert 30 < found[len(texts) :].sum() < 2 + 19 + 16
+    found, stamp_ns, digests = read_digests(buffer, np.cumsum(lengths) - lengths, lengths)
+    assert found.all()
+    assert list(zip(stamp_ns.tolist(), digests.tolist(), strict=True)) == given_digests
+    assert all(type(message).TYPE == "std_msgs/msg/UInt64MultiArray" for message in messages)
+
+
+def test_a_digest_with_a_flipped_bit_is_another_digest_or_an_error() -> None:
+    whole = encode(to_message(Digest(BASE_NS, "0123456789abcdef"), ""))
+    for place in range(len(whole)):
+        data = bytearray(whole)
+        data[place] ^= 1
+        found, _, _ = read_digests(np.frombuffer(data, np.uint8), np.zeros(1, np.int64), np.array([len(data)]))
+        assert found[0] == (place >= len(whole) - 16)
+    nothing = read_digests(np.frombuffer(whole, np.uint8), np.array([1, -1, 2**40]), np.full(3, len(whole)))
+    assert not nothing[0].any()
+    with pytest.raises(RecordingError, match="got 3 integers, expected a digest's two"):
+        from_message(Integers((1, 2, 3)))
 
 
 @given(st.text())

@@ -224,21 +224,11 @@ def test_a_part_of_another_run_is_named_and_not_read(tmp_path: Path, capsys: pyt
     assert part.with_name(f"{part.name}.foreign").is_file()
 
 
-def test_recordings_from_before_the_identity_go_on_as_before(tmp_path: Path) -> None:
-    run = record_run(tmp_path / "run", map(paper_sample, range(COUNT)), **SMALL)
-    (old := tmp_path / "old").mkdir()
-
-    def as_of_version_2(record: dict[str, str]) -> dict[str, str]:
-        if "layout_version" in record:
-            assert record.pop("run_id") and record.pop("layout_version") == "3"
-            record["layout_version"] = "2"
-        return record
-
-    for part in RunReader(run.folder).parts:
-        rewrite(part, old / part.name, metadata=as_of_version_2)
-    report = replay(old)
-    assert (report.exit_code, report.foreign_parts, report.samples) == (0, {}, COUNT)
-    assert RunReader(old).header.run_id == "" and examine(old).layout_version == "2"
+def test_a_recording_of_another_layout_is_refused_by_its_number(tmp_path: Path) -> None:
+    run = record_run(tmp_path / "run", map(paper_sample, range(10)))
+    rewrite(run.file, tmp_path / "old.mcap", metadata=lambda record: {**record, "layout_version": "3"})
+    with pytest.raises(RecordingError, match=r"old\.mcap: layout_version: got '3', expected '4'"):
+        RunReader(tmp_path / "old.mcap")
 
 
 def test_a_stretch_that_stands_there_twice_is_counted_and_used_once(tmp_path: Path) -> None:

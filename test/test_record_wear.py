@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from plow_twin.live.wear_keeper import KeptWear, WearKeeper
+from plow_twin.model.scene import Scene
 from plow_twin.record.wear_state import (
     FILE_NAME,
     WearState,
     WearStateError,
-    load_wear,
+    parse_wear,
+    read_wear,
     save_wear,
     scene_identity,
     wear_content,
@@ -33,6 +35,11 @@ def _save(folder: Path, depth: tuple[float, ...] = DEPTH) -> Path:
     return folder / FILE_NAME
 
 
+def _loaded(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None:
+    content = read_wear(folder)
+    return None if content is None else parse_wear(content, folder / FILE_NAME, head, scene)
+
+
 def _saved(keeper: WearKeeper, depth: np.ndarray) -> str:
     """Have depths saved and wait for it; return the error."""
     keeper.save(depth)
@@ -43,13 +50,13 @@ def _saved(keeper: WearKeeper, depth: np.ndarray) -> str:
 
 def test_what_was_saved_is_loaded_to_the_bit_and_nothing_else_stays_behind(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "folder"
-    assert load_wear(folder, "head 7", SCENE) is None
+    assert _loaded(folder, "head 7", SCENE) is None
     _save(folder)
     _save(folder)
-    assert load_wear(folder, "head 7", SCENE) == DEPTH
+    assert _loaded(folder, "head 7", SCENE) == DEPTH
     assert os.listdir(folder) == [FILE_NAME]
     # loads and contact numbers are not the pads
-    assert load_wear(folder, "head 7", replace(SCENE, loads=())) == DEPTH
+    assert _loaded(folder, "head 7", replace(SCENE, loads=())) == DEPTH
 
 
 def test_another_head_or_scene_and_damage_are_refused(tmp_path: Path) -> None:
@@ -57,7 +64,7 @@ def test_another_head_or_scene_and_damage_are_refused(tmp_path: Path) -> None:
     other = replace(SCENE, clearance=replace(SCENE.clearance, vertical_m=0.031))
     for head, scene, named in (("head 8", SCENE, "another head"), ("head 7", other, "another scene")):
         with pytest.raises(WearStateError, match=named):
-            load_wear(tmp_path, head, scene)
+            _loaded(tmp_path, head, scene)
     record = json.loads(path.read_text())
     broken = [
         path.read_text()[:40],
@@ -71,7 +78,7 @@ def test_another_head_or_scene_and_damage_are_refused(tmp_path: Path) -> None:
     for text in broken:
         path.write_text(text)
         with pytest.raises(WearStateError, match=FILE_NAME):
-            load_wear(tmp_path, "head 7", SCENE)
+            _loaded(tmp_path, "head 7", SCENE)
 
 
 def test_two_twins_do_not_keep_their_wear_in_one_folder(tmp_path: Path) -> None:
@@ -96,7 +103,7 @@ def test_a_disk_that_takes_nothing_leaves_the_old_file(tmp_path: Path, monkeypat
     with pytest.raises(OSError, match="No space"):
         _save(tmp_path, (0.1,) * 8)
     monkeypatch.undo()
-    assert load_wear(tmp_path, "head 7", SCENE) == DEPTH
+    assert _loaded(tmp_path, "head 7", SCENE) == DEPTH
     assert os.listdir(tmp_path) == [FILE_NAME]
 
 
@@ -111,19 +118,19 @@ def test_a_file_that_came_while_the_twin_ran_is_left_as_it_is(tmp_path: Path) ->
     volume.rename(folder)
     for _ in range(2):
         assert "is not the file that this twin has read or written" in _saved(keeper, WORN)
-    assert load_wear(folder, "head 7", SCENE) == DEPTH
+    assert _loaded(folder, "head 7", SCENE) == DEPTH
     with pytest.raises(WearStateError, match="another twin keeps its wear there"):
         WearKeeper(folder, "head 7", SCENE)
     # the one of before is back; then it is written to by somebody, then removed
     folder.rename(volume)
     (tmp_path / "beneath").rename(folder)
-    assert _saved(keeper, WORN) == "" and load_wear(folder, "head 7", SCENE) == tuple(WORN)
+    assert _saved(keeper, WORN) == "" and _loaded(folder, "head 7", SCENE) == tuple(WORN)
     _save(folder)
-    assert _saved(keeper, 2.0 * WORN) and load_wear(folder, "head 7", SCENE) == DEPTH
+    assert _saved(keeper, 2.0 * WORN) and _loaded(folder, "head 7", SCENE) == DEPTH
     (folder / FILE_NAME).unlink()
-    assert _saved(keeper, 2.0 * WORN) == "" and load_wear(folder, "head 7", SCENE) == tuple(2.0 * WORN)
+    assert _saved(keeper, 2.0 * WORN) == "" and _loaded(folder, "head 7", SCENE) == tuple(2.0 * WORN)
     keeper.close(2.0 * WORN)
-    assert load_wear(path.parent, "head 7", SCENE) == DEPTH
+    assert _loaded(path.parent, "head 7", SCENE) == DEPTH
 
 
 def test_a_folder_that_is_made_anew_is_claimed_anew(tmp_path: Path) -> None:
@@ -131,7 +138,7 @@ def test_a_folder_that_is_made_anew_is_claimed_anew(tmp_path: Path) -> None:
     first = WearKeeper(folder, "head 7", SCENE)
     assert _saved(first, NEW) == ""
     folder.rename(tmp_path / "old")
-    assert _saved(first, WORN) == "" and load_wear(folder, "head 7", SCENE) == tuple(WORN)
+    assert _saved(first, WORN) == "" and _loaded(folder, "head 7", SCENE) == tuple(WORN)
     with pytest.raises(WearStateError, match="another twin keeps its wear there"):
         WearKeeper(folder, "head 7", SCENE)
     folder.rename(tmp_path / "older")
@@ -141,7 +148,7 @@ def test_a_folder_that_is_made_anew_is_claimed_anew(tmp_path: Path) -> None:
     assert "another twin keeps its wear there" in _saved(first, NEW)
     second.close(WORN)
     first.release()
-    assert load_wear(folder, "head 7", SCENE) == tuple(WORN)
+    assert _loaded(folder, "head 7", SCENE) == tuple(WORN)
 
 
 @pytest.mark.parametrize("replaced", [False, True])
@@ -169,7 +176,7 @@ def test_wear_that_could_not_be_saved_goes_on_unless_the_file_is_another_one(
         _save(tmp_path)
     again = WearKeeper(tmp_path, "head 7", SCENE)
     assert again.load(kept) == (DEPTH if replaced else tuple(2.0 * WORN))
-    assert again.load(KeptWear(tuple(3.0 * WORN))) == load_wear(tmp_path, "head 7", SCENE)
+    assert again.load(KeptWear(tuple(3.0 * WORN))) == _loaded(tmp_path, "head 7", SCENE)
     again.close(2.0 * WORN)
     assert again.kept(WORN) == KeptWear(tuple(WORN))
-    assert load_wear(tmp_path, "head 7", SCENE) == tuple(2.0 * WORN)
+    assert _loaded(tmp_path, "head 7", SCENE) == tuple(2.0 * WORN)

@@ -42,8 +42,6 @@ MOST_ROWS: Final = 10_000_000
 @click.option("--dt", type=POSITIVE, help="Step of rk4 and euler [s].")
 @click.option(
     "--energy-balance",
-    "--audit",
-    "energy_balance",
     is_flag=True,
     help="Balance energy and momentum; takes some four times as long.",
 )

@@ -15,7 +15,6 @@ from types import MappingProxyType
 from typing import Final
 
 from plow_twin.errors import ArgumentError
-from plow_twin.model.root import bracketed_root
 
 #: 1 - e below which the residual of the exact law is little but rounding, and two terms of D's series are better.
 _NEARLY_ELASTIC: Final = 1e-5
@@ -47,7 +46,10 @@ def exact_damping_number(restitution: float) -> float:
         upper = math.nextafter(upper, 0.0)
     if residual(upper) > 0.0:
         return upper
-    return bracketed_root(residual, lower, upper, rtol=1e-15)
+    from scipy.optimize import brentq  # a quarter of a second: only scenes with this law wait for it
+
+    root: float = brentq(residual, lower, upper, xtol=1e-300, rtol=1e-15)
+    return root
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,13 @@ from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from plow_twin.errors import RecordingError
 from plow_twin.record.messages import (
     MESSAGE_TYPES,
     DiagnosticStatus,
+    Integers,
     JointState,
     Message,
     Odometry,
@@ -167,6 +170,15 @@ def _decode_wrench(wire: Any) -> WrenchStamped:
     return WrenchStamped(_stamp_ns(wire.header), wire.header.frame_id, _xyz(wrench.force), _xyz(wrench.torque))
 
 
+def _encode_integers(types: Any, message: Integers) -> Any:
+    layout = types["std_msgs/msg/MultiArrayLayout"]([], 0)
+    return types[Integers.TYPE](layout, np.array(message.data, np.uint64))
+
+
+def _decode_integers(wire: Any) -> Integers:
+    return Integers(tuple(wire.data.tolist()))
+
+
 def _decode_short_text(data: bytes) -> Text:
     """Return a string without the general decoder: the journal holds many."""
     (length,) = struct.unpack_from("<I", data, 4) if len(data) >= _TEXT_AT else (0,)
@@ -189,10 +201,12 @@ _ENCODERS: dict[type[Message], Callable[[Any, Any], Any]] = {
     Odometry: _encode_odometry,
     DiagnosticStatus: _encode_status,
     WrenchStamped: _encode_wrench,
+    Integers: _encode_integers,
 }
 _DECODERS: dict[type[Message], Callable[[Any], Message]] = {
     JointState: _decode_joint_state,
     Odometry: _decode_odometry,
     DiagnosticStatus: _decode_status,
     WrenchStamped: _decode_wrench,
+    Integers: _decode_integers,
 }

@@ -20,12 +20,7 @@ LOSS_RECORD: Final = "plow_twin_loss"
 #: Key in it of the reason why recording ended before the run; all other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
-LAYOUT_VERSION: Final = 3
-#: Versions that can be read; in version 1 there is one file, and its keys are fewer; version 2 lacks `run_id`.
-READABLE_VERSIONS: Final = ("1", "2", "3")
-
-#: Keys that came after version 1; their defaults say what was so before.
-_LATER: Final = ("record_outputs", "part", "run_id")
+LAYOUT_VERSION: Final = 4
 
 
 @dataclass(frozen=True)
@@ -34,8 +29,8 @@ class RunHeader:
 
     `scene_yaml` is self-contained. `topics` maps the outputs' base names to the names they were sent under. `clock`
     says what the receive times are: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
-    `record_outputs` says which outputs are there: `all`, `decimated` or `none`; `part` counts the files of a run, which
-    all have its `run_id`: made at random by the writer, empty in files from before there was one.
+    `record_outputs` says which outputs are there: `all`, `decimated` or `none`; `part` counts the files of a run. They
+    all have its `run_id`, which the writer makes at random.
     """
 
     scene_yaml: str
@@ -58,6 +53,11 @@ class RunHeader:
     def samples_topic(self) -> str:
         """Topic of the journal's samples."""
         return f"{self.node}/journal/samples"
+
+    @property
+    def digests_topic(self) -> str:
+        """Topic of the journal's digests."""
+        return f"{self.node}/journal/digests"
 
     @property
     def entries_topic(self) -> str:
@@ -102,14 +102,11 @@ class RunHeader:
             A key is missing or does not hold what it should; the message names `source`.
         """
         layout = record.get("layout_version", "")
-        if layout not in READABLE_VERSIONS:
-            expected = " or ".join(READABLE_VERSIONS)
-            raise RecordingError(f"{source}: layout_version: got {layout!r}, expected {expected}")
+        if layout != str(LAYOUT_VERSION):
+            raise RecordingError(f"{source}: layout_version: got {layout!r}, expected '{LAYOUT_VERSION}'")
         values: dict[str, Any] = {}
         for spec in fields(cls):
             text = record.get(spec.name)
-            if text is None and spec.name in _LATER:
-                continue
             if text is None:
                 raise RecordingError(f"{source}: metadata {HEADER_RECORD!r}: {spec.name} is missing")
             try:

@@ -1,20 +1,21 @@
-"""Journal entries as ROS messages: samples as wrenches, all others as one line of JSON each, exact to the bit."""
+"""Journal entries as ROS messages, exact to the bit: samples as wrenches, digests as two integers, the rest as JSON."""
 
 from __future__ import annotations
 
 import base64
 import json
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.record.messages import Message, Text, WrenchStamped
-from plow_twin.record.template import compiled
-from plow_twin.record.words import word
+from plow_twin.record.messages import Integers, Message, Text, WrenchStamped
+from plow_twin.record.template import Bytes, Indexes
 from plow_twin.stream.journal import (
     Digest,
     Entry,
@@ -64,20 +65,14 @@ _KINDS: Final[dict[str, type[Any]]] = {
     "unused": Unused,
     "estimated": Estimated,
     "snapshot": Snapshot,
-    "digest": Digest,
     "loss": Loss,
     "dropped": Dropped,
 }
-#: A digest as it is written, before, between and after stamp and digest.
-_BEGIN: Final = np.frombuffer(b'{"kind": "digest", "stamp_ns": ', np.uint8)
-_MIDDLE: Final = np.frombuffer(b', "digest": "', np.uint8)
-_END: Final = np.frombuffer(b'"}\x00', np.uint8)
-_SHORTEST: Final = len(_BEGIN) + 1 + len(_MIDDLE) + 16 + len(_END)
-_ZERO, _A, _MINUS = ord("0"), ord("a"), ord("-")
-#: Place of the characters in a string message.
-_TEXT_AT: Final = 8
-#: Most of a stamp: the largest of 64 bits has as many.
-_FIGURES: Final = 19
+#: A digest's message before its two numbers: encoding, no dimensions, no offset, the count of numbers, padding.
+_DIGEST_HEAD: Final = np.frombuffer(struct.pack("<BBHIII4x", 0, 1, 0, 0, 0, 2), np.uint8)
+_DIGEST_SIZE: Final = len(_DIGEST_HEAD) + 16
+_MASK: Final = 2**64 - 1
+_SIGN: Final = 2**63
 #: Fields that a line may lack.
 _OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
@@ -88,6 +83,8 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     if isinstance(entry, Sample):
         fx, fy, m = entry.wrench
         return WrenchStamped(entry.stamp_ns, frame_id, (fx, fy, 0.0), (0.0, 0.0, m))
+    if isinstance(entry, Digest):
+        return Integers((entry.stamp_ns & _MASK, int(entry.digest, 16)))
     values = {spec.name: getattr(entry, spec.name) for spec in fields(entry)}
     if isinstance(entry, Pose) and not entry.deviation:
         del values["deviation"]
@@ -114,54 +111,29 @@ def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
         if not all(map(math.isfinite, wrench)):
             raise RecordingError(f"{source}: sample at {message.stamp_ns}: got {wrench}, expected finite numbers")
         return Sample(message.stamp_ns, wrench)
+    if isinstance(message, Integers):
+        if len(message.data) != 2:
+            raise RecordingError(f"{source}: got {len(message.data)} integers, expected a digest's two")
+        stamp_ns, digest = message.data
+        return Digest((stamp_ns ^ _SIGN) - _SIGN, f"{digest:016x}")
     if not isinstance(message, Text):
-        raise RecordingError(f"{source}: got a {message.TYPE}, expected a sample or a line of JSON")
+        raise RecordingError(f"{source}: got a {message.TYPE}, expected a sample, a digest or a line of JSON")
     return _from_json(message.data, source)
 
 
-@compiled
-def read_digests(buffer, starts, lengths, is_sample, chosen, stamps, digests, found):  # type: ignore[no-untyped-def]
-    """Read those of the `chosen` messages that are digests as they are written: most lines of a journal are.
+def read_digests(
+    buffer: Bytes, start: Indexes, length: Indexes
+) -> tuple[NDArray[np.bool_], Indexes, NDArray[np.uint64]]:
+    """Return which messages are digests, and the stamps [ns] and digests of these.
 
-    `stamps` has an item for each message, `digests` and `found` for each chosen one. What is no sample and not found is
-    left to `from_message`: another kind, or a digest in other words.
+    `start` and `length`, shape (n,), say where the messages stand in `buffer`.
     """
-    for k in range(chosen.size):
-        n = chosen[k]
-        start, length = starts[n], lengths[n]
-        found[k] = False
-        if is_sample[n] or length < _TEXT_AT + _SHORTEST or start < 0 or start + length > buffer.size:
-            continue
-        end = start + length
-        place = start + _TEXT_AT
-        good = buffer[start] == 0 and buffer[start + 1] == 1
-        good &= word(buffer, start + 4) & 0xFFFFFFFF == length - _TEXT_AT
-        for i in range(_BEGIN.size):
-            good &= buffer[place + i] == _BEGIN[i]
-        place += _BEGIN.size
-        negative = buffer[place] == _MINUS
-        place += 1 if negative else 0
-        stamp, first = np.int64(0), place
-        while place < end and _ZERO <= buffer[place] <= _ZERO + 9:
-            stamp = 10 * stamp + np.int64(buffer[place] - _ZERO)
-            place += 1
-        good &= place == first + 1 or buffer[first] != _ZERO
-        good &= first < place <= first + _FIGURES and end - place == _MIDDLE.size + 16 + _END.size
-        if not good:
-            continue
-        for i in range(_MIDDLE.size):
-            good &= buffer[place + i] == _MIDDLE[i]
-        place += _MIDDLE.size
-        digest = np.uint64(0)
-        for i in range(16):
-            letter = np.int64(buffer[place + i])
-            figure = letter - _ZERO if letter <= _ZERO + 9 else letter - _A + 10
-            good &= _ZERO <= letter <= _ZERO + 9 or _A <= letter <= _A + 5
-            digest = digest << np.uint64(4) | np.uint64(figure & 15)
-        for i in range(_END.size):
-            good &= buffer[place + 16 + i] == _END[i]
-        if good and stamp >= 0:  # else it has gone round
-            stamps[n], digests[k], found[k] = -stamp if negative else stamp, digest, True
+    found = (length == _DIGEST_SIZE) & (start >= 0) & (start + _DIGEST_SIZE <= buffer.size)
+    messages = buffer[start[found, None] + np.arange(_DIGEST_SIZE)]
+    good = (messages[:, : len(_DIGEST_HEAD)] == _DIGEST_HEAD).all(axis=1)
+    found[found] = good
+    numbers = np.ascontiguousarray(messages[good, len(_DIGEST_HEAD) :]).view("<u8")
+    return found, numbers[:, 0].astype(np.int64), numbers[:, 1]
 
 
 def _from_json(text: str, source: str) -> Entry | Dropped:

@@ -90,8 +90,17 @@ class Text:
     data: str
 
 
-Message = JointState | Odometry | DiagnosticStatus | WrenchStamped | Text
+@dataclass(frozen=True, slots=True)
+class Integers:
+    """Unsigned integers of 64 bits."""
+
+    TYPE: ClassVar = "std_msgs/msg/UInt64MultiArray"
+
+    data: tuple[int, ...]
+
+
+Message = JointState | Odometry | DiagnosticStatus | WrenchStamped | Text | Integers
 #: Every message class by its ROS 2 type.
 MESSAGE_TYPES: Final[dict[str, type[Message]]] = {
-    kind.TYPE: kind for kind in (JointState, Odometry, DiagnosticStatus, WrenchStamped, Text)
+    kind.TYPE: kind for kind in (JointState, Odometry, DiagnosticStatus, WrenchStamped, Text, Integers)
 }

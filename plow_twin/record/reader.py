@@ -284,7 +284,7 @@ class _Merger:
         self._with_outputs = outputs
         self._least = _LEAST if outputs else _LEAST_ALONE
         header = reader.header
-        self._journal = (header.samples_topic, header.entries_topic)
+        self._journal = (header.samples_topic, header.digests_topic, header.entries_topic)
         self._template = sample_template(header.frame_id)
         self._places = self._template.places[_WRENCH]
         self._entries = [NO_ENTRIES]
@@ -315,7 +315,7 @@ class _Merger:
         assert self._chunks is not None
         counts = np.bincount(messages.channel)
         there = counts.nonzero()[0]
-        journal, sent, samples = [], [], -1
+        journal, sent, samples, digests = [], [], -1, -1
         for number, count in zip(there.tolist(), counts[there].tolist(), strict=True):
             channel = self._chunks.channels.get(number)
             if channel is None:
@@ -324,6 +324,7 @@ class _Merger:
             if channel.topic in self._journal:
                 journal.append(number)
                 samples = number if channel.topic == self._journal[0] else samples
+                digests = number if channel.topic == self._journal[1] else digests
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
                 named = channel.topic, channel.message_type
@@ -331,7 +332,7 @@ class _Merger:
                     self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)
-            self._entries.append(self._read(chosen, samples))
+            self._entries.append(self._read(chosen, samples, digests))
             self._count += len(chosen)
         if sent and self._with_outputs:
             chosen = messages if len(sent) == len(there) else _of(messages, sent)
@@ -370,36 +371,37 @@ class _Merger:
             yield Batch(entries, outputs, damaged > self._damaged)
             self._damaged = damaged
 
-    def _read(self, messages: Messages, samples: int) -> Entries:
-        """Return the entries that journal messages stand for."""
+    def _read(self, messages: Messages, samples: int, digests: int) -> Entries:
+        """Return the entries in journal messages, given the channels of samples and digests (-1: no such channel)."""
         sequence = self._unwrap(messages.sequence)
         if len(sequence):
             self._base = int(sequence[-1])
         count, template = len(messages), self._template
-        is_sample = messages.channel == samples
         stamps, wrench, good = np.zeros(count, np.int64), np.zeros((count, 3)), np.zeros(count, bool)
         places = messages.buffer, messages.start, messages.length
         read_numbers(*places, template.data, template.fixed, self._places, stamps, wrench, good)
-        good &= is_sample
+        good &= messages.channel == samples
         if not np.isfinite(wrench).all():
             good &= np.isfinite(wrench).all(axis=1)
-        left = (~good).nonzero()[0]
-        digests, found = np.zeros(len(left), np.uint64), np.zeros(len(left), bool)
-        read_digests(*places, is_sample, left, stamps, digests, found)
+        digest_at = np.flatnonzero(messages.channel == digests)
+        found, digest_stamps, digest = read_digests(
+            messages.buffer, messages.start[digest_at], messages.length[digest_at]
+        )
+        digest_at = digest_at[found]
+        stamps[digest_at] = digest_stamps
+        read = good.copy()
+        read[digest_at] = True
         rest: dict[int, Entry | Dropped] = {}
-        if found.all():
-            return Entries(sequence, messages.log_time_ns, good, stamps, wrench, left, digests, rest)
-        for index in left[~found].tolist():
-            topic = self._journal[0 if is_sample[index] else 1]
+        for index in np.flatnonzero(~read).tolist():
             assert self._chunks is not None
-            kind = self._chunks.channels[int(messages.channel[index])].message_type
-            place = f"{self._part}: {topic} number {int(messages.sequence[index])}"
-            entry = from_message(decode(messages.data(index), kind), place)
+            channel = self._chunks.channels[int(messages.channel[index])]
+            place = f"{self._part}: {channel.topic} number {int(messages.sequence[index])}"
+            entry = from_message(decode(messages.data(index), channel.message_type), place)
             if isinstance(entry, Sample):
                 stamps[index], wrench[index], good[index] = entry.stamp_ns, entry.wrench, True
             else:
                 rest[index] = entry
-        return Entries(sequence, messages.log_time_ns, good, stamps, wrench, left[found], digests[found], rest)
+        return Entries(sequence, messages.log_time_ns, good, stamps, wrench, digest_at, digest, rest)
 
 
 def _of(messages: Messages, channels: list[int]) -> Messages:

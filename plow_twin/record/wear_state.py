@@ -57,12 +57,6 @@ def check_depth(depth_m: Sequence[float], scene: Scene) -> None:
         raise ValueError(f"got {list(depth_m)}, expected depths from 0 to half the frame's smaller side, {most:g} m")
 
 
-def load_wear(folder: Path, head: str, scene: Scene) -> tuple[float, ...] | None:
-    """Return the saved depths [m], or None when none have been saved; raises as `read_wear` and `parse_wear`."""
-    content = read_wear(folder)
-    return None if content is None else parse_wear(content, folder / FILE_NAME, head, scene)
-
-
 def read_wear(folder: Path) -> bytes | None:
     """Return what the file in a folder holds, or None when there is none.
 

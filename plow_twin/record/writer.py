@@ -25,7 +25,7 @@ from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, 
 from plow_twin.record.outputs import SLOW_TOPICS, publication_numbers, publication_templates
 from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
-from plow_twin.stream.journal import Entry, Sample
+from plow_twin.stream.journal import Digest, Entry, Sample
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.topics import TOPICS
 
@@ -120,7 +120,9 @@ class RunWriter:
 
     def write_entry(self, sequence: int, log_time_ns: int, entry: Entry | Dropped) -> None:
         """Write one journal entry under its place in the common order."""
-        topic = self.header.samples_topic if isinstance(entry, Sample) else self.header.entries_topic
+        topic = self.header.entries_topic
+        if isinstance(entry, Sample | Digest):
+            topic = self.header.samples_topic if isinstance(entry, Sample) else self.header.digests_topic
         stamp_ns = getattr(entry, "stamp_ns", log_time_ns)
         self._write(self._journal, topic, sequence, log_time_ns, stamp_ns, to_message(entry, self.header.frame_id))
 
