@@ -5,7 +5,7 @@
 
 Each truth is written as soon as it is done, and what the file holds already is not run again: a long benchmark can be
 stopped, and gone on with. Thresholds of `plow_twin/estimate/verdict.py` were set on other seeds; the table of
-the pages is made by `pages.py` from the seeds of `estimate_pages.TRUTHS`.
+the pages is made by `tools/pages.py` from the seeds of `estimate_pages.TRUTHS`.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+import subprocess
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -117,13 +119,13 @@ def _run(chosen: set[str], repeats: int, quick: bool, notify: Notify) -> list[Ro
 
 def _publish(rows: list[Row], measured: str) -> None:
     """Draw the picture, write all tables beside the rows, and renew the figures of the pages."""
-    import pages
+    import figures
     import plot
 
     plot.draw(rows, PICTURE)
     (RESULTS / f"{machine_name()}.md").write_text(f"{summary.TITLE}\n\n{measured}\n", encoding="utf-8")
-    pages.NEWEST.write_text(f"{machine_name()}\n", encoding="utf-8")
-    pages.main()
+    figures.NEWEST.write_text(f"{machine_name()}\n", encoding="utf-8")
+    subprocess.run([sys.executable, str(ROOT / "tools" / "pages.py")], check=True)
 
 
 def _versions() -> dict[str, str]:

@@ -61,17 +61,17 @@ def test_every_page_is_in_the_site_s_contents() -> None:
     }
 
 
-def test_every_figure_of_the_pages_is_that_of_the_stored_results() -> None:
-    """`benchmark/pages.py` finds nothing to change, and each of its tables stands on a page."""
+def test_every_table_of_the_pages_is_that_of_the_results_and_the_code() -> None:
+    """`tools/pages.py` finds nothing to change, and each of its tables stands on a page."""
     code = (
         "import pages, re\n"
         "texts = {page.name: page.read_text() for page in pages.PAGES}\n"
-        "print([name for name, text in texts.items() if pages.with_figures(text) != text])\n"
-        "named = re.findall('<!-- figures: (.*) -->', '\\n'.join(texts.values()))\n"
-        "print(set(named) ^ pages.FIGURES.keys(), 'figures: speed' in texts['README.md'])\n"
+        "print([name for name, text in texts.items() if pages.renewed(text) != text])\n"
+        "named = re.findall('<!-- made: (.*) -->', '\\n'.join(texts.values()))\n"
+        "print(set(named) ^ pages.TABLES.keys(), 'made: speed' in texts['README.md'])\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT / "benchmark", capture_output=True, text=True, timeout=280, check=False
+        [sys.executable, "-c", code], cwd=ROOT / "tools", capture_output=True, text=True, timeout=280, check=False
     )
     assert done.stdout.splitlines() == ["[]", "set() True"], done.stderr or done.stdout
 

@@ -529,7 +529,7 @@ def markdown_table() -> str:
     """Return the table of all parameters for the documentation."""
     rows = ["| parameter | default | must be | takes effect | meaning |", "|---|---|---|---|---|"]
     for spec in SPECS.values():
-        default, effect = _yaml_value(spec.default), spec.metadata["effect"].value
+        default, effect = _yaml_value(spec.default), spec.metadata["effect"].name.lower()
         rows.append(f"| `{spec.name}` | `{default}` | {expected(spec)} | {effect} | {spec.metadata['doc']} |")
     return "\n".join(rows) + "\n"
 

@@ -1,8 +1,4 @@
-"""Write the figures of the pages from the stored results: `python benchmark/pages.py`, after any part of the benchmark.
-
-A page says where a figure belongs by `<!-- figures: NAME -->` and `<!-- end -->`; what stands between is replaced by
-the text that `FIGURES[NAME]` makes from the files of `benchmark/results`.
-"""
+"""The figures of the pages, as tables made from the files of `benchmark/results`; `tools/pages.py` writes them."""
 
 from __future__ import annotations
 
@@ -23,10 +19,8 @@ from levels import OWN, PEERS, fastest
 from work_precision import OURS_BARE, OURS_CALL
 
 RESULTS = ROOT / "benchmark" / "results"
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 #: Holds the name of the machine of the newest complete run, whose table the pages quote.
 NEWEST = RESULTS / "newest.txt"
-_BLOCK = re.compile(r"(<!-- figures: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _PEERS = (
     "CVODE from C", "CVODE from C, rootfinding", "heyoka", "best of SciPy and scikit-sundae", "lean jitted RK4",
 )  # fmt: skip
@@ -135,18 +129,6 @@ FIGURES: dict[str, Callable[[], str]] = {
 }  # fmt: skip
 
 
-def with_figures(text: str) -> str:
-    """Return a page with the figures of the stored results."""
-    return _BLOCK.sub(lambda block: f"{block[1]}\n{FIGURES[block[2]]()}\n\n{block[3]}", text)
-
-
-def main() -> None:
-    """Rewrite the pages that quote figures."""
-    for page in PAGES:
-        text = page.read_text(encoding="utf-8")
-        page.write_text(with_figures(text), encoding="utf-8")
-
-
 def _own_ms(rows: Sequence[Row], scene: str, output_s: float, level: float, solver: str) -> float:
     reached = fastest(rows, scene, output_s, level, OWN[solver])
     assert reached is not None
@@ -165,7 +147,3 @@ def _short(verdict: targets.Verdict) -> str:
 
 def _lines(name: str) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (RESULTS / name).read_text(encoding="utf-8").splitlines() if line]
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,37 @@
+"""Write the tables of the pages that come from stored results or from the code: `python tools/pages.py`.
+
+A page says where a table belongs by `<!-- made: NAME -->` and `<!-- end -->`; what stands between is replaced by what
+`TABLES[NAME]` returns.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "benchmark"))
+
+import figures  # noqa: E402
+import reference  # noqa: E402
+
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+TABLES: dict[str, Callable[[], str]] = {**figures.FIGURES, **reference.TABLES}
+_BLOCK = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def renewed(text: str) -> str:
+    """Return a page with its tables made anew."""
+    return _BLOCK.sub(lambda block: f"{block[1]}\n{TABLES[block[2]]().strip()}\n\n{block[3]}", text)
+
+
+def main() -> None:
+    """Rewrite the pages."""
+    for page in PAGES:
+        page.write_text(renewed(page.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

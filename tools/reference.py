@@ -1,0 +1,52 @@
+"""Tables of the reference pages, made from the code: topics, parameters, keys of diagnostics, verbs of the command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import click
+
+from plow_twin.cli.app import commands
+from plow_twin.live.diagnostics import markdown_tables
+from plow_twin.live.parameters import markdown_table
+from plow_twin.stream.topics import TOPICS
+
+
+def topics() -> str:
+    """Return the topics that a twin sends."""
+    lines = ["| topic | type | sent | latched | content |", "|---|---|---|---|---|"]
+    for topic in TOPICS:
+        kind = topic.type.replace("/msg/", "/")
+        latched = "yes" if topic.latched else ""
+        lines.append(f"| `{topic.name}` | {kind} | {topic.cadence.value} | {latched} | {topic.content} |")
+    return "\n".join(lines)
+
+
+def diagnostics() -> str:
+    """Return the keys of each part of `/diagnostics`."""
+    parts = {name: text for name, text in markdown_tables().items() if name != "status"}
+    return "\n\n".join(f"### {name}\n\n{text}" for name, text in parts.items())
+
+
+def verbs() -> str:
+    """Return the verbs of `plow-twin` with their options."""
+    lines = ["| verb | does | options |", "|---|---|---|"]
+    for name, command in sorted(commands.commands.items()):
+        if isinstance(command, click.Group):
+            lines += [_verb(f"{name} {inner}", verb) for inner, verb in command.commands.items()]
+        else:
+            lines.append(_verb(name, command))
+    return "\n".join(lines)
+
+
+def _verb(name: str, command: click.Command) -> str:
+    arguments = " ".join(part for part in command.collect_usage_pieces(click.Context(command)) if part != "[OPTIONS]")
+    options = [f"`{max(one.opts, key=len)}`" for one in command.params if isinstance(one, click.Option)]
+    does = command.get_short_help_str(limit=200)
+    return f"| `{f'{name} {arguments}'.strip()}` | {does} | {', '.join(options)} |"
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "topics": topics, "parameters": markdown_table, "status_keys": lambda: markdown_tables()["status"],
+    "diagnostics": diagnostics, "verbs": verbs,
+}  # fmt: skip
