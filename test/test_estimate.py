@@ -29,9 +29,9 @@ from plow_twin.estimate.gaps import Gaps, GapsError, tell
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import EstimateError, Load, Poses, believed
-from plow_twin.estimate.result import CORRELATED, Estimate, Interval, State
+from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.similar import Units
-from plow_twin.estimate.unknowns import GAIN, Spread, Unknowns
+from plow_twin.estimate.unknowns import CORRELATED, GAIN, Unknowns
 from plow_twin.model.loads import compile_loads
 from plow_twin.record.measured import read_recording
 from plow_twin.stream.journal import Entry, Pose, SetWear
@@ -447,7 +447,7 @@ def test_what_is_stated_of_the_measurements_is_believed() -> None:
     run = simulate(scene, 9.9, 0.02, 1e-6)
     poses, _ = Poses.of(run.t, run.q, (1e-3, 1e-3, 4e-3))
     load, _ = Load.of(t, wrench, (0.0, 0.0, 1.0 * float(np.sqrt((wrench[:, 2] ** 2).mean()))))
-    assert Unknowns(scene, Spread.stated(load, poses)).deviations()[GAIN].tolist() == [0.07, 0.07, 1.0]
+    assert Unknowns.stated(scene, load, poses).deviations()[GAIN].tolist() == [0.07, 0.07, 1.0]
     result = estimate(scene, load, poses)
     assert result.noise == (1e-3, 1e-3, 4e-3)
     assert result.horizontal.p95 - result.horizontal.p05 > 1e-4

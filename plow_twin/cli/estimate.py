@@ -29,7 +29,7 @@ from plow_twin.cli.scene_facts import damping_unit
 if TYPE_CHECKING:
     from plow_twin.estimate.forces import Forces
     from plow_twin.estimate.measurements import Load
-    from plow_twin.estimate.result import Estimate, Interval
+    from plow_twin.estimate.result import Estimate
     from plow_twin.model.scene import Scene
 
 
@@ -211,19 +211,16 @@ def _show_live(live: dict[str, Any]) -> None:
 
 
 def _show(result: Estimate, scene: Scene) -> None:
-    damping = "restitution [1]" if scene.contact.damping is None else f"damping [{damping_unit(scene)}]"
-    rows: list[tuple[str, Interval | None, float, str, str]] = [
-        ("horizontal clearance [mm]", result.horizontal, 1e3, ".3f", result.horizontal_state.value),
-        ("vertical clearance [mm]", result.vertical, 1e3, ".3f", result.vertical_state.value),
-        ("stiffness [MN/m^n]", result.stiffness, 1e-6, ".5g", ""),
-        (damping, result.damping, 1.0, ".5g", ""),
-        ("load gain fx [1]", result.gain_fx, 1.0, ".4f", ""),
-        ("load gain fy [1]", result.gain_fy, 1.0, ".4f", ""),
-        ("load gain m [1]", result.gain_m, 1.0, ".4f", ""),
-        ("bias x [mm]", result.bias_x, 1e3, ".3f", ""),
-        ("bias y [mm]", result.bias_y, 1e3, ".3f", ""),
-        ("bias theta [mrad]", result.bias_theta, 1e3, ".3f", ""),
-        ("delay [ms]", result.delay, 1e3, ".3f", ""),
+    from plow_twin.estimate.unknowns import QUANTITIES
+
+    states = {"horizontal": result.horizontal_state.value, "vertical": result.vertical_state.value}
+    labels = {one.name: one.label for one in QUANTITIES}
+    labels["damping"] = "restitution [1]" if scene.contact.damping is None else f"damping [{damping_unit(scene)}]"
+    values = result.values()
+    rows = [
+        (labels[one.name], values[one.name], one.factor, one.digits, states.get(one.name, ""))
+        for one in QUANTITIES
+        if one.name in values
     ]
     rows += [
         (f"{name.replace('_', ', ')} [mm]", value, 1e3, ".3f", state.value)
@@ -233,9 +230,8 @@ def _show(result: Estimate, scene: Scene) -> None:
         f"Estimate of the window from {result.t_start:.2f} s to {result.t_end:.2f} s", "", "mean", "5 %", "95 %", ""
     )
     for name, value, factor, form, state in rows:
-        if value is not None:
-            numbers = (format(factor * number, form) for number in (value.mean, value.p05, value.p95))
-            view.add_row(escape(name), *numbers, state)
+        numbers = (format(factor * number, form) for number in (value.mean, value.p05, value.p95))
+        view.add_row(escape(name), *numbers, state)
     console = output_console()
     console.print(view)
     console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)

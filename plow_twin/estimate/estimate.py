@@ -15,21 +15,19 @@ from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, Told, tell
 from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
 from plow_twin.estimate.pads import askew, by_group, of_turns, turned
-from plow_twin.estimate.result import CORRELATED, NORMAL_P95, Estimate, ForcesUsed, Interval, State
+from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, State
 from plow_twin.estimate.search import HARD, candidate, refine
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.unknowns import (
     BIAS,
     DAMPING,
-    DELAY,
-    GAIN,
     GX,
     GY,
     MOVING,
+    QUANTITIES,
     SIZE,
     SOFTNESS,
-    Spread,
     Unknowns,
     with_other_law,
 )
@@ -200,7 +198,7 @@ def _from_motion(
 ) -> tuple[Estimate, Guess]:
     """Estimate from the motion alone."""
     span = float(load.t[0]), float(load.t[-1])
-    unknowns = Unknowns(scene, Spread.stated(load, poses))
+    unknowns = Unknowns.stated(scene, load, poses)
     if len(poses.t) < FEWEST_POSES:
         few = f"got {len(poses.t)} poses from {span[0]:g} s to {span[1]:g} s, the load's span, expected {FEWEST_POSES}"
         return replace(prior_of(unknowns, span, lost), reasons=(few,)), ()
@@ -575,19 +573,13 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
 
 def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
     """Return what an estimate tells beside the clearances, by its names, from the intervals of the shared unknowns."""
-    gain_fx, gain_fy, gain_m = normal[GAIN]
-    bias_x, bias_y, bias_theta = normal[BIAS]
-    return {
+    told = {quantity.name: value for quantity, value in zip(QUANTITIES, normal, strict=True)}
+    del told["horizontal"], told["vertical"]
+    contact = {
         "stiffness": _stiffness(unknowns, normal[SOFTNESS]),
         "damping": _damping(unknowns, normal[DAMPING]),
-        "gain_fx": gain_fx,
-        "gain_fy": gain_fy,
-        "gain_m": gain_m,
-        "bias_x": bias_x,
-        "bias_y": bias_y,
-        "bias_theta": bias_theta,
-        "delay": normal[DELAY],
     }
+    return told | contact
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
@@ -645,9 +637,9 @@ def _groups(problem: Problem, fit: Fit, widened: float, states: list[State]) -> 
 
 def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
     """Return the correlation of what changes the motion."""
-    size = len(CORRELATED)
-    deviation = np.sqrt(np.diag(covariance))[:size]
-    matrix = covariance[:size, :size] / np.outer(deviation, deviation)
+    moving = covariance[np.ix_(MOVING, MOVING)]
+    deviation = np.sqrt(np.diag(moving))
+    matrix = moving / np.outer(deviation, deviation)
     return tuple(tuple(row) for row in matrix.tolist())
 
 
@@ -660,7 +652,7 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
     """Return the stiffness; where the contact is too hard to tell, the interval is open to the hard side."""
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
-    if unknowns.within(np.full(11, psi.p05))[SOFTNESS] > psi.p05:
+    if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:
         hard = max(hard, unknowns.hardest_believed)
     return Interval(unknowns.stiffness_of(psi.mean), soft, hard)
 

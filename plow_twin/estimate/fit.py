@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
-from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, SIZE, Unknowns
+from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, PROBES, QUANTITIES, SIZE, Unknowns
 from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
@@ -42,9 +42,8 @@ MOST_WORK = 3_000_000
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 #: Prior standard deviations of a starting state about its guess.
 START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
-#: Standard deviations of the displacements that probe what can be foretold.
+#: Standard deviations of the displacements of a starting state that probe what can be foretold.
 _PROBED_STATE = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
-_PROBED = np.array([5e-5, 5e-5, 2e-3, 5e-3, 2e-3, 2e-3, 2e-3, 0.0, 0.0, 0.0, 0.0])
 #: A rate of 0.1 mm/s, or mrad/s, after a second: less of it no solver and no sensor tells.
 _LEAST_DRIFT = 1e-8
 #: Walls by their two pads: left, right (top pad first), top, bottom (left pad first).
@@ -260,7 +259,8 @@ class Problem:
         return Linear(rows, ends)
 
     def _quotient(self, point: Point, index: int) -> tuple[Array, Array]:
-        step = self.unknowns.steps()[index]
+        step = QUANTITIES[index].step
+        assert step is not None, "it moves the head"
         for signed in (step, -step):
             moved = point.shared.copy()
             moved[index] += signed
@@ -311,7 +311,7 @@ def fit(
     jitter = unforeseen(problem, point, linear.rows, seed)
     while done < iterations and problem.forward.work < MOST_WORK:
         done += 1
-        noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.spread.noise)
+        noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.noise)
         variance = noise**2 + JITTER_WEIGHT * jitter
         point.cost = problem.cost(point, variance)
         normal, gradient = normal_equations(problem, point, linear, variance)
@@ -326,7 +326,7 @@ def fit(
             converged = True
             break
         jitter = unforeseen(problem, point, linear.rows, seed)
-    noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.spread.noise)
+    noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.noise)
     variance = noise**2 + JITTER_WEIGHT * jitter
     point.cost = problem.cost(point, variance)
     normal, gradient = normal_equations(problem, point, linear, variance)
@@ -429,7 +429,7 @@ def unforeseen(problem: Problem, point: Point, jacobian: Array, seed: int, probe
     inside = point.swing >= 0
     for _ in range(probes):
         states = _PROBED_STATE * rng.standard_normal(point.states.shape)
-        shared = problem.unknowns.within(point.shared + _PROBED * rng.standard_normal(SIZE))
+        shared = problem.unknowns.within(point.shared + PROBES * rng.standard_normal(SIZE))
         other = problem.evaluate(shared, point.states + states)
         if other is None:
             continue

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.contact_forces import FEWEST_MESSAGES, Cells, ContactForces, Feeling, cells_of
 from plow_twin.estimate.fit import HUBER, START_SPREAD, Fit, Linear, Point, Problem, pieces
 from plow_twin.estimate.result import Cell, ForcesUsed, Interval
-from plow_twin.estimate.unknowns import DAMPING, MOVING, SIZE
+from plow_twin.estimate.unknowns import DAMPING, MOVING, QUANTITIES, SIZE
 from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
@@ -39,9 +39,8 @@ _FEWEST_ROWS, _TOLD = 10, 25.0
 _JITTER_WEIGHT = 10.0
 #: Steps, those before which draws show what cannot be foretold, such draws, and the gain of the cost that ends them.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Steps of the difference quotients, to both sides: of what moves the head, the delay in s, a starting state. With five
-#: times as long ones, to one side, clearances were off by 4 of their deviations.
-_STEPS = np.array([1e-5, 1e-5, 2e-3, 4e-3, 4e-4, 4e-4, 4e-4])
+#: Steps of the difference quotients to both sides: of the delay in s and of a starting state. With the longer steps of
+#: the poses, to one side, clearances were off by 4 of their deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
 #: Most that the freedom of the fit adds to the scatter of few swings.
@@ -206,8 +205,9 @@ class _Joint:
         """Return the Jacobians of the poses, and that of the forces by the border and the own state, (m, b + 6)."""
         place, border = at.place, self._border
         out = np.zeros((len(self._row), border + 6))
-        for j, step in zip(MOVING, _STEPS, strict=True):
-            if j != DAMPING or self._problem.unknowns.damped:
+        for j in MOVING:
+            step = QUANTITIES[j].fine_step
+            if step is not None and (j != DAMPING or self._problem.unknowns.damped):
                 by = step * (np.arange(SIZE) == j)
                 out[:, j] = self._quotient(
                     replace(place, shared=place.shared - by), replace(place, shared=place.shared + by), step

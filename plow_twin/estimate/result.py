@@ -11,6 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
+
 Array = NDArray[np.float64]
 
 #: Quantile of the normal distribution at which a 90 % interval ends.
@@ -18,9 +20,6 @@ NORMAL_P95: Final = 1.6448536269514722
 _STANDARD: Final = NormalDist()
 #: Standard deviations beyond which the normal distribution's tail is as good as exponential.
 _FAR = 30.0
-
-#: Unknowns whose correlation is told; softness is the penetration under a force, the other side of stiffness.
-CORRELATED: Final = ("horizontal", "vertical", "softness", "damping", "gain_fx", "gain_fy", "gain_m")
 
 
 class State(Enum):
@@ -189,20 +188,23 @@ class Estimate:
     groups: dict[str, tuple[Interval, State]] = field(default_factory=dict)
     forces_measured: ForcesUsed | None = None
 
+    def values(self) -> dict[str, Interval]:
+        """Return all that is told, by the names of `QUANTITIES`."""
+        every = ((quantity.name, getattr(self, quantity.name)) for quantity in QUANTITIES)
+        return {name: value for name, value in every if value is not None}
+
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON, as `plow-twin estimate --json` prints it."""
 
         def clearance(value: Interval, state: State) -> dict[str, Any]:
             return {"mean_m": value.mean, "p05_m": value.p05, "p95_m": value.p95, "state": state.value}
 
-        others = ("damping", "gain_fx", "gain_fy", "gain_m", "bias_x", "bias_y", "bias_theta", "delay")
         return {
             "t_start": self.t_start,
             "t_end": self.t_end,
             "horizontal": clearance(self.horizontal, self.horizontal_state),
             "vertical": clearance(self.vertical, self.vertical_state),
-            "stiffness": asdict(self.stiffness),
-            **{name: asdict(value) for name in others if (value := getattr(self, name)) is not None},
+            **{name: asdict(value) for name, value in self.values().items() if name not in ("horizontal", "vertical")},
             "noise": None if self.noise is None else list(self.noise),
             "model": self.model,
             "sensor": self.sensor,

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from plow_twin.estimate.gaps import CONSTANT_ERROR, Gaps
 from plow_twin.estimate.measurements import Deviation, Load, Poses
 from plow_twin.estimate.result import Estimate
+from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Scene
@@ -108,20 +109,21 @@ class Units:
         """Return what was found in these units in those of SI, `scene` being that in SI."""
         contact = scene.contact
         length, time = self.length, self.time
-        stiffness = self.force / length**contact.exponent
-        damping = 1.0 if contact.damping is None else self._damping(contact)
+        unit = {
+            quantity.name: length ** quantity.dimension[0]
+            * self.mass ** quantity.dimension[1]
+            * time ** quantity.dimension[2]
+            for quantity in QUANTITIES
+        }
+        unit["stiffness"] = self.force / length**contact.exponent
+        unit["damping"] = 1.0 if contact.damping is None else self._damping(contact)
+        converted: dict[str, Any] = {name: value.times(unit[name]) for name, value in found.values().items()}
         told = (f"all in units of {length:g} m, {self.mass:g} kg, {time:g} s: the machine is not of the paper's size",)
         return replace(
             found,
             t_start=found.t_start * time,
             t_end=found.t_end * time,
-            horizontal=found.horizontal.times(length),
-            vertical=found.vertical.times(length),
-            stiffness=found.stiffness.times(stiffness),
-            damping=None if found.damping is None else found.damping.times(damping),
-            bias_x=None if found.bias_x is None else found.bias_x.times(length),
-            bias_y=None if found.bias_y is None else found.bias_y.times(length),
-            delay=None if found.delay is None else found.delay.times(time),
+            **converted,
             noise=None if found.noise is None else (found.noise[0] * length, found.noise[1] * length, found.noise[2]),
             groups={name: (value.times(length), state) for name, (value, state) in found.groups.items()},
             forces_measured=None

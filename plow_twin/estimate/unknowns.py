@@ -19,20 +19,77 @@ from plow_twin.model.scene import Clearance, Contact, Scene
 
 Array = NDArray[np.float64]
 
-GX: Final = 0
-GY: Final = 1
-SOFTNESS: Final = 2
-DAMPING: Final = 3
-GAIN: Final = slice(4, 7)
-BIAS: Final = slice(7, 10)
-DELAY: Final = 10
-SIZE: Final = 11
-NAMES: Final = (
-    "horizontal", "vertical", "softness", "damping", "gain_fx", "gain_fy", "gain_m",
-    "bias_x", "bias_y", "bias_theta", "delay",
-)  # fmt: skip
-#: Unknowns that change the motion; the others only change how it is measured.
-MOVING: Final = tuple(range(7))
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity that is estimated.
+
+    Attributes
+    ----------
+    name : str
+        Its name in an estimate.
+    label, factor, digits : str, float, str
+        How it is printed: its name with the unit, what the number is multiplied by, and the format.
+    deviation : float
+        Standard deviation of the prior about the nominal scene, in the unknown's own unit.
+    dimension : tuple of 3 int
+        Powers of length, mass and time in the unit that it is told in; the contact's follow from its law.
+    step : float, optional
+        Step of its difference quotient; None where the derivative is known exactly.
+    fine_step : float, optional
+        The same beside measured forces, which bend more over a step.
+    probe : float
+        Standard deviation of the displacement that probes what can be foretold.
+    """
+
+    name: str
+    label: str
+    factor: float
+    digits: str
+    deviation: float
+    dimension: tuple[int, int, int] = (0, 0, 0)
+    step: float | None = None
+    fine_step: float | None = None
+    probe: float = 0.0
+
+
+#: All that is estimated, in the order of a vector of unknowns: the clearances in m, the softness psi (told as the
+#: stiffness), the logarithm of the damping (of a restitution its logit), three gains of the load, three biases and the
+#: delay of the sensor. The quantities with a `step` move the head and come first; the others change how its motion is
+#: measured.
+QUANTITIES: Final = (
+    Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
+    Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
+    Quantity("stiffness", "stiffness [MN/m^n]", 1e-6, ".5g", 2.5, (0, 0, 0), 0.05, 2e-3, 2e-3),
+    Quantity("damping", "damping", 1.0, ".5g", 1.2, (0, 0, 0), 0.05, 4e-3, 5e-3),
+    Quantity("gain_fx", "load gain fx [1]", 1.0, ".4f", 0.07, (0, 0, 0), 0.01, 4e-4, 2e-3),
+    Quantity("gain_fy", "load gain fy [1]", 1.0, ".4f", 0.07, (0, 0, 0), 0.01, 4e-4, 2e-3),
+    Quantity("gain_m", "load gain m [1]", 1.0, ".4f", 0.07, (0, 0, 0), 0.01, 4e-4, 2e-3),
+    Quantity("bias_x", "bias x [mm]", 1e3, ".3f", 5e-3, (1, 0, 0)),
+    Quantity("bias_y", "bias y [mm]", 1e3, ".3f", 5e-3, (1, 0, 0)),
+    Quantity("bias_theta", "bias theta [mrad]", 1e3, ".3f", 0.02),
+    Quantity("delay", "delay [ms]", 1e3, ".3f", 0.05, (0, 0, 1)),
+)
+
+
+def _place(name: str) -> int:
+    return next(place for place, quantity in enumerate(QUANTITIES) if quantity.name == name)
+
+
+GX: Final = _place("horizontal")
+GY: Final = _place("vertical")
+SOFTNESS: Final = _place("stiffness")
+DAMPING: Final = _place("damping")
+GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
+BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
+DELAY: Final = _place("delay")
+SIZE: Final = len(QUANTITIES)
+#: Places of the quantities that move the head.
+MOVING: Final = tuple(place for place, quantity in enumerate(QUANTITIES) if quantity.step is not None)
+#: Standard deviations of the displacements that probe what can be foretold, shape (11,).
+PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
+#: Names of what moves the head, as their correlation is told: softness is the penetration under a force.
+CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
 #: Impact speed in m/s below which lambda = D / v0 is not followed: touches at rest would make the contact stiff and the
 #: fit slow, for what a sensor of the pose does not see.
@@ -57,36 +114,37 @@ OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 _MOST_GAIN = 1.0
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Standard deviations of the prior about the nominal scene."""
-
-    clearance_m: float = 8e-3
-    #: of ln(u + u0) and of ln of the damping (of the logit of a restitution)
-    softness: float = 2.5
-    damping: float = 1.2
-    gain: tuple[float, float, float] = (0.07, 0.07, 0.07)
-    bias_m: float = 5e-3
-    bias_rad: float = 0.02
-    delay_s: float = 0.05
-    #: least noise of the sensor that is believed: x, y [m], theta [rad]
-    noise: tuple[float, ...] = (0.0, 0.0, 0.0)
-
-    @staticmethod
-    def stated(load: Load, poses: Poses) -> Spread:
-        """Return the prior where deviations are stated; that of a load is taken to move all its samples alike."""
-        fx, fy, moment = np.minimum(np.hypot(Spread().gain, load.gain_deviations()), _MOST_GAIN).tolist()
-        return Spread(gain=(fx, fy, moment), noise=poses.deviation)
+def _prior() -> Array:
+    return np.array([quantity.deviation for quantity in QUANTITIES])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Unknowns:
-    """The prior about a nominal scene, and what a vector of unknowns means."""
+    """The prior about a nominal scene, and what a vector of unknowns means.
+
+    Attributes
+    ----------
+    scene : Scene
+        The nominal scene.
+    deviation : ndarray, shape (11,)
+        Standard deviations of the prior about it.
+    noise : tuple of 3 float
+        Least noise of the sensor that is believed: x, y [m], theta [rad].
+    force : float
+        Force F0 in N to which the softness refers.
+    """
 
     scene: Scene
-    spread: Spread = field(default_factory=Spread)
-    #: force F0 in N to which the softness refers
+    deviation: Array = field(default_factory=_prior)
+    noise: tuple[float, ...] = (0.0, 0.0, 0.0)
     force: float = 1e5
+
+    @staticmethod
+    def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:
+        """Return the prior where load or poses state deviations; that of a load is taken to move all samples alike."""
+        deviation = _prior()
+        deviation[GAIN] = np.minimum(np.hypot(deviation[GAIN], load.gain_deviations()), _MOST_GAIN)
+        return Unknowns(scene, deviation, poses.deviation)
 
     @property
     def damped(self) -> bool:
@@ -107,18 +165,11 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior's standard deviations, shape (11,)."""
-        s = self.spread
-        return np.array(
-            [
-                s.clearance_m, s.clearance_m, s.softness, s.damping if self.damped else 1e-6, *s.gain,
-                s.bias_m, s.bias_m, s.bias_rad, s.delay_s,
-            ]
-        )  # fmt: skip
-
-    def steps(self) -> Array:
-        """Return the steps of difference quotients, shape (11,)."""
-        return np.array([2e-4, 2e-4, 0.05, 0.05, 0.01, 0.01, 0.01, 1.0, 1.0, 1.0, 1.0])
+        """Return the prior's standard deviations, shape (11,); a law without damping has none to estimate."""
+        deviations = self.deviation.copy()
+        if not self.damped:
+            deviations[DAMPING] = 1e-6
+        return deviations
 
     def is_hard(self, vector: Array) -> bool:
         """Tell whether the contact is so hard that its bounces cannot be foretold for long."""

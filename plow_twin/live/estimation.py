@@ -11,7 +11,7 @@ from plow_twin.estimate.answer import Asked
 from plow_twin.estimate.forces import FEWEST
 from plow_twin.estimate.forecast import HOUR_S, Plan, Scenario, check_prior
 from plow_twin.estimate.life import LifeError
-from plow_twin.estimate.result import Interval, State
+from plow_twin.estimate.result import State
 from plow_twin.estimate.window import Windows
 from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.parameters import ESTIMATES, Settings
@@ -32,11 +32,6 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.session import Session
 
-#: Base names of what `estimate` tells; each has its points `<name>/p05` and `<name>/p95` too.
-NAMES: Final = (
-    "horizontal", "vertical", "stiffness", "damping", "gain_fx", "gain_fy", "gain_m", "bias_x", "bias_y", "bias_theta",
-    "delay",
-)  # fmt: skip
 #: Topics of what is published, by base name.
 ESTIMATE, FORCE_INTERVALS, FORECAST = ESTIMATES
 #: What a number of a forecast is called in SI.
@@ -166,11 +161,9 @@ def message_of(found: Found, frame_id: str) -> plain.JointState:
     names: list[str] = []
     numbers: list[float] = []
     withdrawn = State.WITHDRAWN in (result.horizontal_state, result.vertical_state)
-    for name in () if withdrawn else NAMES:
-        value: Interval | None = getattr(result, name)
-        if value is not None:
-            names += [name, f"{name}/p05", f"{name}/p95"]
-            numbers += [value.mean, value.p05, value.p95]
+    for name, value in ({} if withdrawn else result.values()).items():
+        names += [name, f"{name}/p05", f"{name}/p95"]
+        numbers += [value.mean, value.p05, value.p95]
     return plain.JointState(found.end_ns, frame_id, tuple(names), position=np.array(numbers))
 
 
