@@ -1,0 +1,382 @@
+"""The estimate on machines that differ from the model: how often it answers, how far off, whether its intervals hold.
+
+    python benchmark/estimate_mismatch.py --truths 8 --seed 80000              # all kinds
+    python benchmark/estimate_mismatch.py --kind friction_05 --truths 4
+
+Each kind differs in one respect, mildly; `several` in most of them. The truth comes from `mismatched_machine.py`,
+whose equations and integrator are not those of the project. Each truth is written as soon as it is done, and a truth
+that the file holds is not run again.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from estimate import RESULTS, load_rows
+from estimate_truths import PERIOD, ROOT, cutting
+from mismatched_machine import Machine, poses_of
+from numpy.typing import NDArray
+
+from plow_twin import Clearance, Contact, Scene
+from plow_twin.estimate.estimate import estimate, warm_up
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.result import NORMAL_P95, State
+from plow_twin.model.loads import compile_loads
+from plow_twin.model.pairs import CORNER_X, CORNER_Y, NORMAL_X
+from plow_twin.scene_file import load_scene
+
+Array = NDArray[np.float64]
+
+#: Distance of the samples of the true load in s.
+_FINE = 1e-3
+#: Penetration in m at which contacts of different exponents have the same force.
+_COMMON_DEPTH = 8e-3
+#: States with which a clearance is published as found; an interval below `USEFUL_M` is useful.
+PUBLISHED = {"estimated", "rough"}
+USEFUL_M = 4e-3
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a machine differs; shares and sizes are standard deviations where a sign is drawn."""
+
+    title: str
+    stiffness: tuple[float, float] = (5e6, 3e7)
+    periods: float = 10.0
+    noise_m: float = 5e-4
+    rate_hz: float = 100.0
+    #: shape of the load believed: paper, cutting (paper and broad band), pressed, chatter, vertical
+    shape: str = "paper"
+    gain: float = 0.05
+    #: of each load component's range: correlated error, third harmonic, constant
+    correlated: float = 0.0
+    harmonic: float = 0.0
+    constant: float = 0.0
+    #: the load is believed as averages over so many s, or sampled each so many s
+    averaged_s: float = 0.0
+    sampled_s: float = 0.01
+    friction: float = 0.0
+    exponent: float = 1.0
+    walls: float = 0.0
+    #: true over believed mass and inertia, and frame size in m beyond that believed
+    mass: float = 0.0
+    inertia: float = 0.0
+    frame_m: float = 0.0
+    spring: float = 0.0
+    radius_m: float = 0.0
+    askew_m: float = 0.0
+    lever_m: float = 0.0
+    filter_hz: float = 0.0
+    steps_m: float = 0.0
+    theta_missing: bool = False
+    theta_scale: float = 0.0
+    clock: float = 0.0
+
+
+_HARD = (1e9, 1e11)
+KINDS = {
+    "none": Kind("nothing"),
+    "load_5": Kind("load: correlated error 5 %", correlated=0.05),
+    "load_10": Kind("load: correlated error 10 %", correlated=0.10),
+    "harmonic_1": Kind("load: third harmonic 1 %", harmonic=0.01),
+    "harmonic_5": Kind("load: third harmonic 5 %", harmonic=0.05),
+    "constant_1": Kind("load: constant 1 %", constant=0.01),
+    "averages_1hz": Kind("load: averages of 1 Hz", averaged_s=1.0),
+    "cutting_10hz": Kind("load: 10 Hz samples of cutting", shape="cutting", sampled_s=0.1),
+    "friction_02": Kind("friction .02", friction=0.02),
+    "friction_05": Kind("friction .05", friction=0.05),
+    "friction_10": Kind("friction .1", friction=0.1),
+    "exponent_105": Kind("exponent 1.05", exponent=1.05),
+    "exponent_110": Kind("exponent 1.1", exponent=1.1),
+    "walls_5": Kind("walls' stiffness +-5 %", walls=0.05),
+    "walls_20": Kind("walls' stiffness +-20 %", walls=0.20),
+    "frame": Kind("frame 2 mm", frame_m=2e-3),
+    "mass": Kind("mass 5 %", mass=0.05),
+    "inertia": Kind("inertia 5 %", inertia=0.05),
+    "spring": Kind("frame on 4e8 N/m", spring=4e8),
+    "corners": Kind("corners rounded 2 mm", radius_m=2e-3),
+    "lever": Kind("lever arm of the sensor 5 mm", lever_m=5e-3),
+    "filter_20": Kind("filter of the sensor 20 Hz", filter_hz=20.0),
+    "filter_5": Kind("filter of the sensor 5 Hz", filter_hz=5.0),
+    "steps": Kind("steps of 1 mm", steps_m=1e-3),
+    "no_theta": Kind("theta missing", theta_missing=True),
+    "theta_scale": Kind("theta's scale 1 %", theta_scale=0.01),
+    "clock": Kind("clock drift 1e-4", clock=1e-4),
+    "several": Kind(
+        "several mild ones",
+        correlated=0.03,
+        harmonic=0.005,
+        constant=0.005,
+        friction=0.02,
+        exponent=1.03,
+        walls=0.05,
+        inertia=0.03,
+        mass=0.02,
+        frame_m=1e-3,
+        radius_m=1e-3,
+        lever_m=2e-3,
+        filter_hz=20.0,
+        theta_scale=3e-3,
+    ),
+    "several_stochastic": Kind(
+        "several mild ones, cutting load",
+        shape="cutting",
+        correlated=0.03,
+        friction=0.02,
+        exponent=1.03,
+        walls=0.05,
+        inertia=0.03,
+        mass=0.02,
+        frame_m=1e-3,
+        radius_m=1e-3,
+        lever_m=2e-3,
+        filter_hz=20.0,
+        theta_scale=3e-3,
+    ),
+    "pressed": Kind("pressed to one side while cutting", shape="pressed"),
+    "chatter": Kind("8 Hz chatter", shape="chatter"),
+    "vertical": Kind("load vertical, x at rest", shape="vertical"),
+    "hard": Kind("hard: nothing", stiffness=_HARD),
+    "hard_corners": Kind("hard: corners rounded 5 mm", stiffness=_HARD, radius_m=5e-3),
+    "hard_askew": Kind("hard: pads askew 1 mm", stiffness=_HARD, askew_m=1e-3),
+    "hard_theta": Kind("hard: theta's scale 1 %", stiffness=_HARD, theta_scale=0.01),
+    "hard_friction": Kind("hard: friction .05", stiffness=_HARD, friction=0.05),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Mismatch:
+    """What is true, and what the estimate gets."""
+
+    scene: Scene
+    nominal: Scene
+    load: Load
+    poses: Poses
+
+    @property
+    def clearance(self) -> Array:
+        """The true clearances in m, shape (2,)."""
+        return np.array([self.scene.clearance.horizontal_m, self.scene.clearance.vertical_m])
+
+
+def draw(kind: Kind, seed: int) -> Mismatch:
+    """Draw a machine; the same seed gives the same one."""
+    rng = np.random.default_rng([20261123, seed])
+    nominal = load_scene(ROOT / "config" / "paper.yaml")
+    end = kind.periods * PERIOD
+    fine = np.arange(0.0, end + _FINE, _FINE)
+    believed = _believed(kind, nominal, rng, fine)
+    if kind.shape == "vertical":
+        nominal = replace(nominal, gravity=replace(nominal.gravity, arm_m=0.0))
+    scene = _true_scene(kind, nominal, rng)
+    machine = Machine(
+        1.0 + kind.walls * _by_wall(rng),
+        0.5 * kind.askew_m * rng.choice([-1.0, 1.0], 8),
+        kind.radius_m,
+        kind.friction,
+        kind.spring,
+    )
+    wrench = _true_load(kind, rng, fine, believed)
+    t = np.arange(0.0, end, 1.0 / kind.rate_hz)
+    poses, _ = Poses.of(*_measured(kind, rng, t, fine, poses_of(scene, machine, fine, wrench, fine)))
+    load, _ = Load.of(*_telemetry(kind, fine, believed))
+    return Mismatch(scene, nominal, load, poses)
+
+
+def _believed(kind: Kind, nominal: Scene, rng: np.random.Generator, t: Array) -> Array:
+    paper = compile_loads(nominal.loads).at(t)
+    noise = cutting(rng, t)
+    if kind.shape == "cutting":
+        return paper + noise * [8e3, 4e3, 1.1e4]
+    if kind.shape == "pressed":
+        # a steady push against one wall, and cutting about it
+        return noise * [8e3, 4e3, 1.1e4] + [6e4, -5e3, 2e4]
+    if kind.shape == "chatter":
+        turn = 2.0 * np.pi * 8.0 * t
+        return np.stack([2e4 * np.sin(turn), 3e4 * np.sin(turn + 0.5), 6e3 * np.sin(turn + 1.0)], axis=1)
+    if kind.shape == "vertical":
+        return np.stack([0.0 * t, 8e4 * np.sin(2.0 * t), 0.0 * t], axis=1)
+    return paper
+
+
+def _true_scene(kind: Kind, nominal: Scene, rng: np.random.Generator) -> Scene:
+    low, high = np.log(kind.stiffness)
+    stiffness = float(np.exp(rng.uniform(low, high)))
+    clearance = Clearance(*rng.uniform(0.018, 0.034, 2))
+    damping = 0.72 * float(np.exp(rng.normal(0.0, 0.4)))
+    sign = rng.choice([-1.0, 1.0], 4)
+    head, frame = nominal.head, nominal.frame
+    return replace(
+        nominal,
+        clearance=clearance,
+        contact=Contact(
+            law="hunt_crossley",
+            stiffness=stiffness * _COMMON_DEPTH ** (1.0 - kind.exponent),
+            exponent=kind.exponent,
+            damping=damping,
+        ),
+        head=replace(
+            head,
+            mass_kg=head.mass_kg * (1.0 + kind.mass * sign[0]),
+            inertia_kg_m2=head.inertia_kg_m2 * (1.0 + kind.inertia * sign[1]),
+        ),
+        frame=replace(
+            frame, width_m=frame.width_m + kind.frame_m * sign[2], height_m=frame.height_m + kind.frame_m * sign[3]
+        ),
+    )
+
+
+def _by_wall(rng: np.random.Generator) -> Array:
+    """Return a number of each pair, -1 or 1, the same for both pads of a wall, and not the same for all walls."""
+    signs: Array = rng.permutation([-1.0, -1.0, 1.0, 1.0])
+    wall = np.where(NORMAL_X != 0.0, np.where(CORNER_X > 0.0, 0, 1), np.where(CORNER_Y > 0.0, 2, 3))
+    return np.asarray(signs[wall], np.float64)
+
+
+def _true_load(kind: Kind, rng: np.random.Generator, t: Array, believed: Array) -> Array:
+    size = np.ptp(believed, axis=0) / 2.0
+    slow = _correlated(rng, t)
+    wrench = believed * (1.0 + kind.gain * rng.standard_normal(3)) + kind.correlated * size * slow
+    phase = rng.uniform(0.0, 2.0 * np.pi, 3)
+    wrench = wrench + kind.harmonic * size * np.sin(3.0 * 2.0 * np.pi / PERIOD * t[:, None] + phase)
+    return np.asarray(wrench + kind.constant * size * rng.choice([-1.0, 1.0], 3))
+
+
+def _correlated(rng: np.random.Generator, t: Array, time_s: float = 0.5) -> Array:
+    """Return an Ornstein-Uhlenbeck process of unit variance, shape (n, 3)."""
+    keep = np.exp(-(t[1] - t[0]) / time_s)
+    drive = np.sqrt(1.0 - keep**2) * rng.standard_normal((len(t), 3))
+    out: Array = np.zeros_like(drive)
+    for index in range(1, len(t)):
+        out[index] = keep * out[index - 1] + drive[index]
+    return out
+
+
+def _measured(kind: Kind, rng: np.random.Generator, t: Array, fine: Array, motion: Array) -> tuple[Array, Array]:
+    """Return stamps and poses as the sensor gives them."""
+    turned = motion.copy()
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    arm = kind.lever_m * np.array([np.cos(angle), np.sin(angle)])
+    c, s = np.cos(motion[:, 2]), np.sin(motion[:, 2])
+    turned[:, 0] += c * arm[0] - s * arm[1] - arm[0]
+    turned[:, 1] += s * arm[0] + c * arm[1] - arm[1]
+    if kind.filter_hz:
+        keep = np.exp(-2.0 * np.pi * kind.filter_hz * _FINE)
+        for index in range(1, len(turned)):
+            turned[index] = keep * turned[index - 1] + (1.0 - keep) * turned[index]
+    q = np.stack([np.interp(t, fine, column) for column in turned.T], axis=1)
+    q[:, 2] *= 1.0 + kind.theta_scale * rng.choice([-1.0, 1.0])
+    q += kind.noise_m * np.array([1.0, 1.0, 4.0]) * rng.standard_normal(q.shape)
+    if kind.steps_m:
+        step = kind.steps_m * np.array([1.0, 1.0, 4.0])
+        q = np.round(q / step) * step
+    if kind.theta_missing:
+        q[:, 2] = np.nan
+    return t * (1.0 + kind.clock), q
+
+
+def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
+    if not kind.averaged_s:
+        knots = np.arange(0.0, fine[-1] + kind.sampled_s, kind.sampled_s)
+        return knots, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
+    rows = round(kind.averaged_s / _FINE)
+    count = len(fine) // rows
+    # stamped in the middle of what is averaged
+    middle = fine[: count * rows].reshape(count, rows).mean(axis=1)
+    return middle, believed[: count * rows].reshape(count, rows, 3).mean(axis=1)
+
+
+def run_one(name: str, seed: int) -> dict[str, Any]:
+    """Estimate one machine and compare."""
+    truth = draw(KINDS[name], seed)
+    begin = time.process_time()
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    row: dict[str, Any] = {
+        "kind": name, "seed": seed, "stiffness": truth.scene.contact.stiffness, "model": result.model,
+        "sensor": result.sensor, "cpu_s": time.process_time() - begin, "reasons": "; ".join(result.reasons),
+    }  # fmt: skip
+    for axis, value, state, true in zip(
+        "hv",
+        (result.horizontal, result.vertical),
+        (result.horizontal_state, result.vertical_state),
+        truth.clearance.tolist(),
+        strict=True,
+    ):
+        row |= {
+            f"{axis}_error_m": value.mean - true,
+            f"{axis}_sd_m": (value.p95 - value.p05) / (2.0 * NORMAL_P95),
+            f"{axis}_inside": int(value.p05 <= true <= value.p95),
+            f"{axis}_state": state.value,
+        }
+    return row | {f"figure_{key}": value for key, value in result.figures.items()}
+
+
+def summary(rows: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """Return the figures of a kind, both clearances together."""
+    both = [
+        {key: row[f"{axis}_{key}"] for key in ("error_m", "sd_m", "inside", "state")} for row in rows for axis in "hv"
+    ]
+    known = [one for one in both if one["state"] in PUBLISHED]
+    errors, all_errors = (np.array([one["error_m"] for one in some]) for some in (known, both))
+    deviations = np.array([one["sd_m"] for one in known])
+    useful = sum(2.0 * NORMAL_P95 * one["sd_m"] < USEFUL_M for one in known)
+    return {
+        "clearances": len(both),
+        "published": len(known) / len(both),
+        "useful": useful / len(both),
+        "rmse_mm": 1e3 * float(np.sqrt(np.mean(errors**2))) if known else np.nan,
+        "coverage": float(np.mean([one["inside"] for one in known])) if known else np.nan,
+        "width_mm": 1e3 * 2.0 * NORMAL_P95 * float(np.median(deviations)) if known else np.nan,
+        "far_off": float(np.mean(np.abs(errors) > 3.0 * deviations)) if known else 0.0,
+        "all_rmse_mm": 1e3 * float(np.sqrt(np.mean(all_errors**2))),
+        "withdrawn": float(np.mean([one["state"] == State.WITHDRAWN.value for one in both])),
+        "cpu_s": float(np.mean([row["cpu_s"] for row in rows])),
+    }
+
+
+def as_markdown(groups: dict[str, dict[str, float]]) -> str:
+    """Return the table of the page."""
+    lines = [
+        "| what differs | clearances | published | interval below 4 mm | RMSE [mm] | coverage | median width [mm] | "
+        "beyond 3 deviations | CPU [s] |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for title, one in groups.items():
+        lines.append(
+            f"| {title} | {one['clearances']} | {one['published']:.2f} | {one['useful']:.2f} | {one['rmse_mm']:.3f} | "
+            f"{one['coverage']:.2f} | {one['width_mm']:.2f} | {one['far_off']:.2f} | {one['cpu_s']:.1f} |"
+        )
+    return "\n".join(lines).replace("nan", "-")
+
+
+@click.command()
+@click.option("--kind", "kinds", multiple=True, type=click.Choice(list(KINDS)))
+@click.option("--truths", default=8, show_default=True)
+@click.option("--seed", default=80000, show_default=True, help="First seed.")
+@click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "estimate_mismatch.jsonl", show_default=True)
+def main(kinds: tuple[str, ...], truths: int, seed: int, out: Path) -> None:
+    """Run the kinds and write one line of JSON a truth."""
+    warm_up(load_scene(ROOT / "config" / "paper.yaml"))
+    rows = load_rows(out)
+    done = {(row["kind"], row["seed"]) for row in rows}
+    names, seeds = kinds or tuple(KINDS), range(seed, seed + truths)
+    for number in seeds:
+        for name in names:
+            if (name, number) not in done:
+                rows.append(run_one(name, number))
+                with out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(rows[-1]) + "\n")
+    asked = [row for row in rows if row["seed"] in seeds and row["kind"] in names]
+    groups = {KINDS[name].title: summary([row for row in asked if row["kind"] == name]) for name in names}
+    click.echo(as_markdown(groups | {"all": summary(asked)}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""A machine that differs from every scene: its own equations, integrated with fixed steps of Runge and Kutta.
+
+Independent of the solver: the walls may differ in stiffness, the corners may be round, the pads may lie askew, the
+frame may stand on a spring, the corners may rub. A head of `rotation: paper` alone is modelled.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import CORNER_X, CORNER_Y, NORMAL_X, NORMAL_Y
+from plow_twin.model.scene import Scene
+
+Array = NDArray[np.float64]
+
+#: Steps in the shortest period of a contact's oscillation, and the longest step in s.
+_STEPS_A_PERIOD, _LONGEST_STEP = 60.0, 1e-4
+#: Mass in kg of a frame that stands on a spring, and its share of the critical damping.
+_FRAME_MASS, _FRAME_DAMPING = 500.0, 0.1
+#: Speed in m/s below which friction is viscous.
+_CREEP = 0.005
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a scene does not tell.
+
+    Attributes
+    ----------
+    stiffness_share, depth : ndarray, shape (8,)
+        Each pair's stiffness over the contact's, and by how much its wall lies further out, in m.
+    radius : float
+        Radius of the corners in m.
+    friction : float
+        Coefficient of friction.
+    spring : float
+        Stiffness in N/m of the spring that the frame stands on, along x and along y; 0: the frame is fixed.
+    """
+
+    stiffness_share: Array
+    depth: Array
+    radius: float = 0.0
+    friction: float = 0.0
+    spring: float = 0.0
+
+
+def poses_of(scene: Scene, machine: Machine, t: Array, wrench: Array, asked: Array) -> Array:
+    """Return the poses at the times `asked` in s under a load (n, 3) at equal distances `t` in s: (k, 3)."""
+    contact = scene.contact
+    stiff = contact.stiffness * max(1.0, 0.01 ** (contact.exponent - 1.0) * contact.exponent)
+    lever = 1.0 / scene.head.mass_kg + 0.05 / scene.head.inertia_kg_m2
+    fastest = max(math.sqrt(3.0 * stiff * lever), math.sqrt(machine.spring / _FRAME_MASS))
+    step = min(_LONGEST_STEP, 2.0 * math.pi / fastest / _STEPS_A_PERIOD)
+    half = 0.5 * scene.frame.width_m - machine.radius, 0.5 * scene.frame.height_m - machine.radius
+    walls = (
+        np.abs(NORMAL_X) * 0.5 * (scene.frame.width_m + scene.clearance.horizontal_m)
+        + np.abs(NORMAL_Y) * 0.5 * (scene.frame.height_m + scene.clearance.vertical_m)
+        + machine.depth
+        - machine.radius
+    )
+    gravity = scene.gravity.acceleration_m_s2
+    numbers = np.array([
+        scene.head.mass_kg, scene.head.inertia_kg_m2, contact.exponent, contact.damping or 0.0, machine.friction,
+        gravity, scene.gravity.arm_m, machine.spring, _FRAME_MASS,
+        2.0 * _FRAME_DAMPING * math.sqrt(machine.spring * _FRAME_MASS),
+    ])  # fmt: skip
+    corners = np.stack([half[0] * CORNER_X, half[1] * CORNER_Y])
+    normals = np.stack([NORMAL_X, NORMAL_Y]).astype(np.float64)
+    stiffness = contact.stiffness * machine.stiffness_share
+    out: Array = _run(numbers, corners, normals, walls, stiffness, t, wrench, asked, step)
+    return out
+
+
+@numba.njit(cache=True)
+def _run(numbers, corners, normals, walls, stiffness, t, wrench, asked, step):  # type: ignore[no-untyped-def]
+    out = np.zeros((len(asked), 3))
+    state, now = np.zeros(10), t[0]
+    for row in range(len(asked)):
+        steps = int(np.ceil((asked[row] - now) / step)) if asked[row] > now else 0
+        h = (asked[row] - now) / steps if steps else 0.0
+        for _ in range(steps):
+            a = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now, state)
+            b = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now + 0.5 * h, state + 0.5 * h * a)
+            c = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now + 0.5 * h, state + 0.5 * h * b)
+            d = _rates(numbers, corners, normals, walls, stiffness, t, wrench, now + h, state + h * c)
+            state = state + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
+            now += h
+        out[row] = state[:3]
+    return out
+
+
+@numba.njit(cache=True)
+def _rates(numbers, corners, normals, walls, stiffness, t, wrench, now, state):  # type: ignore[no-untyped-def]
+    mass, inertia, exponent, damping, friction, gravity, arm, spring, frame_mass, frame_damping = numbers
+    place = min(max((now - t[0]) / (t[1] - t[0]), 0.0), len(t) - 1.000001)
+    left = int(place)
+    load = wrench[left] + (place - left) * (wrench[left + 1] - wrench[left])
+    fx, fy = load[0], load[1] - mass * gravity
+    moment = load[2] - mass * gravity * arm
+    frame_x, frame_y = 0.0, 0.0
+    c, s = np.cos(state[2]), np.sin(state[2])
+    for k in range(8):
+        dx, dy = corners[0, k] + state[6] - state[0], corners[1, k] + state[7] - state[1]
+        px, py = c * dx + s * dy, -s * dx + c * dy
+        nx, ny = normals[0, k], normals[1, k]
+        depth = nx * px + ny * py - walls[k]
+        if depth <= 0.0:
+            continue
+        ux, uy = state[8] - state[3], state[9] - state[4]
+        wx, wy = c * ux + s * uy + state[5] * py, -s * ux + c * uy - state[5] * px
+        force = stiffness[k] * depth**exponent * (1.0 + damping * (nx * wx + ny * wy))
+        if force <= 0.0:
+            continue
+        rub = friction * force * np.tanh((nx * wy - ny * wx) / _CREEP)
+        bx, by = force * nx - rub * ny, force * ny + rub * nx
+        ax, ay = c * bx - s * by, s * bx + c * by
+        fx, fy, moment = fx + ax, fy + ay, moment + px * by - py * bx
+        frame_x, frame_y = frame_x - ax, frame_y - ay
+    rates = np.zeros(10)
+    rates[:3] = state[3:6]
+    rates[3], rates[4], rates[5] = fx / mass, fy / mass, moment / inertia
+    if spring > 0.0:
+        rates[6:8] = state[8:10]
+        rates[8] = (frame_x - spring * state[6] - frame_damping * state[8]) / frame_mass
+        rates[9] = (frame_y - spring * state[7] - frame_damping * state[9]) / frame_mass
+    return rates
