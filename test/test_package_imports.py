@@ -156,6 +156,10 @@ def _imported_names(path: Path) -> set[str]:
             "import plow_twin.stream.session",
             {*SCIPY, "jsonschema", "click", "rich", "mcap", "rosbags", "rerun", "rclpy"},
         ),
+        (
+            "from plow_twin import Twin, load_scene; Twin(load_scene('paper')).advance(0.01)",
+            {*SCIPY, "click", "rich", "mcap", "rosbags", "rerun", "rclpy"},
+        ),
         ("import plow_twin.cli.app, plow_twin.record.replay", {*SCIPY, "mcap", "rosbags", "rerun", "rclpy"}),
         ("import plow_twin.cli.live, plow_twin.live.front", {*SCIPY, "mcap", "rosbags", "rerun", "rclpy", "paho"}),
         ("import plow_twin.ros.node", {*SCIPY, "mcap", "rosbags", "rerun"}),

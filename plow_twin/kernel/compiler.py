@@ -1,7 +1,7 @@
 """The decorator of every compiled function: numba with a cache on disk that notices a change in any kernel.
 
-Numba's own cache looks at the file of the function that is called, not at those of the functions it calls: a change
-there would go unseen. Here the stamp of each cached function stands for the text of all kernels.
+Numba's own cache compares the file of the called function only and misses a change in the functions that it calls.
+Here the stamp of each cached function is a digest of the source of all kernels.
 """
 
 from __future__ import annotations
@@ -13,16 +13,32 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numba
+from numba.core.registry import cpu_target
+from numba.np import linalg
 
-from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, background, keep_from_python
-from plow_twin.kernel.quick import load_numba
+from plow_twin.kernel.linked import EntryCompiler, LinkedCompiler, garbage_kept, keep_from_python
 
 #: Value-preserving relaxations only: sums may be reordered and fused, but NaN and infinity keep their meaning.
 FASTMATH: Final = frozenset({"contract", "reassoc", "nsz", "arcp"})
 
 _said: set[str] = set()
 
-load_numba()
+
+def _load_numba() -> None:
+    """Load what numba types and lowers with, without SciPy's linear algebra: 0.15 s, a third of a start.
+
+    Numba imports it only to learn whether a BLAS is there; compiled functions that use one import it themselves.
+    """
+    found = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        with garbage_kept():
+            cpu_target.target_context.refresh()
+    finally:
+        linalg.ensure_blas = found
+
+
+_load_numba()
 
 #: Subpackages that hold compiled functions, with all their folders.
 KERNEL_FOLDERS: Final = ("kernel", "model", "solve")
@@ -50,10 +66,10 @@ def kernel(
     fast : bool
         Allow reordered and fused sums.
     inline : {"code", "source"}, optional
-        Inline it into its callers: its code, or its source, which compiles more slowly but follows the caller's `fast`
+        Inline its code or its source into its callers. Inlined source compiles more slowly, follows the caller's `fast`
         and may return records, which numba's functions cannot.
     entry : bool
-        Python calls it too, not kernels alone: that takes a wrapper, which costs a tenth of the time of compiling.
+        Whether Python calls it too. The wrapper for that costs a tenth of the time of compiling.
     """
     options: dict[str, Any] = {"fastmath": set(FASTMATH)} if fast else {}
     if inline == "source":
@@ -65,27 +81,23 @@ def kernel(
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         dispatcher = numba.njit(cache=True, nogil=True, error_model="numpy", **options)(function)
-        # absent when numba is told not to compile
+        # absent with NUMBA_DISABLE_JIT
         cache_file = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
         if cache_file is not None:
             cache_file._source_stamp = SOURCE_DIGEST
-            # read before the rest of an index, which cannot be read once a type that it names is gone
+            # numba compares the version first: an index that names a removed type cannot be unpickled
             cache_file._version = f"{numba.__version__} {SOURCE_DIGEST}"
-            linked = inline != "source" and not entry
-            if linked:
+            if inline != "source" and not entry:
                 keep_from_python(dispatcher)
-            save_or_warn(dispatcher, later=linked)
+            save_or_warn(dispatcher)
         compiled: Callable[..., Any] = dispatcher
         return compiled
 
     return decorate
 
 
-def save_or_warn(dispatcher: Any, *, later: bool = False) -> None:
-    """Let a disk that does not take the cache be a warning, and no error: what is compiled works without it.
-
-    `later` : written when LLVM is done with what goes into it.
-    """
+def save_or_warn(dispatcher: Any) -> None:
+    """Warn where the disk does not take the cache: a compiled kernel works without it."""
     cache = dispatcher._cache
     save = cache.save_overload
 
@@ -95,23 +107,20 @@ def save_or_warn(dispatcher: Any, *, later: bool = False) -> None:
         except OSError as error:
             place = Path(cache.cache_path).parent
             text = f"compiled kernels are not kept for the next start: {place}: {error.strerror or error}"
-            if text not in _said:  # numba makes Python forget which warnings it has given
+            if text not in _said:  # numba resets Python's register of warnings
                 _said.add(text)
                 warnings.warn(text, RuntimeWarning, stacklevel=1)
 
-    if later:
-        cache.save_overload = lambda signature, result: background.do(attempt, signature, result)
-    else:
-        cache.save_overload = attempt
+    cache.save_overload = attempt
 
 
 def for_arguments(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Return an entry compiled for the types of some arguments; a call of it looks at no types.
+    """Return an entry compiled for the types of these arguments; a call of it does not look at types.
 
-    For calls whose types never change: to look at those of nested tuples and records takes longer than a sample's work.
+    For calls whose types never change: numba needs longer to look at nested tuples and records than a sample takes.
     """
     compile_for = getattr(function, "compile", None)
     if compile_for is None:
-        return function  # numba is told not to compile
+        return function  # NUMBA_DISABLE_JIT
     found: Callable[..., Any] = compile_for(tuple(map(numba.typeof, arguments)))
     return found

@@ -1,68 +1,54 @@
-"""Compile what only kernels call to code for linking: numba would optimise it and make machine code of it once more.
+"""Two compilers for numba: one for kernels that only kernels call, one for kernels that Python calls too.
 
-A kernel is optimised as a whole, together with all that it calls, so whatever was done to the parts alone is done in
-vain. It takes a quarter of the time of compiling, which is left out here by numba's own means: a compiler of one's own
-(numba's manual, "Customizing the Compiler"), which lowers into a library of one's own.
+LLVM optimises a kernel together with everything that it calls. Numba would also optimise each called kernel alone and
+make machine code of it, a quarter of the time of compiling; the first compiler stops at code for linking. Both use
+numba's extension point (its manual, "Customizing the Compiler") and lower into a code library of their own.
 """
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import llvmlite.binding as llvm
 import llvmlite.ir
-from numba.core.cgutils import normalize_ir_text
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 
-from plow_twin.kernel.background import Background
-from plow_twin.kernel.quick import QuickPasses, ask_llvm_once, caching_context, garbage_kept, without_lock_events
-
 _ENVIRONMENT = "_ZN08NumbaEnv"
-
-#: What LLVM does to linked code, beside the typing and lowering of what calls it.
-background = Background()
 
 
 class LinkedLibrary(JITCodeLibrary):
-    """The code of a kernel, as its callers link it; its machine code holds nothing but the variables numba sets."""
+    """The code of a kernel as its callers link it; its machine code holds only the variables that numba sets."""
 
     def __init__(self, codegen: Any, name: str) -> None:
         super().__init__(codegen, name)
-        self._texts: list[tuple[str, str]] = []
         self._exported: list[str] = []
-        #: whether sums may be reordered and fused: what it is inlined into may change its bits
+        #: whether sums may be reordered and fused: then the bits may depend on the caller it is inlined into
         self.fast = False
 
     def add_ir_module(self, ir_module: llvmlite.ir.Module) -> None:
-        """Take functions as text."""
-        self._texts.append((ir_module.name, normalize_ir_text(str(ir_module))))
+        """Add the functions of a module, and note those that callers use."""
+        super().add_ir_module(ir_module)
         defined = (function for function in ir_module.functions if not function.is_declaration)
         self._exported += [function.name for function in defined if not function.linkage]
 
     def finalize(self) -> None:
-        """Have LLVM make of the text what callers link, in the background."""
+        """Link everything that the functions call."""
         self._finalized = True
-        self._wait = background.do(self._link, list(dict.fromkeys(self._linking_libraries)))
-
-    def _link(self, libraries: list[JITCodeLibrary]) -> None:
-        for name, text in self._texts:
-            functions = llvm.parse_assembly(text)
-            functions.name = name
-            functions.verify()
-            self.add_llvm_module(functions)
-        self._texts.clear()
         whole = self._final_module
         self._finalize_dynamic_globals()
         environments = _environments(whole)
-        for library in libraries:
+        for library in dict.fromkeys(self._linking_libraries):
             whole.link_in(library._get_module_for_linking(), preserve=True)
             self._dynamic_globals += library._dynamic_globals
             environments |= _environments(library._final_module)
         for name in self._exported:
-            # a caller holds it, or leaves it out
+            # a caller keeps its own copy, or drops it
             whole.get_function(name).linkage = "linkonce_odr" if self.fast else "weak_odr"
         self._shared_module = whole
         self._final_module = _variables(self._codegen._create_empty_module(self.name), environments)
@@ -70,7 +56,6 @@ class LinkedLibrary(JITCodeLibrary):
 
     def _get_module_for_linking(self) -> llvm.ModuleRef:
         self._ensure_finalized()
-        self._wait()
         return self._shared_module
 
 
@@ -87,11 +72,11 @@ def _variables(module: llvmlite.ir.Module, names: set[str]) -> llvm.ModuleRef:
 
 
 class EntryLibrary(JITCodeLibrary):
-    """The code of a kernel that Python calls, with all that it calls for itself alone.
+    """The code of a kernel that Python calls, with its own copy of every kernel that it calls.
 
-    Otherwise the first entry loaded would lend its copies of them to the next: optimised for another caller, they may
-    differ in the last bit. LLVM knows it before it optimises, and inlines what is called at one place, but for `fast`
-    code, which is left its size as the only reason: elsewhere its sums would be reordered in other ways.
+    Shared copies would come from the entry that is loaded first: optimised for another caller, they may differ in the
+    last bit. Copies become internal before LLVM optimises, so that it inlines a kernel with one caller; those of `fast`
+    kernels only afterwards: inlined for that reason, their sums would be reordered in other ways.
     """
 
     def _optimize_final_module(self) -> None:
@@ -100,7 +85,7 @@ class EntryLibrary(JITCodeLibrary):
         self._keep(llvm.Linkage.linkonce_odr)
 
     def _keep(self, linkage: llvm.Linkage) -> None:
-        """Keep the functions of a linkage for this entry."""
+        """Make the functions of one linkage internal."""
         for function in self._final_module.functions:
             if function.linkage == linkage and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
@@ -114,7 +99,7 @@ def _new_library(state: Any, kind: type[JITCodeLibrary]) -> JITCodeLibrary:
 
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _LowerForLinking(NativeLowering):
-    """Numba's pass, but that nothing is made ready to be called."""
+    """Numba's lowering, without making the function callable."""
 
     _name = "lower_for_linking"
 
@@ -124,7 +109,7 @@ class _LowerForLinking(NativeLowering):
         state.flags.no_compile = True
         super().run_pass(state)
         state.library.finalize()
-        # stands for the function wherever a caller is lowered
+        # callers are lowered against this object instead of a callable
         entry_point = object()
         state.targetctx.insert_user_function(entry_point, state.cr.fndesc, [state.library])
         state["cr"] = state.cr._replace(cfunc=entry_point)
@@ -143,36 +128,44 @@ class _LowerForPython(NativeLowering):
 class _Compiler(CompilerBase):
     lowering: type[NativeLowering]
 
-    def __init__(self, typing: Any, target: Any, library: Any, args: Any, result: Any, flags: Any, local: Any) -> None:
-        ask_llvm_once(target)
-        super().__init__(caching_context(typing, flags), target, library, args, result, flags, local)
-
     def define_pipelines(self) -> list[Any]:
-        passes = QuickPasses(DefaultPassBuilder.define_nopython_pipeline(self.state))
-        passes.passes = [(self.lowering if one is NativeLowering else one, said) for one, said in passes.passes]
+        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        passes.passes = [(self.lowering if one is NativeLowering else one, text) for one, text in passes.passes]
         passes.finalize()
         return [passes]
 
 
 class LinkedCompiler(_Compiler):
-    """numba's compiler, but for the library that it lowers into: for what kernels call."""
+    """numba's compiler with `LinkedLibrary`, for kernels that only kernels call."""
 
     lowering = _LowerForLinking
 
 
 class EntryCompiler(_Compiler):
-    """numba's compiler, but for the library that it lowers into: for what Python calls, with all that it calls."""
+    """numba's compiler with `EntryLibrary`, for kernels that Python calls."""
 
     lowering = _LowerForPython
 
     def compile_extra(self, func: Any) -> Any:
-        """Compile, as numba's own."""
-        with garbage_kept(), without_lock_events(), background.running():
+        """Compile with the collection of garbage paused, which is a seventh of the time: little is freed."""
+        with garbage_kept():
             return super().compile_extra(func)
 
 
+@contextmanager
+def garbage_kept() -> Iterator[None]:
+    """Pause Python's collection of garbage."""
+    paused = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if paused:
+            gc.enable()
+
+
 def keep_from_python(dispatcher: Any) -> None:
-    """Make a call from Python an error: there is no machine code to go to."""
+    """Make a call from Python an error: there is no machine code to run."""
 
     def refuse(*arguments: Any, **named: Any) -> None:
         raise TypeError(f"{dispatcher.py_func.__qualname__} is for kernels to call: it would have to be an entry")
