@@ -99,15 +99,17 @@ def test_every_test_that_shows_a_promise_exists() -> None:
     assert all("::test_" in row or "benchmark/" in row for row in rows)
 
 
-def test_the_readme_s_example_runs() -> None:
-    (example,) = blocks(ROOT / "README.md", "python")
-    done = subprocess.run([sys.executable, "-c", example], capture_output=True, text=True, timeout=280, check=False)
+@pytest.mark.parametrize("page", ["README.md", "docs/interface.md"])
+def test_the_page_s_example_runs(page: str) -> None:
+    (example,) = blocks(ROOT / page, "python")
+    code = f"{example}\nprint(result.solver)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
     assert done.returncode == 0, done.stderr
     assert "'method': 'events'" in done.stdout
 
 
-def test_the_model_page_s_law_of_one_s_own_runs() -> None:
-    (example,) = blocks(ROOT / "docs" / "model.md", "python")
+def test_the_law_of_the_how_to_runs() -> None:
+    (example,) = blocks(ROOT / "docs" / "how_to_own_law.md", "python")
     # a process of its own: the law stays where it was added
     code = f"{example}\nfrom plow_twin.model.contact_laws import LAWS\nprint(LAWS[contact.law].damping_number(0.4))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=280, check=False)
