@@ -100,6 +100,10 @@ class RecordingError(PlowTwinError, ValueError):
     """A recording cannot be written or read; the message names the file and the record."""
 
 
+class UnitError(RecordingError):
+    """Measured numbers look as if they were in another unit; the message names them and how to state the unit."""
+
+
 class TakenError(RecordingError):
     """A recording cannot be made where another one is."""
 

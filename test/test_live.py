@@ -135,7 +135,7 @@ def test_a_time_that_stands_alone_is_no_clock_and_no_end(tmp_path: Path, capsys:
     assert replay(tmp_path / "run").samples == 300
 
 
-@pytest.mark.parametrize(("column", "bad"), [("x", "99"), ("speed", "fast")])
+@pytest.mark.parametrize(("column", "bad"), [("x", "999"), ("speed", "fast")])
 def test_whatever_is_dropped_of_any_input_is_told_by_the_exit_code(column: str, bad: str, tmp_path: Path) -> None:
     path = tmp_path / "all.csv"
     rows = "".join(f"{index * 0.01},1,2,3,{bad if index % 2 else 0}\n" for index in range(20))
@@ -718,7 +718,7 @@ def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(ur
         (["load.csv", "--set", "excitation_timeout=-1"], 2, "a number from 0.01"),
         (["load.csv", "--set", "excitation_source=tool_forces"], 1, "expected 'excitation' or 'scene'"),
         (["other.csv"], 1, "expected the columns fx, fy, m"),
-        (["twice.csv"], 1, "column 'fx' stands there more than once"),
+        (["twice.csv"], 1, "column 'fx' stands more than once"),
         (["load.csv", "--map", "twice.yaml"], 1, "the key twice, in lines 1 and 2"),
         (["junk.csv"], 1, "\\x1b"),
         (["mqtt://localhost:1"], 1, "expected one that names the topics"),
@@ -765,3 +765,28 @@ def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
         inputs.take_gaps(second + at * 20_000_000, gaps)
     assert used == [{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.05, 1: 0.03}]
     assert inputs.gaps.counts[Verdict.IMPLAUSIBLE] == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "said"),
+    [
+        ("t,fx,fy,m\n", 3, "no sample came on load"),
+        ("0.0,1.0,2.0,3.0\n0.1,1.0,2.0,3.0\n", 1, "columns 0.0, 1.0, 2.0, 3.0 (no header row?)"),
+    ],
+)
+def test_an_input_without_a_sample_or_without_a_header_is_named(
+    text: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "load.csv").write_text(text)
+    assert run_cli(["live", str(tmp_path / "load.csv"), "--quiet"]) == code
+    shown = capsys.readouterr().err
+    assert said in shown and "no --scene: the preset paper is used" in shown
+
+
+def test_a_stop_before_the_end_of_a_file_is_a_loss(tmp_path: Path) -> None:
+    path = _csv(tmp_path / "load.csv", 3000)
+    prepared = Preparation(parameters.settings({})).result(lambda: False)
+    front = BridgeFront(Files([path], follow=False), None, parameters.settings({}), prepared, lambda *_: None, str)
+    asked = iter([False, False, True])
+    assert front.run(lambda: next(asked, True)) == ["stopped before the end of load"]
+    assert 0 < int(front.parts()["input"][2]["samples_used"]) < 3000

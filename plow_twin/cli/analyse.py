@@ -24,6 +24,7 @@ from plow_twin.cli.console import (
     quiet_option,
     say_error,
     table,
+    unit_option,
 )
 
 
@@ -39,6 +40,7 @@ from plow_twin.cli.console import (
     type=click.Path(path_type=Path, exists=True, dir_okay=False),
     help="YAML that says which topic is the excitation, the head_pose, the travel, the forces, the gaps.",
 )
+@unit_option
 @click.option("--with", "others", multiple=True, help="A further scene to predict with; may be repeated.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for report.html and Parquet.")
 @click.option("--workers", type=click.IntRange(1), help="Processes for many recordings; by default one a core.")
@@ -52,6 +54,7 @@ def analyse(
     recordings: tuple[Path, ...],
     scene: str | None,
     mapping: Path | None,
+    units: dict[str, str],
     others: tuple[str, ...],
     out: Path | None,
     workers: int | None,
@@ -69,7 +72,7 @@ def analyse(
             raise click.UsageError("--watch cannot be combined with --dask or --workers: it follows one run")
         if len(recordings) != 1:
             raise click.UsageError(f"--watch: got {len(recordings)} recordings, expected one")
-        return _watched(Task(recordings[0], scene_file, mapping, further, out), watch, as_json, quiet)
+        return _watched(Task(recordings[0], scene_file, mapping, further, out, units=units), watch, as_json, quiet)
     found, left = _found(recordings, out)
     many = len(found) > 1 or found != list(recordings)
     for option, given in (("--dask", dask), ("--workers", workers)):
@@ -80,7 +83,8 @@ def analyse(
     folders = [out / name for name in names_apart(found)] if out is not None and many else [out] * len(found)
     beside = () if many else left
     tasks = [
-        Task(path, scene_file, mapping, further, folder, beside) for path, folder in zip(found, folders, strict=True)
+        Task(path, scene_file, mapping, further, folder, beside, units)
+        for path, folder in zip(found, folders, strict=True)
     ]
     for task in tasks:  # before the first of them removes anything
         task.check(found)
@@ -171,6 +175,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             path,
             scene=task.scene,
             mapping=task.mapping,
+            units=task.units,
             others=task.others,
             out=task.out,
             tail=Tail(stopped),

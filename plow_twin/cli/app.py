@@ -25,7 +25,7 @@ from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
 from plow_twin.cli.view import view
-from plow_twin.errors import PlowTwinError, RunInterrupted, SceneError
+from plow_twin.errors import PlowTwinError, RunInterrupted, SceneError, UnitError
 
 #: Extra of the package that brings a module.
 EXTRA_OF_MODULE: Final = {
@@ -95,7 +95,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # click turns every KeyboardInterrupt into an Abort
         stopped = error.__cause__
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
-    except SceneError as error:
+    except (SceneError, UnitError) as error:
         return _fail(str(error), WRONG_INPUT)
     except PlowTwinError as error:
         return _fail(str(error))

@@ -173,3 +173,19 @@ def counts(found: Mapping[str, int]) -> str:
 def kilonewton(force_n: float) -> str:
     """Return a force in N as text in kN."""
     return f"{force_n / 1e3:.2f}"
+
+
+def unit_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--unit NAME=UNIT`, which arrives as the parameter `units`: units by name."""
+
+    def parsed(context: click.Context, parameter: click.Parameter, given: tuple[str, ...]) -> dict[str, str]:
+        units = dict(text.partition("=")[::2] for text in given)
+        for text in given:
+            if "=" not in text:
+                raise click.BadParameter(f"got {text!r}, expected NAME=UNIT, as fx=kN or t=ms")
+        return units
+
+    return click.option(
+        "--unit", "units", multiple=True, metavar="NAME=UNIT", callback=parsed,
+        help="Unit of a measured number: fx=kN, x=mm, theta=deg, t=ms; may be repeated.",
+    )(command)  # fmt: skip

@@ -25,12 +25,14 @@ from plow_twin.cli.console import (
     table,
 )
 from plow_twin.cli.scene_facts import damping_unit
+from plow_twin.errors import UnitError
 
 if TYPE_CHECKING:
     from plow_twin.estimate.forces import Forces
     from plow_twin.estimate.measurements import Load
     from plow_twin.estimate.result import Estimate
     from plow_twin.model.scene import Scene
+    from plow_twin.record.measured import Measured
 
 
 @click.command(
@@ -136,6 +138,7 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     from plow_twin.record.measured import read_measured, read_recording
 
     measured = read_measured(source, scene) if folder else read_recording(source, scene, mapping)
+    _check_units(source, measured)
     load, lost_load = Load.of(measured.load[:, 0], measured.load[:, 1:], measured.load_deviation)
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
     gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
@@ -148,6 +151,18 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
         lost += lost_forces
     losses = {"losses": dict(measured.lost)}
     return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost, told, forces), losses))
+
+
+def _check_units(source: Path, measured: Measured) -> None:
+    """Refuse poses that no head can have, and warn of a load that looks as if it were in another unit."""
+    from plow_twin.record.unit_check import unit_doubts
+
+    values = {("excitation", name): measured.load[:, 1 + place] for place, name in enumerate(("fx", "fy", "m"))}
+    values |= {("head_pose", name): measured.poses[:, 1 + place] for place, name in enumerate(("x", "y", "theta"))}
+    for doubt in unit_doubts(values, measured.load[:, 0], measured.scene):
+        if doubt.is_impossible:
+            raise UnitError(f"{source}: {doubt}: convert the file, or state the unit in a mapping (--map)")
+        say_error(f"plow-twin: {source}: {doubt}")
 
 
 def _repeated(source: Path) -> _Task | None:

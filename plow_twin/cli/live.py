@@ -23,6 +23,7 @@ from plow_twin.cli.console import (
     quiet_option,
     say_error,
     show_facts,
+    unit_option,
 )
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.argument("source")
 @click.option("--scene", help="Scene file or preset; else the parameter scene.")
 @click.option("--map", "mapping", type=_FILE, help="YAML that says where load, travel and pose stand, with units.")
+@unit_option
 @click.option("--params", type=_FILE, help="YAML file of parameters, as of the node.")
 @click.option("--set", "given", multiple=True, metavar="NAME=VALUE", help="One parameter; may be repeated.")
 @click.option("--record", type=click.Path(path_type=Path, file_okay=False), help="Folder for the recording.")
@@ -63,7 +65,9 @@ def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | 
     from plow_twin.live.stop import StopSignals
 
     with StopSignals() as stop:
-        return _live(source, stop, options, as_json=as_json, quiet=quiet, lines=lines, seconds=seconds)
+        return _live(
+            source, stop, {**options, "source": source}, as_json=as_json, quiet=quiet, lines=lines, seconds=seconds
+        )
 
 
 def _live(
@@ -103,7 +107,7 @@ def _live(
         def on_error(text: str) -> None:
             say_error(f"plow-twin: {text}")
 
-        front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error)
+        front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error, options["units"])
         stop.interrupt = False
         lost = front.run(lambda: stop.stopped, seconds or float("inf"))
     except StopRequested:
@@ -155,6 +159,10 @@ def _settings(options: dict[str, Any]) -> Settings:
         settings = parameters.settings(values)
     except parameters.ParameterError as error:
         raise click.UsageError(str(error)) from error
+    if not options["scene"] and "scene" not in values:
+        say_error(f"plow-twin: no --scene: the preset {settings.scene} is used, which is not your machine")
+    if settings.estimate and not (options["follow"] or "://" in options["source"] or options["source"] == "-"):
+        say_error("plow-twin: estimate: files that end are read faster than estimates come: plow-twin estimate RUN")
     scene, record = options["scene"] or settings.scene, options["record"] or settings.record_path
     return replace(settings, scene=scene, record_path=str(record))
 

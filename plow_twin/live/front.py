@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
+from plow_twin.errors import UnitError
 from plow_twin.live import diagnostics
 from plow_twin.live.bridge.feeder import Feeder
-from plow_twin.live.bridge.source import Bridge, BridgeError
+from plow_twin.live.bridge.source import BATCH, Bridge, BridgeError
 from plow_twin.live.load_model import read_load_model
 from plow_twin.live.parameters import Settings
 from plow_twin.live.part import Part
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
-from plow_twin.record.mapping import Role, read_map, stamps_by
+from plow_twin.record.mapping import Role, read_map, stamps_by, with_units
 from plow_twin.record.messages import DiagnosticStatus, JointState
+from plow_twin.record.sources import Arrived
+from plow_twin.record.unit_check import CHECKED, check_units
 from plow_twin.stream.outputs import Publication
 from plow_twin.stream.topics import TOPICS
 
@@ -45,6 +49,8 @@ class BridgeFront:
         Receives status and alarms on change, and the diagnostics once a second.
     on_error
         Receives errors in words; may be called from another thread.
+    units
+        Units by name (fx, ..., t) that are not those of the mapping.
 
     Raises
     ------
@@ -62,6 +68,7 @@ class BridgeFront:
         prepared: Prepared,
         say: Say,
         on_error: Callable[[str], None],
+        units: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.name = NAME
         self.topics: Mapping[str, str] = {topic.name: f"/{topic.name}" for topic in TOPICS}
@@ -70,7 +77,14 @@ class BridgeFront:
         self.say_error = on_error
         self._said: Part | None = None
         model = read_load_model(mapping)
-        self.roles = _roles(bridge, mapping, settings.excitation_source, model is not None)
+        self.roles = _roles(bridge, mapping, settings.excitation_source, model is not None, units)
+        bridge.start([role.topic for role in self.roles.values()], stamps_by(self.roles.values()))
+        self._first = list(_first_messages(bridge)) if bridge.ends else []
+        try:
+            check_units(self._first, self.roles, prepared.scene, "input")
+        except UnitError:
+            bridge.close()
+            raise
         self._connected = {"excitation" if name == "drive" else name for name in self.roles}
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, model if "drive" in self.roles else None)
@@ -116,17 +130,25 @@ class BridgeFront:
         runtime, bridge = self.runtime, self._bridge
         lost: list[str] = []
         try:
-            bridge.start([role.topic for role in self.roles.values()], stamps_by(self.roles.values()))
-            first = bridge.poll(0.0) if bridge.ends else []
-            self._feeder.begin(first)
+            self._feeder.begin(self._first)
             runtime.start()
             runtime.activate()
-            self._feeder.take(first)
             self._loop(stop_asked, time.monotonic() + seconds)
         finally:
             bridge.close()
             lost = runtime.close()
-        return lost
+        return [*self._not_read(stop_asked()), *lost]
+
+    def _not_read(self, stopped: bool) -> list[str]:
+        """Return, in words, the input that never came or was left unread."""
+        if self._settings.excitation_source != "excitation":
+            return []
+        intake, topic = self.runtime.driver.intake, self.roles[_load_role(self.roles)].topic
+        if not sum(intake.counts.values()):
+            return [f"no sample came on {topic}"]
+        if stopped and self._bridge.ends and (self._first or not self._bridge.finished):
+            return [f"stopped before the end of {topic}"]
+        return []
 
     def parts(self) -> dict[str, Part]:
         """Return the diagnostics by part."""
@@ -135,9 +157,9 @@ class BridgeFront:
     def _loop(self, stop_asked: Callable[[], bool], give_up: float) -> None:
         inputs, bridge, trouble = self.runtime.inputs, self._bridge, ""
         periodic = [Timer(1.0 / rate, do) for rate, do in self.runtime.periodic()] + [Timer(_REPORT_S, self._report)]
-        while not (stop_asked() or bridge.finished) and time.monotonic() < give_up:
+        while not stop_asked() and (self._first or not bridge.finished) and time.monotonic() < give_up:
             next_due = min(timer.due for timer in periodic)
-            messages = bridge.poll(max(0.0, min(_POLL_S, next_due - time.monotonic())))
+            messages = self._messages(max(0.0, min(_POLL_S, next_due - time.monotonic())))
             inputs.lost = bridge.lost
             if bridge.trouble != trouble:
                 trouble = bridge.trouble
@@ -153,13 +175,34 @@ class BridgeFront:
             self.runtime.publish_due()
         self.changed()
 
+    def _messages(self, timeout_s: float) -> list[Arrived]:
+        """Return the next messages: first those that the check of units has read already."""
+        if not self._first:
+            return self._bridge.poll(timeout_s)
+        messages, self._first = self._first[:BATCH], self._first[BATCH:]
+        return messages
+
     def _report(self) -> None:
         self.changed()
         for name, part in self.parts().items():
             self._say(name, part)
 
 
-def _roles(bridge: Bridge, mapping: Path | None, source: str, modelled: bool) -> dict[str, Role]:
+def _load_role(roles: Mapping[str, Role]) -> str:
+    return "drive" if "drive" in roles else "excitation"
+
+
+def _first_messages(bridge: Bridge) -> Iterator[Arrived]:
+    """Yield the messages that the check of units looks at."""
+    count = 0
+    while count < CHECKED and (found := bridge.poll(0.0)):
+        count += len(found)
+        yield from found
+
+
+def _roles(
+    bridge: Bridge, mapping: Path | None, source: str, modelled: bool, units: Mapping[str, str]
+) -> dict[str, Role]:
     """Return the roles that the twin takes."""
     if source == "tool_forces":
         raise BridgeError("excitation_source: got 'tool_forces', expected 'excitation' or 'scene' without ROS")
@@ -173,7 +216,7 @@ def _roles(bridge: Bridge, mapping: Path | None, source: str, modelled: bool) ->
         # whatever stands there: it may be no text at all
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
         raise BridgeError(f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m")
-    return roles
+    return with_units(roles, units)
 
 
 _TAKEN: Final = ("excitation", "drive", "travel", "head_pose", "gaps")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -111,6 +111,8 @@ class Role:
     stamp_unit: str = "s"
     clock_offset_ns: int = 0
     sequence: str = ""
+    #: whether somebody has stated `stamp_unit`
+    stamp_unit_is_stated: bool = False
 
     def read(self, arrived: Arrived) -> tuple[int, dict[str, float]] | None:
         """Return stamp [ns] and numbers (NaN where the field is empty), or None when the message does not fit."""
@@ -336,6 +338,7 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, TopicType] | N
         _choice(path, role, "stamp_unit", entry.get("stamp_unit", "s"), STAMP_UNITS),
         round(_clock_offset(path, role, entry.get("clock_offset", 0.0)) * 1e9),
         sequence,
+        "stamp_unit" in entry,
     )
     _check_columns(path, role, found)
     if "stamp_unit" in entry:
@@ -343,6 +346,33 @@ def _role(path: Path, role: str, entry: Any, topics: Mapping[str, TopicType] | N
     if not isinstance(kind, Columns) and kind != "json" and stamp not in ("header", "log"):
         raise RecordingError(f"{path}: {role}: stamp: got {stamp!r}, expected header or log for {kind}")
     return found
+
+
+def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:
+    """Return roles whose numbers of these names (fx, x, ..., or t for stamps) are in these units.
+
+    Raises
+    ------
+    RecordingError
+        No role has a number of that name, or the unit measures something else.
+    """
+    changed = dict(roles)
+    for name, unit in units.items():
+        if name == "t":
+            if unit not in STAMP_UNITS:
+                raise RecordingError(f"unit of t: got {unit!r}, expected one of {', '.join(STAMP_UNITS)}")
+            changed = {key: replace(role, stamp_unit=unit, stamp_unit_is_stated=True) for key, role in changed.items()}
+            continue
+        having = [key for key, role in roles.items() if name in role.fields]
+        if not having:
+            there = sorted({field for role in roles.values() for field in role.fields} | {"t"})
+            raise RecordingError(f"unit of {name}: got an unknown name, expected one of {', '.join(there)}")
+        for key in having:
+            known = UNITS[_QUANTITIES[key, name]]
+            if unit not in known:
+                raise RecordingError(f"unit of {name}: got {unit!r}, expected one of {', '.join(known)}")
+            changed[key] = replace(changed[key], factor={**changed[key].factor, name: known[unit]})
+    return changed
 
 
 def _check_columns(path: Path, name: str, role: Role) -> None:

@@ -22,7 +22,7 @@ from plow_twin.record.chunks import MAGIC, Channel, ChunkReader, is_begun, is_mc
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.metadata_yaml import missing_files
 from plow_twin.record.reader import part_number, run_parts
-from plow_twin.record.times import NO_TIME, STAMP_UNITS, TIMES, time_ns
+from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
 from plow_twin.scene_file.csv_rows import csv_rows, open_csv
 
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
@@ -41,10 +41,10 @@ class Columns:
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the names as a reader may tell them apart, whatever is in them."""
-        return "columns " + ", ".join(
-            ascii(name) if "," in name or not name.isprintable() else name for name in self.names
-        )
+        """Return the names as a reader may tell them apart, whatever is in them; numbers are hardly names."""
+        names = ", ".join(ascii(name) if "," in name or not name.isprintable() else name for name in self.names)
+        numbers = bool(self.names) and all(NUMBER.fullmatch(name.strip()) for name in self.names)
+        return f"columns {names}" + (" (no header row?)" if numbers else "")
 
 
 #: The name of a ROS type, `json`, or columns.
@@ -413,10 +413,11 @@ def columns_of(source: Path | str, names: Sequence[str]) -> Columns:
     RecordingError
         A column's name stands twice.
     """
+    columns = Columns(tuple(names))
     twice = [name for name, count in Counter(names).items() if name and count > 1]
     if twice:
-        raise RecordingError(f"{source}: column {twice[0]!r} stands there more than once, expected one of a name")
-    return Columns(tuple(names))
+        raise RecordingError(f"{source}: column {twice[0]!r} stands more than once in the {columns}, expected once")
+    return columns
 
 
 def _log_time_ns(arrived: Arrived) -> int | None:

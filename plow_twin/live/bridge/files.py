@@ -12,15 +12,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-from plow_twin.live.bridge.source import BridgeError, Lines, Rows
+from plow_twin.live.bridge.source import BATCH, BridgeError, Lines, Rows
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType
 from plow_twin.record.times import NO_TIME
 
 #: Most bytes read from a source at once.
 _BLOCK: Final = 1 << 18
-#: Most messages handed over at once.
-_BATCH: Final = 256
 #: Bytes by which a file is known again.
 _REMEMBERED: Final = 256
 #: A followed file is looked at that often [s].
@@ -154,7 +152,7 @@ class Files:
     def poll(self, timeout_s: float) -> list[Arrived]:
         """Return the next messages."""
         if self._merged is not None:
-            found = list(islice(self._merged, _BATCH))
+            found = list(islice(self._merged, BATCH))
             self.finished = not found
             return found
         give_up = time.monotonic() + timeout_s

@@ -12,6 +12,8 @@ from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of
 from plow_twin.scene_file.csv_rows import delimiter_of
 
+#: Most messages that a source hands over at once.
+BATCH: Final = 256
 #: A longer line or payload is none of a sensor's [B].
 LONGEST: Final = 65536
 

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -19,9 +20,10 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.bag import beside_folders, readable_beside
 from plow_twin.record.follow import Tail
 from plow_twin.record.importing import Feed
-from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source
+from plow_twin.record.mapping import UNFIT, Role, messages_of, read_map, readings, roles_by_source, with_units
 from plow_twin.record.reader import FileStatus, RunReader, own_run
 from plow_twin.record.sources import open_source, packed
+from plow_twin.record.unit_check import check_units
 from plow_twin.record.walking import JournalWalk, Walked, Walker
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
@@ -272,6 +274,7 @@ def analyse(
     *,
     scene: Path | None = None,
     mapping: Path | None = None,
+    units: Mapping[str, str] = MappingProxyType({}),
     others: Sequence[Path] = (),
     out: Path | None = None,
     on_progress: OnProgress | None = None,
@@ -288,6 +291,8 @@ def analyse(
         Scene file or preset; needed for other recordings (or `scene.yaml` beside them), else that of the run.
     mapping
         YAML that says which topic is what.
+    units
+        Units by name (fx, x, ..., t) that are not those of the mapping; for another recording only.
     others
         Further scenes to predict with.
     out
@@ -299,7 +304,7 @@ def analyse(
     Raises
     ------
     RecordingError, SceneError
-        The recording, the mapping or a scene cannot be used.
+        The recording, the mapping or a scene cannot be used; `UnitError`: a unit looks wrong.
     """
     begin = time.perf_counter()
     if not path.exists():
@@ -321,9 +326,11 @@ def analyse(
         predictions.append(Prediction(str(other), with_scene, LoadTotals(with_scene)))
     measured = Measured()
     if reader is not None:
+        if units:
+            raise RecordingError(f"{path}: got units, expected none: a run of plow_twin is in SI")
         found = _walk_own(reader, path, mapping, predictions, on_progress, on_caught_up)
     else:
-        found = _walk_other(path, mapping, predictions, measured, out)
+        found = _walk_other(path, mapping, units, predictions, measured, out)
     found.wall_s = time.perf_counter() - begin
     return found
 
@@ -406,15 +413,21 @@ def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measu
 
 
 def _walk_other(
-    path: Path, mapping: Path | None, predictions: list[Prediction], measured: Measured, out: Path | None
+    path: Path,
+    mapping: Path | None,
+    units: Mapping[str, str],
+    predictions: list[Prediction],
+    measured: Measured,
+    out: Path | None,
 ) -> Analysis:
     source = open_source(path)
-    roles = read_map(mapping, source.topics())
+    roles = with_units(read_map(mapping, source.topics()), units)
     if "excitation" not in roles:
         found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(source.topics().items())) or "no topic"
         raise RecordingError(
             f"{path}: excitation: got {found}, expected a topic with the load, or a mapping that says it"
         )
+    check_units(messages_of(open_source(path), roles), roles, predictions[0].scene, path)
     writer = _writer(out, predictions[0].scene, roles) if out is not None else None
     walkers = [
         Walker(_session(prediction.scene, _TOLERANCE), prediction.walked, writer if number == 0 else None)

@@ -7,8 +7,8 @@ import json
 import re
 import shutil
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -57,6 +57,8 @@ class Task:
     out: Path | None
     #: what the recording's folder holds besides, which is said in the results
     left_out: tuple[Path, ...] = ()
+    #: units of measured numbers by name, beside those of the mapping
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def stored(self) -> dict[str, Any] | None:
         """Return the facts of this very analysis when its files are there, whole."""
@@ -123,6 +125,7 @@ class Task:
             self.path,
             scene=self.scene,
             mapping=self.mapping,
+            units=self.units,
             others=self.others,
             out=self.out,
             on_progress=on_progress,
@@ -144,6 +147,7 @@ class Task:
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,
             "map": None if self.mapping is None else _state(self.mapping, None),
+            "units": dict(self.units),
             "with": [_scene_state(other) for other in self.others],
             "version": package_version(),
         }

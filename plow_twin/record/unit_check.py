@@ -1,0 +1,167 @@
+"""Wrong units in measured data: magnitude and rate tell them, where a mapping states no unit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import UnitError
+from plow_twin.model.loads import compile_loads
+from plow_twin.model.scene import Scene
+from plow_twin.record.mapping import Role, readings
+from plow_twin.record.sources import Arrived
+
+Array = NDArray[np.float64]
+
+#: Messages that are looked at: 20 s at 1 kHz hold several periods of a load.
+CHECKED: Final = 20_000
+#: A machine that idles draws more than the hundredth part of the scene's largest force; the thousandth is the same in
+#: kN; what is below the ten-thousandth is neither.
+_IDLE_SHARE: Final = 1e-2
+_BROKEN_SHARE: Final = 1e-4
+#: An angle beyond this [rad] leaves the model, which ends at 45 degrees.
+_LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
+#: Stamps further apart than this [s] cannot follow a load that changes smoothly from one to the next.
+_SLOW_S: Final = 0.5
+#: A load is smooth when it changes by less than this share of its range between two samples, in the median.
+_SMOOTH: Final = 0.05
+#: Fewer samples tell nothing of their spacing.
+_FEW: Final = 20
+#: Stamps beyond this are dates: 1e9 s is in the year 2001.
+_DATES_S: Final = 1e9
+
+
+@dataclass(frozen=True)
+class UnitDoubt:
+    """Numbers of a role that look as if they were in another unit; the stamps of the load are `t`.
+
+    `found` and `expected` say why, `likely` is the unit that they look like. `is_impossible`: no head can move so.
+    """
+
+    role: str
+    names: tuple[str, ...]
+    found: str
+    expected: str
+    likely: str
+    is_impossible: bool = False
+
+    def __str__(self) -> str:
+        return f"{', '.join(self.names)}: got {self.found}, expected {self.expected}; they look like {self.likely}"
+
+    @property
+    def remedy(self) -> str:
+        """How to state the unit."""
+        return "state the unit: " + " ".join(f"--unit {name}={self.likely}" for name in self.names)
+
+
+def unit_doubts(
+    values: Mapping[tuple[str, str], Sequence[float] | Array], load_stamps_s: Sequence[float] | Array, scene: Scene
+) -> list[UnitDoubt]:
+    """Return the numbers that look as if they were in another unit than SI.
+
+    Parameters
+    ----------
+    values
+        Measured numbers by role and name, as ("excitation", "fx") or ("head_pose", "theta"); NaN where none came.
+    load_stamps_s
+        Stamps of the load [s].
+    scene
+        Its loads and sizes say which magnitudes are plausible.
+    """
+    magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
+    load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]
+    spacing = _spacing(np.asarray(load_stamps_s, float), np.array(load, float).T) if load else []
+    return [*_load(magnitudes, scene), *_pose(magnitudes, scene), *spacing]
+
+
+def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: Scene, source: object) -> None:
+    """Refuse a recording whose numbers look as if they were in another unit.
+
+    Numbers whose unit, scale or limits the mapping states are believed. The first 20,000 messages are looked at.
+
+    Raises
+    ------
+    UnitError
+        It names the numbers, their values, and how to state the unit.
+    """
+    stamps: list[float] = []
+    values: dict[tuple[str, str], list[float]] = {}
+    for role, _, reading in readings(islice(messages, CHECKED), roles):
+        if reading is not None:
+            if role == "excitation":
+                stamps.append(reading[0] * 1e-9)
+            for name, value in reading[1].items():
+                values.setdefault((role, name), []).append(value)
+    load = roles.get("excitation")
+    doubts = [
+        doubt
+        for doubt in unit_doubts(values, stamps, scene)
+        if not (load and load.stamp_unit_is_stated if doubt.names == ("t",) else _stated(doubt, roles))
+    ]
+    if doubts:
+        raise UnitError(f"{source}: " + "; ".join(f"{doubt}: {doubt.remedy}" for doubt in doubts))
+
+
+def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
+    """Tell whether the mapping states how each of the numbers is to be read."""
+    role = roles[doubt.role]
+    return set(doubt.names) <= {*role.factor, *role.scale, *role.limits}
+
+
+def _usual_magnitude(values: Array) -> float:
+    """Return the magnitude that one value in a hundred exceeds: an outlier tells nothing of the unit."""
+    known = np.abs(values)[np.isfinite(values)]
+    return float(np.percentile(known, 99.0)) if known.size else 0.0
+
+
+def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
+    """Doubt the forces together: one component alone may well be small."""
+    found = [magnitudes[key] for key in (("excitation", "fx"), ("excitation", "fy")) if key in magnitudes]
+    usual = _largest_force(scene)
+    largest = max(found, default=0.0)
+    if not _BROKEN_SHARE * usual < largest < _IDLE_SHARE * usual:
+        return []
+    return [UnitDoubt("excitation", ("fx", "fy"), f"{largest:.3g}", f"some {usual:.2g} N as in the scene", "kN")]
+
+
+def _pose(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
+    doubts = []
+    half = 0.5 * max(scene.frame.width_m, scene.frame.height_m)
+    for (role, name), largest in magnitudes.items():
+        if role == "head_pose" and name == "theta":
+            if _LARGEST_ANGLE_RAD < largest < np.degrees(_LARGEST_ANGLE_RAD):
+                expected = f"less than {_LARGEST_ANGLE_RAD:.3g} rad"
+                doubts.append(UnitDoubt(role, (name,), f"{largest:.3g}", expected, "deg", True))
+        elif role in ("head_pose", "gaps") and half < largest < 1e3 * half:
+            expected = f"less than half the frame, {half:.3g} m"
+            doubts.append(UnitDoubt(role, (name,), f"{largest:.3g}", expected, "mm", True))
+    return doubts
+
+
+def _largest_force(scene: Scene) -> float:
+    """Return the largest force [N] of the scene's loads, or the head's weight where that is larger."""
+    loads = compile_loads(scene.loads)
+    amplitude = np.abs(loads.constant) + np.hypot(loads.sine, loads.cosine).sum(axis=0)
+    if loads.pieces is not None:
+        amplitude = amplitude + np.abs(loads.pieces.start).max(axis=0)
+    return max(float(amplitude[:2].max()), scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2))
+
+
+def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
+    """Doubt stamps that are far apart for a load (n, k) that changes smoothly from one to the next."""
+    if len(stamps_s) < _FEW or stamps_s.max() > _DATES_S:
+        return []
+    spacing = float(np.median(np.abs(np.diff(stamps_s))))
+    span = np.ptp(load, axis=0)
+    if spacing < _SLOW_S or not span.any():
+        return []
+    change = np.median(np.abs(np.diff(load[:, span > 0.0], axis=0)), axis=0) / span[span > 0.0]
+    if not float(change.max()) < _SMOOTH:
+        return []
+    found = f"stamps {spacing:.4g} s apart"
+    return [UnitDoubt("excitation", ("t",), found, "many in a period of a load that changes so smoothly", "ms")]

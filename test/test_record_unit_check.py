@@ -1,0 +1,100 @@
+"""A wrong unit is caught by magnitude and rate, and named; a stated unit and an unusual machine pass."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from plow_twin.cli.app import run as cli
+from plow_twin.record.unit_check import unit_doubts
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
+
+SCENE = load_scene(scene_path("paper"))
+TIMES = np.arange(4000) * 1e-3
+LOAD = np.sin(2.0 * TIMES)[:, None] * [32e3, -11e3, -45e3]
+POSE = np.cos(2.0 * TIMES)[:, None] * [0.012, 0.014, 0.15]
+
+
+def _write(path: Path, scale: dict[str, float]) -> Path:
+    names = ("t", "fx", "fy", "m", "x", "y", "theta")
+    rows = np.column_stack((TIMES, LOAD, POSE)) * [scale.get(name, 1.0) for name in names]
+    np.savetxt(path, rows, "%.9g", ",", header=",".join(names), comments="")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("scale", "options"),
+    [
+        ({"fx": 1e-3, "fy": 1e-3, "m": 1e-3}, ["fx=kN", "fy=kN"]),
+        ({"t": 1e3}, ["t=ms"]),
+        ({"x": 1e3, "y": 1e3}, ["x=mm", "y=mm"]),
+        ({"theta": 180.0 / np.pi}, ["theta=deg"]),
+    ],
+)
+@pytest.mark.parametrize("verb", ["live", "analyse"])
+def test_a_wrong_unit_is_refused_with_the_option_that_states_it(
+    verb: str, scale: dict[str, float], options: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = _write(tmp_path / "load.csv", scale)
+    (tmp_path / "map.yaml").write_text("excitation: {topic: load}\nhead_pose: {topic: load}\n")
+    command = [verb, str(path), "--map", str(tmp_path / "map.yaml"), "--scene", "paper", "--quiet"]
+    record = ["--record", str(tmp_path / "run")] if verb == "live" else []
+    assert cli([*command, *record]) == 2
+    said = capsys.readouterr().err
+    stated = [part for option in options for part in ("--unit", option)]
+    for option in options:
+        assert f"--unit {option}" in said
+    assert not (tmp_path / "run").exists()  # a refused start leaves no empty run
+    more = ["--unit", "m=kN m"] if options[0] == "fx=kN" else []
+    assert cli([*command, *stated, *more]) == 0
+
+
+def test_an_estimate_refuses_millimetres_for_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "scene.yaml").write_text(scene_path("paper").read_text())
+    np.savetxt(tmp_path / "load.csv", np.column_stack((TIMES, LOAD)), "%.9g", ",", header="t,fx,fy,m", comments="")
+    pose = np.column_stack((TIMES, POSE * [1e3, 1e3, 1.0]))
+    np.savetxt(tmp_path / "pose.csv", pose, "%.9g", ",", header="t,x,y,theta", comments="")
+    assert cli(["estimate", str(tmp_path)]) == 2
+    assert "x: got 12, expected less than half the frame, 0.165 m; they look like mm" in capsys.readouterr().err
+
+
+def test_an_unknown_name_and_a_unit_of_another_quantity_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = _write(tmp_path / "load.csv", {})
+    for option, expected in (
+        ("fz=kN", "unit of fz: got an unknown name, expected one of fx, fy, m, t, theta, x, y"),
+        ("fx=mm", "unit of fx: got 'mm', expected one of N, kN, MN"),
+        ("t=min", "unit of t: got 'min', expected one of"),
+        ("fx", "got 'fx', expected NAME=UNIT"),
+    ):
+        assert cli(["live", str(path), "--unit", option, "--quiet"]) != 0
+        assert expected in capsys.readouterr().err
+
+
+@given(
+    share=st.floats(0.02, 5.0),
+    rate=st.sampled_from([2.0, 10.0, 100.0, 1000.0]),
+    pose=st.floats(1e-4, 0.12),
+    offset_s=st.sampled_from([0.0, 1.7e9]),
+)
+def test_measurements_in_si_pass(share: float, rate: float, pose: float, offset_s: float) -> None:
+    times = np.arange(2000) / rate
+    phase = np.sin(2.0 * times)
+    values = {("excitation", name): share * phase * size for name, size in (("fx", 32e3), ("fy", 1.0), ("m", 45e3))}
+    values |= {("head_pose", name): pose * phase for name in ("x", "y", "theta")}
+    assert unit_doubts(values, offset_s + times, SCENE) == []
+
+
+def test_a_load_of_one_sample_a_second_in_dates_or_with_changes_is_believed() -> None:
+    times = np.arange(600.0)
+    load = {("excitation", "fx"): 32e3 * np.sin(2.0 * times)}
+    assert unit_doubts(load, times, SCENE) == []
+    slow = {("excitation", "fx"): 32e3 * np.sin(0.01 * times)}
+    assert unit_doubts(slow, 1.7e9 + times, SCENE) == []
+    assert [doubt.likely for doubt in unit_doubts(slow, times, SCENE)] == ["ms"]
