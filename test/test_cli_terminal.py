@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import re
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -146,3 +148,9 @@ def test_progress_has_a_rate_and_the_time_left(monkeypatch: pytest.MonkeyPatch) 
             on_progress(share)
     last = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", text.getvalue()).replace("\r", "\n").strip().splitlines()[-1]
     assert re.search(r" 30% [0-9.e+]+ %/s +[0-9:]+ [-0-9:]+$", last.rstrip()), last
+
+
+def test_the_help_of_the_node_starts_no_node() -> None:
+    code = "import sys; sys.modules['rclpy'] = None; from plow_twin.ros.main import main; main(['--help'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0 and "--ros-args" in done.stdout

@@ -222,7 +222,7 @@ def test_what_lies_along_the_face_what_was_measured_and_what_if(tmp_path: Path) 
     assert len(same) == COUNT and np.abs(other - largest).max() > 10.0
     # the bars at the corners of the frame, and their depths in words
     depths = tables["/exaggerated/pads/wear"]["Points2D:labels"].to_pylist()[-1]
-    assert len(depths) == 8 and all(depth.endswith(" um") for depth in depths)
+    assert len(depths) == 8 and all(depth.endswith(" µm") for depth in depths)
     for group in ("clearance", "growth"):
         band, low, high = (
             scalars(tables[f"/{group}/{part}"]) for part in ("band/vertical", "vertical/p05", "vertical/p95")

@@ -27,13 +27,17 @@ SIZE = (1400, 900)
 MENU = 37
 
 
-def start_viewer(port: int) -> subprocess.Popen[bytes]:
-    """Start a viewer without a window that only this machine can reach."""
+def start_viewer(port: int, home: Path) -> subprocess.Popen[bytes]:
+    """Start a viewer without a window that only this machine can reach; its settings lie in a `home` of its own."""
     rerun = Path(sys.executable).with_name("rerun")
-    subprocess.run([rerun, "analytics", "disable"], check=True, capture_output=True)
+    settings = {name: str(home) for name in ("HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME")}
+    environment = {**os.environ, **settings}
+    subprocess.run([rerun, "analytics", "disable"], check=True, capture_output=True, env=environment)
     window = f"{SIZE[0]}x{SIZE[1]}"
     command = [str(rerun), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", window]
-    return subprocess.Popen(command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return subprocess.Popen(
+        command, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment
+    )
 
 
 def connect(port: int, patience_s: float = 60.0) -> ViewerClient:
@@ -81,7 +85,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         rrd, shot = Path(folder) / "run.rrd", Path(folder) / "shot.png"
         to_rrd(options.run, rrd, others={Path(file).stem: load_scene(scene_path(file)) for file in options.others})
-        viewer = start_viewer(port)
+        viewer = start_viewer(port, Path(folder))
         try:
             client = connect(port)
             client.open(str(rrd))

@@ -149,7 +149,8 @@ def _serve(file: Path, port: int) -> int:
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
     # in the place of this process: whoever stops it stops the server
-    os.execv(program, [*command, "--web-viewer-port", str(port)])
+    # without the program's own lines: its address opens the light theme, on which labels cannot be read
+    os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
 
 def _follow(

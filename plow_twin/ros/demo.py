@@ -311,7 +311,7 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
         console.print(f"contact sets {sense}: {sets or 'none'}", highlight=False, soft_wrap=True)
     _print_clearances(console, summary)
     wear = (
-        "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e6:.3f} um, deepest pad"
+        "off in this scene" if summary.scene.wear is None else f"{summary.wear_depth.max() * 1e6:.3f} µm, deepest pad"
     )
     console.print(f"wear {wear}", highlight=False)
     used, out = watch.text("input", "samples_used"), watch.text("output", "published")

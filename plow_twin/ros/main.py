@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
@@ -28,6 +29,7 @@ def make_executor() -> Executor:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until it is asked to stop; return 0, or 2 when its arguments or parameters cannot be used."""
+    _parser().parse_known_args(arguments)
     stop = StopSignals()
     try:
         return _run(arguments, stop)
@@ -35,6 +37,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     finally:
         stop.ignore()
+
+
+def _parser() -> argparse.ArgumentParser:
+    """Return the parser of `--help`; all other arguments are ROS 2's."""
+    return argparse.ArgumentParser(
+        "twin",
+        usage="twin [--help] [--ros-args -p NAME:=VALUE ... --params-file FILE -r FROM:=TO ...]",
+        description="Run the twin as a ROS 2 lifecycle node until SIGINT or SIGTERM.",
+        epilog="Parameters with units and ranges: config/twin.yaml. Exit codes: 0 stopped, 2 wrong arguments.",
+        allow_abbrev=False,
+    )
 
 
 def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:

@@ -330,7 +330,7 @@ class Drawing:
             if depth_mm[row].any():
                 middles, halves, places = self.section.pads(depth_mm[row])
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
-                labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} um" for depth in depth_mm[row]]
+                labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} µm" for depth in depth_mm[row]]
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
             elif self._worn:  # the pads are new ones
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=[], half_sizes=[])

@@ -96,7 +96,7 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb
         _plot("load", "Load on the head"),
         rrb.Tabs(
             *([_plot("what_if", "What if: largest force [kN]")] if what_if else []),
-            _plot("growth", "Growth by wear [um]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
+            _plot("growth", "Growth by wear [µm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             _plot("clearance", "Clearance [mm]", contents=_WITHOUT_BOUNDS),
             _plot("residual", "Residual"),
             _plot("penetration", "Penetration [mm]"),
@@ -204,7 +204,7 @@ Where a corner of the frame meets a wall of the cavity, an arrow shows the force
 - force along the face: the largest in each piece, the newest pass bright; residual: measured pose less the model's
 - timelines: `{ROS_TIME}` is the stamp, `{RUN_TIME}` the time since the first one, `{STEP}` counts the advances
 - beside it the same with the clearance drawn several times as wide; walls that touch are orange; bars inside the frame
-  are the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each um
+  are the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each µm
 
 | | |
 |---|---|
