@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -28,8 +29,14 @@ def resident_mb(pid: int) -> float:
 
 def main() -> None:
     file, at_s = Path(sys.argv[1]).resolve(), float(sys.argv[2])
+    with tempfile.TemporaryDirectory() as home:
+        measure(file, at_s, Path(home))
+
+
+def measure(file: Path, at_s: float, home: Path) -> None:
+    """Open the file in a viewer whose settings lie in `home`, and print times and memory."""
     port = free_port()
-    viewer = start_viewer(port)
+    viewer = start_viewer(port, home)
     try:
         client = connect(port)
         time.sleep(2.0)
