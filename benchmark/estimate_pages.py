@@ -98,19 +98,6 @@ def coverage(held: Sequence[bool]) -> str:
     return f"{count / total:.2f} ({low:.2f} to {high:.2f})"
 
 
-def commands() -> str:
-    """Return the calls that run these truths again."""
-    calls: dict[tuple[int, int], list[str]] = {}
-    for group, seeds in TRUTHS.items():
-        for first, count in seeds:
-            calls.setdefault((first, count), []).append(group)
-    lines = []
-    for (first, count), groups in calls.items():
-        named = " ".join(f"--group {group}" for group in groups)
-        lines.append(f"python benchmark/estimate.py {named} --truths {count} --seed {first}")
-    return "\n".join(["```", *lines, "```"])
-
-
 def filter_table(rows: Sequence[dict[str, Any]]) -> str:
     """Return errors and coverage of the two filters, by group."""
     lines = ["| group | filter | truths | RMSE gx, gy [mm] | coverage gx, gy | CPU [s] |", "|---|---|---|---|---|---|"]
@@ -133,5 +120,5 @@ def filters() -> str:
 
 
 FIGURES: dict[str, Callable[[], str]] = {
-    "right_models": right_models, "wrong_models": wrong_models, "estimate_commands": commands, "filters": filters,
+    "right_models": right_models, "wrong_models": wrong_models, "filters": filters,
 }  # fmt: skip

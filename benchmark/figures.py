@@ -122,9 +122,35 @@ def month_table() -> str:
     return "\n".join(head + [f"| {1e-3 * day:g} {own[2]}" for day, own in zip(days, tables, strict=True)])
 
 
+def siconos() -> str:
+    """Return the slider of the literature beside this solver: two references of Siconos."""
+    with (RESULTS / "siconos.csv").open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["quantity"] != "largest gap function error"]
+    names = [name for name in dict.fromkeys(row["reference"] for row in rows) if " against " not in name]
+    head = ["quantity"]
+    for name in names:
+        head += [f"Siconos, {name.removeprefix('MoreauJean').removesuffix('OSI')}", "plow_twin"]
+    lines = []
+    for quantity in dict.fromkeys(row["quantity"] for row in rows):
+        line = [quantity]
+        for row in (row for name in names for row in rows if (row["reference"], row["quantity"]) == (name, quantity)):
+            difference = row["unit"] == "clearance"
+            line += (
+                ["", f"{float(row['ours']):.2f}"] if difference else [_in_unit(row, key) for key in ("theirs", "ours")]
+            )
+        lines.append(line)
+    return table(head, lines)
+
+
+def _in_unit(row: dict[str, str], key: str) -> str:
+    milli = {"s": "ms", "N s": "mN s"}[row["unit"]]
+    return f"{1e3 * float(row[key]):.3g} {milli}"
+
+
 FIGURES: dict[str, Callable[[], str]] = {
     "speed": speed, "located": located, "work": work, "missed": missed,
-    "random_scenes": random_scenes, "lives": life_table, "month": month_table, **estimate_pages.FIGURES,
+    "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "month": month_table,
+    **estimate_pages.FIGURES,
     **{name: stored(name) for name in ("live_node", "replay", "estimate_forces", "estimate_scales", "estimate_live")},
 }  # fmt: skip
 
