@@ -42,6 +42,7 @@ EXTRAS["dev"] = [
     "types-jsonschema",
     "build",
     "colcon-common-extensions",
+    "pandas>=2",
     "psutil",
 ]
 

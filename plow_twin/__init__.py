@@ -33,6 +33,8 @@ if _TYPE_CHECKING:
     from plow_twin.model.scene import Support as Support
     from plow_twin.model.scene import Table as Table
     from plow_twin.model.scene import Wear as Wear
+    from plow_twin.record.recording import Recording as Recording
+    from plow_twin.record.recording import read_recording as read_recording
     from plow_twin.run.advance import Advance as Advance
     from plow_twin.run.advance import AdvanceBatch as AdvanceBatch
     from plow_twin.run.advance import AdvanceSeries as AdvanceSeries
@@ -83,6 +85,7 @@ _NAMES = {
         "Table",
         "Wear",
     ),
+    "plow_twin.record.recording": ("Recording", "read_recording"),
     "plow_twin.run.advance": ("Advance", "AdvanceBatch", "AdvanceSeries"),
     "plow_twin.run.batch": ("TwinBatch",),
     "plow_twin.run.energy_balance": ("EnergyBalance",),
@@ -94,8 +97,8 @@ _NAMES = {
     "plow_twin.scene_file": ("dump_scene", "load_scene"),
 }
 _HOMES = {name: module for module, names in _NAMES.items() for name in names}
-#: For a star: names that `__getattr__` finds are not in the module before.
-__all__ = [*_HOMES]
+#: For a star import, which must work without the libraries of recordings.
+__all__ = [name for name, module in _HOMES.items() if not module.startswith("plow_twin.record")]
 
 
 def __getattr__(name: str) -> object:

@@ -17,6 +17,7 @@ from plow_twin.cli.console import FAILED, WRONG_INPUT, say_error
 from plow_twin.cli.demo import demo
 from plow_twin.cli.doctor import doctor
 from plow_twin.cli.estimate import estimate
+from plow_twin.cli.export import export
 from plow_twin.cli.forecast import forecast
 from plow_twin.cli.info import info
 from plow_twin.cli.live import live
@@ -46,6 +47,7 @@ EXTRA_OF_MODULE: Final = {
     "rerun": "view",
     "rainflow": "study",
     "matplotlib": "study",
+    "pandas": "study",
     "pyarrow": "study",
     "jinja2": "study",
     "distributed": "dask",
@@ -61,7 +63,7 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, live, estimate, forecast, record, replay, analyse, doctor, view, info, study):
+for _verb in (simulate, demo, live, estimate, forecast, record, replay, analyse, export, doctor, view, info, study):
     commands.add_command(_verb)
 
 

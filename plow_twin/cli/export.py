@@ -1,0 +1,36 @@
+"""`plow-twin export`: a recording as CSV, Parquet or NPZ."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, busy, counts, output_console, quiet_option, say_error, table
+
+
+@click.command(
+    short_help="Write a recording as CSV, Parquet or NPZ.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, and the recording lacks something.",
+)
+@click.argument("recording", metavar="RUN", type=click.Path(path_type=Path, exists=True))
+@click.option("--to", "kind", type=click.Choice(["csv", "parquet", "npz"]), required=True, help="Format.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder (csv, parquet) or file (npz).")
+@quiet_option
+def export(recording: Path, kind: str, out: Path, quiet: bool) -> int:
+    """Write load, measured poses, forces, peaks, motion, clearances and wear rates of RUN as tables in SI."""
+    from plow_twin.record.recording import export as write
+    from plow_twin.record.recording import read_recording
+
+    opened = read_recording(recording)
+    with busy("exporting", quiet):
+        rows = write(opened, kind, out)
+    if not quiet:
+        shown = table(str(out), "table", "rows", "columns")
+        for name, count in rows.items():
+            shown.add_row(name, str(count), str(len(opened[name].columns)))
+        output_console().print(shown)
+    lost = opened.losses()
+    if lost:
+        say_error(f"plow-twin: {recording}: lost {counts(lost)}")
+    return DONE_WITH_LOSS if lost else DONE

@@ -1,0 +1,271 @@
+"""A recording as tables of numbers: for numpy, pandas and Arrow, batch by batch or whole."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import RecordingError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.scene import Scene
+from plow_twin.record.entries import Batch
+from plow_twin.record.header import RunHeader
+from plow_twin.record.outputs import publication_templates
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.stream.journal import PartOfPose, Pose, whole_pose
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+Array = NDArray[np.float64]
+Indexes = NDArray[np.int64]
+
+_POSE: Final = ("x", "y", "theta")
+
+
+def _by_pair(*quantities: str) -> tuple[str, ...]:
+    return tuple(f"{pair}/{quantity}" for quantity in quantities for pair in PAIR_NAMES)
+
+
+#: Columns of each table. The first two hold what the twin took, the others what it sent.
+COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
+    "excitation": ("fx", "fy", "m"),
+    "head_pose": _POSE,
+    "contact_forces": _by_pair("penetration", "rate", "force"),
+    "contact_peaks": _by_pair("touches", "impulse", "peak"),
+    "head_state": (*_POSE, "velocity_x", "velocity_y", "omega"),
+    "clearance": CLEARANCE_NAMES,
+    "wear_rate": PAD_NAMES,
+}
+
+
+def read_recording(run: str | Path) -> Recording:
+    """Return a recording of plow_twin; only its header is read until a table is asked for.
+
+    Parameters
+    ----------
+    run
+        Folder of the run, or one of its `.mcap` files.
+
+    Raises
+    ------
+    RecordingError
+        There is no such recording.
+    """
+    return Recording(Path(run))
+
+
+@dataclass(frozen=True)
+class Batched:
+    """Rows of a table: `stamp_ns` (n,) in ns on the clock of the samples, `values` (n, k) in SI."""
+
+    stamp_ns: Indexes
+    values: Array
+
+
+class Recording:
+    """A recording, read lazily; `recording["contact_peaks"]` is a table.
+
+    Attributes
+    ----------
+    path : Path
+        Where it lies.
+    header : RunHeader
+        Settings of the run.
+    scene : Scene
+        The scene that was computed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        reader = RunReader(path)
+        self.path = path
+        self.header: RunHeader = reader.header
+        self.scene: Scene = reader.header.scene(reader.path)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the tables."""
+        return tuple(COLUMNS)
+
+    def __getitem__(self, name: str) -> Table:
+        if name not in COLUMNS:
+            raise KeyError(f"{name}: no table of a recording, expected one of {', '.join(COLUMNS)}")
+        return Table(self, name, COLUMNS[name])
+
+    def losses(self) -> dict[str, int]:
+        """Return the counts of what the recording lacks, by topic; the whole of it is read."""
+        reader = RunReader(self.path)
+        for _ in reader.batches(outputs=False):
+            pass
+        whole = reader.status is FileStatus.COMPLETE
+        return {**reader.lost, **reader.lost_parts, **({} if whole else {reader.status.value: 1})}
+
+    def batches(self, *names: str) -> Iterator[dict[str, Batched]]:
+        """Return an iterator over the rows of some tables in one pass over the recording.
+
+        Parameters
+        ----------
+        names
+            Tables; by default all.
+
+        Raises
+        ------
+        RecordingError
+            A part cannot be read.
+        """
+        wanted = names or self.names
+        templates = publication_templates(self.header.frame_id, self.header.child_frame_id)
+        sent = [name for name in wanted if name in templates]
+        topics = {self.header.topic(name): name for name in sent}
+        for batch in RunReader(self.path).batches(outputs=bool(sent)):
+            found: dict[str, Batched] = {}
+            if "excitation" in wanted and batch.entries.sample.any():
+                found["excitation"] = Batched(*batch.entries.samples())
+            if "head_pose" in wanted and (poses := _poses(batch)) is not None:
+                found["head_pose"] = poses
+            if sent:
+                rows = rows_by_topic(batch.outputs, topics, templates)
+                found |= {name: _plain(name, rows[name]) for name in sent if name in rows}
+            if found:
+                yield found
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of a recording: `stamp_ns` and columns in SI, named as in `columns`."""
+
+    recording: Recording
+    name: str
+    columns: tuple[str, ...]
+
+    def batches(self) -> Iterator[Batched]:
+        """Return an iterator over the rows, part by part, so that a run of any length fits into memory."""
+        for found in self.recording.batches(self.name):
+            yield found[self.name]
+
+    def numpy(self) -> tuple[Indexes, Array]:
+        """Return stamps [ns], shape (n,), and values, shape (n, number of columns)."""
+        parts = list(self.batches())
+        if not parts:
+            return np.zeros(0, np.int64), np.zeros((0, len(self.columns)))
+        return np.concatenate([part.stamp_ns for part in parts]), np.concatenate([part.values for part in parts])
+
+    def arrow(self) -> pa.Table:
+        """Return an Arrow table; needs pyarrow."""
+        import pyarrow as pa
+
+        return pa.Table.from_batches(map(self.arrow_batch, self.batches()), self.arrow_schema())
+
+    def pandas(self) -> pd.DataFrame:
+        """Return a data frame indexed by the stamps in UTC; needs pandas."""
+        import pandas as pd
+
+        stamps, values = self.numpy()
+        index = pd.DatetimeIndex(stamps.view("datetime64[ns]"), tz="UTC", name="stamp")
+        return pd.DataFrame(values, index, list(self.columns))
+
+    def arrow_schema(self) -> pa.Schema:
+        """Return the columns as Arrow types them."""
+        import pyarrow as pa
+
+        return pa.schema([("stamp", pa.timestamp("ns", "UTC")), *((name, pa.float64()) for name in self.columns)])
+
+    def arrow_batch(self, part: Batched) -> pa.RecordBatch:
+        """Return rows as Arrow keeps them."""
+        import pyarrow as pa
+
+        columns: list[Any] = [pa.array(part.stamp_ns.view("datetime64[ns]"), pa.timestamp("ns", "UTC"))]
+        columns += [pa.array(np.ascontiguousarray(column)) for column in part.values.T]
+        return pa.RecordBatch.from_arrays(columns, schema=self.arrow_schema())
+
+
+def export(recording: Recording, kind: str, out: Path) -> dict[str, int]:
+    """Write all tables that have rows; return the number of rows by table.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    kind
+        `csv` or `parquet`: a file for each table in the folder `out`, written part by part. `npz`: one file, which has
+        `<table>/stamp_ns`, `<table>/values` and `<table>/columns`.
+    out
+        Folder or file.
+
+    Raises
+    ------
+    RecordingError
+        `out` cannot be written.
+    """
+    try:
+        return _exported_npz(recording, out) if kind == "npz" else _exported_tables(recording, kind, out)
+    except OSError as error:
+        raise RecordingError(f"{error.filename or out}: cannot be written: {error.strerror or error}") from error
+
+
+def _exported_npz(recording: Recording, out: Path) -> dict[str, int]:
+    from plow_twin.record.durable import whole_file
+
+    parts: dict[str, list[Batched]] = {}
+    for found in recording.batches():
+        for name, part in found.items():
+            parts.setdefault(name, []).append(part)
+    arrays: dict[str, Any] = {}
+    for name, rows in parts.items():
+        arrays[f"{name}/stamp_ns"] = np.concatenate([part.stamp_ns for part in rows])
+        arrays[f"{name}/values"] = np.concatenate([part.values for part in rows])
+        arrays[f"{name}/columns"] = np.array(COLUMNS[name])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(out) as stream:
+        np.savez_compressed(stream, **arrays)
+    return {name: sum(len(part.stamp_ns) for part in rows) for name, rows in parts.items()}
+
+
+def _exported_tables(recording: Recording, kind: str, out: Path) -> dict[str, int]:
+    from contextlib import ExitStack
+
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    out.mkdir(parents=True, exist_ok=True)
+    counts: dict[str, int] = {}
+    writers: dict[str, Any] = {}
+    with ExitStack() as opened:
+        for found in recording.batches():
+            for name, part in found.items():
+                table = recording[name]
+                if name not in writers:
+                    make = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
+                    writers[name] = opened.enter_context(make(str(out / f"{name}.{kind}"), table.arrow_schema()))
+                writers[name].write_batch(table.arrow_batch(part))
+                counts[name] = counts.get(name, 0) + len(part.stamp_ns)
+    return counts
+
+
+def _poses(batch: Batch) -> Batched | None:
+    """Return the measured poses of a batch, NaN where a component was not measured."""
+    found = [
+        (entry.stamp_ns, entry.pose if isinstance(entry, Pose) else whole_pose(entry))
+        for _, entry in sorted(batch.entries.others.items())
+        if isinstance(entry, Pose | PartOfPose)
+    ]
+    if not found:
+        return None
+    return Batched(np.array([stamp for stamp, _ in found], np.int64), np.array([pose for _, pose in found], float))
+
+
+def _plain(name: str, rows: Rows) -> Batched:
+    """Return the numbers of messages under the columns of the table: an angle in the place of a quaternion."""
+    values = rows.numbers
+    if name == "head_state":
+        theta = 2.0 * np.arctan2(values[:, 2], values[:, 3])
+        values = np.column_stack((values[:, :2], theta, values[:, 4:7]))
+    return Batched(rows.stamp_ns, values)

@@ -1,0 +1,87 @@
+"""A recording read from Python and exported: the numbers of the messages, in SI, in every format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from record_support import BASE_NS, STEP_NS, Run, paper_entries, paper_sample, record_run
+
+import plow_twin
+from plow_twin.cli.app import run as cli
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.messages import JointState
+from plow_twin.stream.journal import PartOfPose, Pose
+
+COUNT = 600
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    entries = paper_entries(COUNT)
+    entries[10:10] = [Pose(BASE_NS, (1e-3, 2e-3, 3e-3)), PartOfPose(BASE_NS + 1, (2,), (4e-3,))]
+    return record_run(tmp_path_factory.mktemp("export") / "run", entries)
+
+
+def test_tables_hold_the_numbers_of_the_messages(run: Run) -> None:
+    recording = plow_twin.read_recording(run.folder)
+    sent = [m for topic, m in run.outputs if topic == "/contact_peaks" and isinstance(m, JointState)]
+    stamps, values = recording["contact_peaks"].numpy()
+    assert stamps.tolist() == [message.stamp_ns for message in sent]
+    np.testing.assert_array_equal(values, [np.r_[m.position, m.velocity, m.effort] for m in sent])
+    column = recording["contact_peaks"].columns.index(f"{PAIR_NAMES[2]}/peak")
+    np.testing.assert_array_equal(values[:, column], [message.effort[2] for message in sent])
+    stamps, load = recording["excitation"].numpy()
+    assert len(load) == COUNT and tuple(load[5]) == paper_sample(5).wrench and stamps[5] == BASE_NS + 5 * STEP_NS
+    stamps, poses = recording["head_pose"].numpy()
+    np.testing.assert_array_equal(poses, [[1e-3, 2e-3, 3e-3], [np.nan, np.nan, 4e-3]])
+    assert recording.scene.head.mass_kg == 2430.0
+    with pytest.raises(KeyError, match="expected one of excitation, head_pose"):
+        recording["forces"]
+
+
+def test_numpy_pandas_and_arrow_are_the_same_numbers(run: Run) -> None:
+    table = plow_twin.read_recording(run.folder)["head_state"]
+    stamps, values = table.numpy()
+    frame, arrow = table.pandas(), table.arrow()
+    assert list(frame.columns) == list(table.columns) == arrow.column_names[1:]
+    np.testing.assert_array_equal(frame.to_numpy(), values)
+    np.testing.assert_array_equal(np.stack([column.to_numpy() for column in arrow.columns[1:]], axis=1), values)
+    assert frame.index[0] == pd.Timestamp(stamps[0], tz="UTC")
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "npz"])
+def test_an_export_is_the_recording(kind: str, run: Run, tmp_path: Path) -> None:
+    out = tmp_path / ("run.npz" if kind == "npz" else "tables")
+    assert cli(["export", str(run.folder), "--to", kind, "--out", str(out), "--quiet"]) == 0
+    recording = plow_twin.read_recording(run.folder)
+    for name in recording.names:
+        stamps, values = recording[name].numpy()
+        if kind == "npz":
+            with np.load(out) as found:
+                np.testing.assert_array_equal(found[f"{name}/stamp_ns"], stamps)
+                np.testing.assert_array_equal(found[f"{name}/values"], values)
+                assert tuple(found[f"{name}/columns"]) == recording[name].columns
+            continue
+        file = out / f"{name}.{kind}"
+        table = pyarrow.csv.read_csv(file) if kind == "csv" else pyarrow.parquet.read_table(file)
+        assert table.column_names == ["stamp", *recording[name].columns]
+        read = np.stack([column.to_numpy().astype(float) for column in table.columns[1:]], axis=1)
+        np.testing.assert_array_equal(read, values)
+        np.testing.assert_array_equal(table["stamp"].to_numpy().astype("datetime64[ns]").astype(np.int64), stamps)
+
+
+def test_an_export_of_a_cut_recording_says_so_and_of_a_place_that_takes_nothing_too(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(run.file.read_bytes()[: run.file.stat().st_size // 2])
+    assert cli(["export", str(cut), "--to", "csv", "--out", str(tmp_path / "tables"), "--quiet"]) == 3
+    assert "truncated" in capsys.readouterr().err and (tmp_path / "tables" / "excitation.csv").is_file()
+    (tmp_path / "file").write_text("")
+    assert cli(["export", str(run.folder), "--to", "csv", "--out", str(tmp_path / "file" / "x"), "--quiet"]) == 1
+    assert "cannot be written" in capsys.readouterr().err
