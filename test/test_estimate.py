@@ -17,7 +17,7 @@ from scenes import ROOT, gaps_at, preset
 from scipy.stats import truncnorm
 from test_study_analysis import BIAS, LAG_S, motion, write_bag
 
-from plow_twin import Clearance, Friction, Initial, Scene, Table, Twin, Wear, simulate
+from plow_twin import Clearance, Friction, Initial, Mark, Provenance, Scene, Table, Twin, Wear, simulate
 from plow_twin.estimate import estimate as estimating
 from plow_twin.estimate.answer import followed
 from plow_twin.estimate.arrow import Arrow
@@ -437,6 +437,28 @@ def test_a_clearance_that_nothing_contradicts_is_not_estimated() -> None:
     assert run.statistics["bottom_left_bottom"]["time_in_contact"] == 0.0
     assert result.vertical_state is not State.ESTIMATED
     assert result.vertical.p05 < clearance.vertical_m < result.vertical.p95
+
+
+def test_the_prior_is_what_the_scene_states_or_the_mark_says() -> None:
+    scene = preset("paper")
+    t = np.arange(0.0, 10.0, 0.1)
+    load, poses = Load(t, compile_loads(scene.loads).at(t)), Poses(t, np.zeros((len(t), 3)))
+    by_mark = Unknowns.stated(scene, load, poses).deviations()
+    np.testing.assert_array_equal(by_mark[:4], [8e-3, 8e-3, 2.5, 1.2])
+    marks = {
+        "clearance.horizontal_m": Provenance(Mark.ASSUMED, "", 2e-3),
+        "clearance.vertical_m": Provenance(Mark.MEASURED),
+        "contact.stiffness": Provenance(Mark.ASSUMED, "", 0.1 * scene.contact.stiffness),
+        "contact.damping": Provenance(Mark.ASSUMED, "", 0.2 * (scene.contact.damping or 0.0)),
+    }
+    stated = Unknowns.stated(replace(scene, marks=marks), load, poses).deviations()
+    # 10 % of the stiffness is 10 % of the penetration, of which 0.1 mm cannot be told from none
+    np.testing.assert_allclose(stated[:4], [2e-3, 2e-3, 0.1, 0.2], rtol=0.02)
+    # the same in the units of a machine of another size
+    units = Units(0.5, 2.0, 0.25)
+    other = units.scene(replace(scene, marks=marks))
+    far = Unknowns.stated(other, units.load(load), units.poses(poses)).deviations()
+    assert far[0] == 2.0 * stated[0] and far[3] == pytest.approx(stated[3])
 
 
 def test_what_is_stated_of_the_measurements_is_believed() -> None:

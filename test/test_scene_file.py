@@ -74,6 +74,17 @@ def test_presets_state_where_each_number_comes_from(name: str) -> None:
     assert all(mark.source for mark in scene.marks.values())
 
 
+def test_a_number_states_how_well_it_is_known() -> None:
+    marked = "{horizontal_m: {value: 0.025, mark: assumed, deviation: 0.002}, vertical_m: {value: 0.03, mark: given}}"
+    scene = loads_scene(MINIMAL.replace("{horizontal_m: 0.025, vertical_m: 0.030}", marked))
+    assert scene.marks["clearance.horizontal_m"] == Provenance(Mark.ASSUMED, "", 0.002)
+    assert scene.marks["clearance.vertical_m"].deviation is None
+    assert loads_scene(dump_scene(scene)).marks == scene.marks
+    for wrong in ("-0.002", "wide", ".inf"):
+        with pytest.raises(SceneError, match=r"clearance\.horizontal_m\.deviation: .*standard deviation"):
+            loads_scene(MINIMAL.replace("{horizontal_m: 0.025, vertical_m: 0.030}", marked.replace("0.002", wrong)))
+
+
 def test_paper_preset_is_reconstruction_r1() -> None:
     scene = load_scene(scene_path("paper"))
     force = np.array([load.force_n for load in scene.loads])

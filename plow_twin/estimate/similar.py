@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from plow_twin.estimate.gaps import CONSTANT_ERROR, Gaps
 from plow_twin.estimate.measurements import Deviation, Load, Poses
+from plow_twin.estimate.priors import KINDS
 from plow_twin.estimate.result import Estimate
 from plow_twin.estimate.unknowns import QUANTITIES
 from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
-from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Scene
+from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Provenance, Scene
 
 if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
@@ -58,7 +59,7 @@ class Units:
         x, y = head.com_offset_m
         (qx, qy, theta), (vx, vy, omega) = scene.initial.q, scene.initial.v
         speed = length / time
-        return replace(
+        its = replace(
             scene,
             head=replace(
                 head,
@@ -79,6 +80,7 @@ class Units:
             loads=(),
             wear=None,
         )
+        return replace(its, marks=_converted(scene, its))
 
     def load(self, load: Load) -> Load:
         """Return a load in these units."""
@@ -154,3 +156,15 @@ class Units:
             stick_stiffness_n_m=None if stiffness is None else stiffness * self.time**2 / self.mass,
             stick_damping_n_s_m=None if damping is None else damping * self.time / self.mass,
         )
+
+
+def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
+    """Return the marks with deviations that are to the numbers of `its` as they are to those of `scene`."""
+    marks = dict(scene.marks)
+    for path in KINDS:
+        mark, (part, name) = marks.get(path), path.split(".")
+        value = getattr(getattr(scene, part), name, None)
+        if mark is not None and mark.deviation is not None and value:
+            ratio = getattr(getattr(its, part), name) / value
+            marks[path] = replace(mark, deviation=mark.deviation * ratio)
+    return marks

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.priors import deviation_of, is_stated
 from plow_twin.model.scene import Clearance, Contact, Scene
 
 Array = NDArray[np.float64]
@@ -141,8 +142,17 @@ class Unknowns:
 
     @staticmethod
     def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:
-        """Return the prior where load or poses state deviations; that of a load is taken to move all samples alike."""
-        deviation = _prior()
+        """Return the prior with the deviations that scene, load and poses state; a load's moves all samples alike."""
+        unknowns, deviation, contact = Unknowns(scene), _prior(), scene.contact
+        deviation[GX] = deviation_of(scene, "clearance.horizontal_m")
+        deviation[GY] = deviation_of(scene, "clearance.vertical_m")
+        deviation[SOFTNESS] = deviation_of(scene, "contact.stiffness")
+        if is_stated(scene, "contact.stiffness"):
+            # of the logarithm of K to that of u + u0
+            u = math.exp(unknowns.softness_of(contact.stiffness)) - _RESOLVED
+            deviation[SOFTNESS] *= u / (u + _RESOLVED) / contact.exponent
+        damped = "contact.damping" if contact.restitution is None else "contact.restitution"
+        deviation[DAMPING] = deviation_of(scene, damped)
         deviation[GAIN] = np.minimum(np.hypot(deviation[GAIN], load.gain_deviations()), _MOST_GAIN)
         return Unknowns(scene, deviation, poses.deviation)
 

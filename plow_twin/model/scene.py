@@ -55,10 +55,13 @@ class Provenance:
         Where the number comes from.
     source : str
         The source, in words.
+    deviation : float, optional
+        Standard deviation of the number, in its unit; None where it is not stated.
     """
 
     mark: Mark
     source: str = ""
+    deviation: float | None = None
 
 
 def _quantity(unit: str, doc: str, default: Any = ..., **bounds: float) -> Any:

@@ -129,12 +129,16 @@ def _arguments(part: type, raw: Mapping[str, Any], path: str, marks: dict[str, P
 
 def _number(raw: Any, path: str, marks: dict[str, Provenance]) -> float | tuple[float, ...]:
     if isinstance(raw, dict):
-        marks[path] = Provenance(Mark(raw["mark"]), raw.get("source", ""))
+        marks[path] = Provenance(Mark(raw["mark"]), raw.get("source", ""), _deviation(raw))
         raw = raw["value"]
     if isinstance(raw, list):
         # the elements of a list are numbers, perhaps marked ones
         return tuple(float(_number(item, f"{path}[{index}]", marks)) for index, item in enumerate(raw))  # type: ignore[arg-type]
     return float(raw)
+
+
+def _deviation(raw: Mapping[str, Any]) -> float | None:
+    return float(raw["deviation"]) if "deviation" in raw else None
 
 
 def _read_loads(

@@ -110,7 +110,7 @@ def _quantity(spec: Field[Any]) -> Schema:
 def _markable(plain: Schema) -> Schema:
     marked = {
         "type": "object",
-        "description": f"a mapping with value, mark and source, value: {plain['description']}",
+        "description": f"a mapping with value, mark, source and deviation, value: {plain['description']}",
         "properties": {
             "value": plain,
             "mark": {
@@ -118,6 +118,11 @@ def _markable(plain: Schema) -> Schema:
                 "description": f"one of {', '.join(m.value for m in Mark)}",
             },
             "source": {"type": "string", "description": "a text"},
+            "deviation": {
+                "type": "number",
+                "minimum": 0.0,
+                "description": "a standard deviation in the unit of the value, at least 0",
+            },
         },
         "required": ["value", "mark"],
         "additionalProperties": False,

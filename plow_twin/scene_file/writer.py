@@ -80,7 +80,9 @@ def _marked(value: Any, path: str, marks: Mapping[str, Provenance]) -> Any:
     if path not in marks:
         return plain
     mark = marks[path]
-    return {"value": plain, "mark": mark.mark.value} | ({"source": mark.source} if mark.source else {})
+    source = {"source": mark.source} if mark.source else {}
+    deviation = {} if mark.deviation is None else {"deviation": mark.deviation}
+    return {"value": plain, "mark": mark.mark.value} | deviation | source
 
 
 def _plain_load(load: Load, path: str, marks: Mapping[str, Provenance]) -> dict[str, Any]:

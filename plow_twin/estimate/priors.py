@@ -1,0 +1,61 @@
+"""How well the numbers of a scene are known: the deviation that it states, or the default of the number's mark."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from plow_twin.model.scene import Mark, Scene
+
+#: Standard deviation of a number without a stated one, by mark. A clearance grows by wear, whatever the drawing says,
+#: and a contact's numbers are seldom known at all: only those measured at the machine are worth more. Mass and inertia
+#: follow from a drawing to some percent, a frame's sides to a tolerance and to how far its corners are round. The
+#: exponent is that of an idealised law; friction is seldom written down. Units: m for lengths, the logarithm of
+#: stiffness and damping (of a restitution its logit), shares of mass and inertia, else the number's own.
+DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
+    "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
+    "stiffness": {Mark.GIVEN: 2.5, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 2.5, Mark.ASSUMED: 2.5},
+    "damping": {Mark.GIVEN: 1.2, Mark.MEASURED: 0.5, Mark.RECONSTRUCTED: 1.2, Mark.ASSUMED: 1.2},
+    "mass": {Mark.GIVEN: 0.02, Mark.MEASURED: 0.01, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.10},
+    "inertia": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.10, Mark.ASSUMED: 0.20},
+    "frame": {Mark.GIVEN: 1e-3, Mark.MEASURED: 5e-4, Mark.RECONSTRUCTED: 2e-3, Mark.ASSUMED: 5e-3},
+    "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
+    "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
+}
+#: Which row of the table a number has.
+KINDS: Final = {
+    "clearance.horizontal_m": "clearance",
+    "clearance.vertical_m": "clearance",
+    "contact.stiffness": "stiffness",
+    "contact.damping": "damping",
+    "contact.restitution": "damping",
+    "head.mass_kg": "mass",
+    "head.inertia_kg_m2": "inertia",
+    "frame.width_m": "frame",
+    "frame.height_m": "frame",
+    "contact.exponent": "exponent",
+    "friction.coefficient": "friction",
+}
+
+
+def is_stated(scene: Scene, path: str) -> bool:
+    """Tell whether the scene states how well it knows a number."""
+    provenance = scene.marks.get(path)
+    return provenance is not None and provenance.deviation is not None
+
+
+def deviation_of(scene: Scene, path: str) -> float:
+    """Return the prior's standard deviation of a number by its path, in the units of `DEFAULTS`.
+
+    A number without a mark counts as assumed.
+    """
+    kind, provenance = KINDS[path], scene.marks.get(path)
+    if provenance is None or provenance.deviation is None:
+        return DEFAULTS[kind][Mark.ASSUMED if provenance is None else provenance.mark]
+    part, name = path.split(".")
+    owner = getattr(scene, part)
+    value = float(getattr(owner, name)) if owner is not None else 0.0
+    if name == "restitution":
+        return provenance.deviation / max(value * (1.0 - value), 1e-6)
+    if kind in ("stiffness", "damping", "mass", "inertia"):
+        return provenance.deviation / max(abs(value), 1e-300)
+    return provenance.deviation
