@@ -70,7 +70,7 @@ setup(
         "numba>=0.59",
         # scene files and the command line
         "click>=8.1",
-        "jsonschema>=4.18",
+        "jsonschema>=4.10",
         "PyYAML>=6",
         "rich>=13",
     ],

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 
 class PlowTwinError(Exception):
     """Base of every error that the package raises on purpose."""
+
+
+#: Problems that a message lists.
+_MOST_SHOWN: Final = 50
 
 
 @dataclass(frozen=True)
@@ -33,22 +37,32 @@ class Problem:
         return f"{self.key}: got {self.got!r}, expected {self.expected}"
 
 
-class SceneError(PlowTwinError, ValueError):
-    """A scene cannot be used; the message lists every problem found, not the first one.
+class InputError(PlowTwinError, ValueError):
+    """A file or values that a user wrote cannot be used; the message lists the problems, the first 50 of them.
 
     Attributes
     ----------
     problems : tuple of Problem
         All that is wrong.
     source : str
-        Name of the file, or `scene`.
+        Name of the file, or of what was given.
     """
 
-    def __init__(self, problems: Sequence[Problem], source: str = "scene") -> None:
+    def __init__(self, problems: Iterable[Problem], source: str) -> None:
         self.problems = tuple(problems)
         self.source = source
-        lines = "\n".join(f"  {problem}" for problem in self.problems)
-        super().__init__(f"{source}: {len(self.problems)} problem(s)\n{lines}")
+        lines = [f"  {problem}" for problem in self.problems[:_MOST_SHOWN]]
+        if len(self.problems) > _MOST_SHOWN:
+            lines.append(f"  and {len(self.problems) - _MOST_SHOWN} more")
+        text = lines[0].strip() if len(lines) == 1 else "\n".join([f"{len(self.problems)} problems", *lines])
+        super().__init__(f"{source}: {text}")
+
+
+class SceneError(InputError):
+    """A scene cannot be used."""
+
+    def __init__(self, problems: Iterable[Problem], source: str = "scene") -> None:
+        super().__init__(problems, source)
 
 
 class ArgumentError(PlowTwinError, ValueError):

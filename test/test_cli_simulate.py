@@ -143,7 +143,10 @@ def test_fixed_step_methods_run_the_same_scene(tmp_path: Path) -> None:
             "inf rows, expected at most 10000000 rows",
         ),
         (["simulate", "missing.yaml", "--t-end", "1"], "missing.yaml"),
-        (["simulate", "bad.yaml", "--t-end", "1"], "head.mass: got 2430.0, expected a known key, nearest is mass_kg"),
+        (
+            ["simulate", "bad.yaml", "--t-end", "1"],
+            "head.mass: got 2430.0, expected a known key; did you mean mass_kg",
+        ),
         (["replay", "missing.mcap"], "missing.mcap"),
         (["demo", "--speed", "warp"], "warp"),
         (["record", "run", "--all", "--exclude", "["], "expected a regular expression"),

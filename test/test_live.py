@@ -316,19 +316,22 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
     assert time_ns("9999-12-31") is None and time_ns("2300-01-01T00:00:00") is None and time_ns("0001-01-01") is None
     assert time_ns(10**400) is None and time_ns("20260102") == (20_260_102 + 1) * 10**9
     for text, said in (
-        ("unit: {x: N}", "unit: got 'N', expected one of m, cm, mm, um"),
-        ("limits: {x: [2, 1]}", "limits"),
+        ("unit: {x: N}", "unit.x: got 'N', expected one of m, cm, mm, um"),
+        ("limits: {x: [2, 1]}", "limits.x: got [2, 1], expected the smallest number"),
         ("clock_offset: soon", "clock_offset: got 'soon'"),
         ("stamp_unit: h", "stamp_unit: got 'h'"),
-        ("gain: 2", "got gain"),
+        ("gain: 2", "gain: got 2, expected a known key"),
+        ("scal: 2", "scal: got 2, expected a known key; did you mean scale?"),
         ("stamp_unit: [s]", "stamp_unit: got ['s'], expected one of s, ms"),
-        ("stamp: [t]", "stamp: got ['t'], expected the name"),
+        ("stamp: [t]", "stamp: got ['t'], expected header, log, the name of a column or a path"),
         ("sequence: 0.5", "sequence: got 0.5, expected the name"),
-        ("fields: {x: [1]}", "fields: got {'x': [1]}, expected names of columns"),
+        ("fields: {x: [1]}", "fields.x: got [1], expected the name of a column"),
         ("fields: 5", "fields: got 5"),
-        ("scale: {x: true}", "scale: got {'x': True}, expected numbers"),
+        ("scale: {x: true}", "scale.x: got True, expected a finite number"),
         ("scale: false", "scale: got False, expected a mapping"),
-        ("limits: {x: [0, true]}", "expected numbers, or pairs"),
+        ("limits: {x: [0, true]}", "limits.x[1]: got True, expected a finite number"),
+        ("unit: mm", "unit.theta: got 'mm', expected one of rad"),
+        ("limits: 0", "limits.x: got 0, expected a finite number > 0"),
     ):
         path.write_text(f"head_pose: {{topic: p, {text}}}")
         with pytest.raises(RecordingError, match="head_pose") as caught:
@@ -338,7 +341,9 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
     assert read("head_pose: {topic: p, stamp: at}", x=1, y=2, theta=3) is None
     for key, name in (("stamp", "at"), ("sequence", "n")):
         path.write_text(f"head_pose: {{topic: p, {key}: {name}}}")
-        with pytest.raises(RecordingError, match=f"{key}: got '{name}', expected one of the columns t, x, y, theta"):
+        with pytest.raises(
+            RecordingError, match=f"head_pose.{key}: got '{name}', expected one of the columns t, x, y, theta"
+        ):
             read_map(path, {"p": Columns(("t", "x", "y", "theta"))})
     for data in (b"head_pose: {topic: p", b"\xff\xfe\x00", b"[" * 5000, b"7"):
         path.write_bytes(data)
@@ -684,15 +689,17 @@ def test_a_wrong_password_a_strange_certificate_and_a_broker_without_tls_are_ref
 def test_what_the_system_refuses_is_a_warning_and_the_rest_is_done() -> None:
     code = """
 import os, resource
+from dataclasses import replace
 from plow_twin.live.parameters import settings
 from plow_twin.live.realtime import apply_realtime
+asked, wrong = settings({"priority": 50, "lock_memory": True}), settings({"cpu_affinity": "0,x"})
 for limit in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK):
     resource.setrlimit(limit, (0, 0))
 if os.getuid() == 0:
     os.setresuid(65534, 65534, 65534)
 one = min(os.sched_getaffinity(0))
-print(*apply_realtime(settings({"priority": 50, "cpu_affinity": str(one), "lock_memory": True})), sep="\\n")
-print(*apply_realtime(settings({"cpu_affinity": "0,x"})), sep="\\n")
+print(*apply_realtime(replace(asked, cpu_affinity=str(one))), sep="\\n")
+print(*apply_realtime(wrong), sep="\\n")
 print(os.sched_getaffinity(0) == {one})
 """
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
@@ -719,7 +726,7 @@ def test_another_machine_without_tls_and_passwords_in_the_address_are_refused(ur
         (["load.csv", "--set", "excitation_source=tool_forces"], 1, "expected 'excitation' or 'scene'"),
         (["other.csv"], 1, "expected the columns fx, fy, m"),
         (["twice.csv"], 1, "column 'fx' stands more than once"),
-        (["load.csv", "--map", "twice.yaml"], 1, "the key twice, in lines 1 and 2"),
+        (["load.csv", "--map", "twice.yaml"], 2, "the key twice, in lines 1 and 2"),
         (["junk.csv"], 1, "\\x1b"),
         (["mqtt://localhost:1"], 1, "expected one that names the topics"),
     ],

@@ -114,20 +114,27 @@ def test_telemetry_of_the_drive_runs_the_twin_and_its_interval_is_in_the_journal
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("entry", "said"),
     [
         (
-            "load_model: {push_ratio: [0.5, 0.1], at_m: [0, 0], efficiency: 0.8}",
-            "efficiency: got 0.8, expected two numbers",
+            "push_ratio: [0.5, 0.1], at_m: [0, 0], efficiency: 0.8",
+            "load_model.efficiency: got 0.8, expected a mean and a standard deviation >= 0",
         ),
-        ("load_model: {push_ratio: [0.5, -0.1], at_m: [0, 0], efficiency: [1, 0]}", "a deviation >= 0"),
-        ("load_model: {push_ratio: [0.5, 0.1]}", "expected push_ratio, at_m"),
-        ("load_model: {push_ratio: [0.5, 0.1], at_m: [0, 0]}", "expected efficiency, specific_force_n_m or"),
-        ("load_model: {push_ratio: [1, 0], at_m: [0, 0], idle_force_n: [0, 0], resistance: {}}", "resistance"),
+        (
+            "push_ratio: [0.5, -0.1], at_m: [0, 0], efficiency: [1, 0]",
+            "push_ratio[1]: got -0.1, expected a standard deviation >= 0",
+        ),
+        ("push_ratio: [0.5, 0.1], efficiency: [1, 0]", "at_m: got nothing, expected two finite numbers: x and y [m]"),
+        ("push_ratio: [0.5, 0.1], at_m: [0, 0]", "efficiency or specific_force_n_m or idle_force_n (for chain_force)"),
+        ("push_ratio: [1, 0], at_m: [0, 0], idle_force_n: [0, 0], resistance: {}", "resistance.factor: got nothing"),
+        (
+            "push_ratio: [1, 0], at_m: [0, 0], idle_force_n: [0, 0], resistance: {position_m: [1, 0], factor: [1, 1]}",
+            "expected rising position_m",
+        ),
     ],
 )
-def test_coefficients_that_cannot_be_used_are_named(text: str, said: str, tmp_path: Path) -> None:
-    (tmp_path / "map.yaml").write_text(text)
+def test_coefficients_that_cannot_be_used_are_named(entry: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(f"load_model: {{{entry}}}")
     with pytest.raises(PlowTwinError) as caught:
         read_load_model(tmp_path / "map.yaml")
     assert said in str(caught.value)

@@ -158,7 +158,7 @@ gravty: 3
     assert not missing, f"not reported: {missing}\n{caught.value}"
     assert got.keys() - {"frame.labels.1"} == expected.keys()
     assert "mass_kg" in got["head.mas"][1]  # the nearest known key
-    assert got["gravty"][1].endswith("gravity")
+    assert got["gravty"][1] == "a known key; did you mean gravity?"
     assert got["head.mass_kg"][1] == "a finite number > 0 [kg]"
     assert str(caught.value).startswith("bad.yaml: ")
 

@@ -178,7 +178,7 @@ def test_a_mapping_of_a_bag_that_names_no_field_or_stamp_is_told_by_name(tmp_pat
     file, chosen = mcap(tmp_path / "load.mcap", "cdr", (TYPE, "ros2msg", schema), messages), tmp_path / "map.yaml"
     topic = next(iter(open_source(file).topics()))
     chosen.write_text(f"excitation: {{topic: {topic}, stamp: headr}}")
-    with pytest.raises(RecordingError, match=f"excitation: stamp: got 'headr', expected header or log for {TYPE}"):
+    with pytest.raises(RecordingError, match=f"excitation.stamp: got 'headr', expected header or log for {TYPE}"):
         analyse(file, scene=PAPER, mapping=chosen)
     wrong = "{fx: wrench.force.x, fy: wrench.forc.y, m: wrench.torque.z}"
     chosen.write_text(f"excitation: {{topic: {topic}, fields: {wrong}}}")

@@ -26,7 +26,7 @@ from plow_twin.cli.replay import replay
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
 from plow_twin.cli.view import view
-from plow_twin.errors import PlowTwinError, RunInterrupted, SceneError, UnitError
+from plow_twin.errors import InputError, PlowTwinError, RunInterrupted, UnitError
 
 #: Extra of the package that brings a module.
 EXTRA_OF_MODULE: Final = {
@@ -97,7 +97,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # click turns every KeyboardInterrupt into an Abort
         stopped = error.__cause__
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
-    except (SceneError, UnitError) as error:
+    except (InputError, UnitError) as error:
         return _fail(str(error), WRONG_INPUT)
     except PlowTwinError as error:
         return _fail(str(error))

@@ -146,13 +146,13 @@ def _settings(options: dict[str, Any]) -> Settings:
     """Return the parameters: of the file, then those given one by one, then those that have options of their own."""
     from plow_twin.live import parameters
 
-    values = parameters.read_yaml(options["params"]) if options["params"] else {}
+    values = parameters.read_parameters(options["params"]) if options["params"] else {}
     for text in options["given"]:
         name, equals, value = text.partition("=")
         if not equals:
             raise click.BadParameter(f"got {text!r}, expected NAME=VALUE", param_hint="--set")
         values[name.strip()] = parameters.read_value(value)
-    for name, nearest in parameters.unknown(values).items():
+    for name, nearest in parameters.unknown(values):
         hint = f"; did you mean {nearest}?" if nearest else ""
         raise click.BadParameter(f"unknown parameter {name}{hint}", param_hint="--set or --params")
     try:

@@ -21,11 +21,33 @@ from scipy.signal import lfilter
 from scipy.stats import gamma, norm
 
 from plow_twin.errors import ArgumentError
+from plow_twin.scene_file.validation import Schema, validate
 
 Array = NDArray[np.float64]
 
 #: Points of the field in a correlation length: between two of them it is straight, which takes 1 % of its variance.
 _POINTS: Final = 25
+
+
+def _at_least(low: float, kind: str = "number") -> Schema:
+    return {"type": kind, "minimum": low, "description": f"a finite {kind} >= {low:g}"}
+
+
+_NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
+_SCHEMA: Final[Schema] = {
+    "type": "object",
+    "properties": {
+        "length_m": _at_least(1e-3),
+        "speed_m_s": _at_least(1e-6),
+        "turn_s": _at_least(0.0),
+        "force_n": _NUMBER,
+        "lateral_n": _at_least(0.0),
+        "at_m": {"type": "array", "items": _NUMBER, "minItems": 2, "maxItems": 2, "description": "two numbers"},
+        "variation": _at_least(1e-6),
+        "correlation_m": _at_least(1e-4),
+        "seed": _at_least(0, "integer"),
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -95,21 +117,11 @@ class CuttingLoad:
 
     def __post_init__(self) -> None:
         face = self.face
-        for name, value, low in (
-            ("length_m", face.length_m, 1e-3),
-            ("speed_m_s", face.speed_m_s, 1e-6),
-            ("turn_s", face.turn_s, 0.0),
-            ("variation", self.variation, 1e-6),
-            ("correlation_m", self.correlation_m, 1e-4),
-            ("lateral_n", self.lateral_n, 0.0),
-            ("seed", self.seed, 0),
-        ):
-            if not low <= value < math.inf:
-                raise ArgumentError(f"{name}: got {value!r}, expected a finite number >= {low:g}")
+        problems = validate({**vars(face), **vars(self)}, _SCHEMA, "load")
+        if problems:
+            raise ArgumentError("; ".join(map(str, problems)))
         if face.speed_m_s * face.turn_s >= 2.0 * face.length_m:
             raise ArgumentError(f"turn_s: got {face.turn_s!r}, expected less than two passes of {face.length_m:g} m")
-        if not all(map(math.isfinite, (self.force_n, *self.at_m))):
-            raise ArgumentError(f"force_n, at_m: got {self.force_n!r}, {self.at_m!r}, expected finite numbers")
 
     def at(self, t: Array) -> Array:
         """Return Fx, Fy [N], M [N m] at times `t` (n,) [s], shape (n, 3); in a turn it falls with the speed."""

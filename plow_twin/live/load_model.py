@@ -12,15 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from plow_twin.errors import RecordingError
-from plow_twin.record.mapping import LOAD_MODEL, read_map_file
+from plow_twin.record.map_file import LOAD_MODEL, map_error, read_map_file
 
 #: Below that speed [m/s] the power says nothing of the chain's force.
 SLOWEST_M_S: Final = 0.1
@@ -125,53 +124,21 @@ def read_load_model(path: Path | None) -> LoadModel | None:
 
     Raises
     ------
-    RecordingError
+    MapError
         It cannot be used; the message names key, value got and value expected.
     """
-    if path is None:
+    entry = None if path is None else read_map_file(path).get(LOAD_MODEL)
+    if path is None or entry is None:
         return None
-    entry = read_map_file(path).get(LOAD_MODEL)
-    if entry is None:
-        return None
-    names = [spec.name for spec in fields(LoadModel)]
-    if not isinstance(entry, dict) or not set(entry) <= set(names) or not {"push_ratio", "at_m"} <= set(entry):
-        raise RecordingError(
-            f"{path}: {LOAD_MODEL}: got {entry!r}, expected push_ratio, at_m and others of {', '.join(names)}"
-        )
-    if not {"efficiency", "specific_force_n_m", "idle_force_n"} & set(entry):
-        raise RecordingError(
-            f"{path}: {LOAD_MODEL}: expected efficiency, specific_force_n_m or idle_force_n (for chain_force)"
-        )
-    values: dict[str, Any] = {
-        name: _resistance(path, value) if name == "resistance" else _pair(path, name, value)
-        for name, value in entry.items()
-    }
+    values: dict[str, Any] = {name: _floats(value) for name, value in entry.items() if name != "resistance"}
+    if "resistance" in entry:
+        places, factors = (_floats(entry["resistance"][key]) for key in ("position_m", "factor"))
+        if len(places) != len(factors) or not all(later > earlier for earlier, later in pairwise(places)):
+            key, expected = f"{LOAD_MODEL}.resistance", "rising position_m and as many factors"
+            raise map_error(path, key, entry["resistance"], expected)
+        values["resistance"] = places, factors
     return LoadModel(**values)
 
 
-def _pair(path: Path, name: str, given: Any) -> Number:
-    """Return mean and deviation, or x and y."""
-    try:
-        first, second = (float(value) for value in given)
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"{path}: {LOAD_MODEL}: {name}: got {given!r}, expected two numbers") from error
-    if not math.isfinite(first + second) or (name != "at_m" and second < 0.0):
-        expected = "two finite numbers" if name == "at_m" else "a mean and a deviation >= 0"
-        raise RecordingError(f"{path}: {LOAD_MODEL}: {name}: got {given!r}, expected {expected}")
-    return first, second
-
-
-def _resistance(path: Path, given: Any) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    try:
-        places = tuple(float(value) for value in given["position_m"])
-        factors = tuple(float(value) for value in given["factor"])
-    except (TypeError, ValueError, KeyError) as error:
-        raise RecordingError(
-            f"{path}: {LOAD_MODEL}: resistance: got {given!r}, expected position_m and factor"
-        ) from error
-    rising = all(later > earlier for earlier, later in pairwise(places))
-    if not places or len(places) != len(factors) or not rising or not all(0.0 <= value < math.inf for value in factors):
-        raise RecordingError(
-            f"{path}: {LOAD_MODEL}: resistance: got {given!r}, expected rising position_m and as many factors >= 0"
-        )
-    return places, factors
+def _floats(given: list[float]) -> tuple[float, ...]:
+    return tuple(map(float, given))

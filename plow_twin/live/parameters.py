@@ -6,16 +6,16 @@
 from __future__ import annotations
 
 import difflib
-import math
 import re
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-from plow_twin.errors import PlowTwinError, Problem
+from plow_twin.errors import InputError, Problem
 from plow_twin.stream.topics import Cadence, names_of
 
 #: Topics of the estimate and of what follows from it.
@@ -30,13 +30,11 @@ class Effect(Enum):
     NOW = "at once"
 
 
-class ParameterError(PlowTwinError, ValueError):
-    """Parameters cannot be used; the message lists every problem found."""
+class ParameterError(InputError):
+    """Parameters cannot be used."""
 
     def __init__(self, problems: Iterable[Problem], source: str = "parameters") -> None:
-        self.problems = tuple(problems)
-        lines = "\n".join(f"  {problem}" for problem in self.problems)
-        super().__init__(f"{source}: {len(self.problems)} problem(s)\n{lines}")
+        super().__init__(problems, source)
 
 
 def _number(default: float, unit: str, low: float, high: float, effect: Effect, doc: str) -> Any:
@@ -407,22 +405,42 @@ def expected(spec: Field[Any]) -> str:
     if "choices" in spec.metadata:
         return f"one of {', '.join(spec.metadata['choices'])}"
     if isinstance(spec.default, tuple):
-        low, high = spec.metadata["low"], spec.metadata["high"]
-        return f"{len(spec.default)} numbers from {low:g} to {high:g} [{spec.metadata['unit']}]"
+        return _range(f"{len(spec.default)} numbers", spec)
     if "unit" in spec.metadata:
-        kind = "an integer" if isinstance(spec.default, int) else "a number"
-        return f"{kind} from {spec.metadata['low']:g} to {spec.metadata['high']:g} [{spec.metadata['unit']}]"
+        return _range("an integer" if isinstance(spec.default, int) else "a number", spec)
     return "true or false" if isinstance(spec.default, bool) else "a text"
+
+
+def _range(kind: str, spec: Field[Any]) -> str:
+    return f"{kind} from {spec.metadata['low']:g} to {spec.metadata['high']:g} [{spec.metadata['unit']}]"
 
 
 def problems(values: Mapping[str, Any]) -> list[Problem]:
     """Return every problem of the given values; names that are not in the table are passed over."""
-    found = []
-    for name, value in values.items():
-        spec = SPECS.get(name)
-        if spec is not None and not _admissible(spec, coerce(name, value)):
-            found.append(Problem(name, value, expected(spec)))
-    return found
+    from plow_twin.scene_file.validation import validate
+
+    known = {name: coerce(name, value) for name, value in values.items() if name in SPECS}
+    return validate(known, schema(), "parameters")
+
+
+@cache
+def schema() -> dict[str, Any]:
+    """Return the JSON schema of the parameters."""
+    return {"type": "object", "properties": {name: _property(spec) for name, spec in SPECS.items()}}
+
+
+def _property(spec: Field[Any]) -> dict[str, Any]:
+    words = {"description": expected(spec)}
+    if "choices" in spec.metadata:
+        return {"enum": list(spec.metadata["choices"]), **words}
+    if "unit" not in spec.metadata:
+        return {"type": "boolean" if isinstance(spec.default, bool) else "string", **words}
+    bounds = {"minimum": spec.metadata["low"], "maximum": spec.metadata["high"]}
+    if isinstance(spec.default, tuple):
+        count = len(spec.default)
+        number = {"type": "number", **bounds, "description": _range("a number", spec)}
+        return {"type": "array", "items": number, "minItems": count, "maxItems": count, **words}
+    return {"type": "integer" if isinstance(spec.default, int) else "number", **bounds, **words}
 
 
 def settings(values: Mapping[str, Any]) -> Settings:
@@ -445,7 +463,7 @@ def model_changes(given: Settings) -> dict[str, float]:
     return {key: value for key, value in values.items() if value != -1.0}
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_parameters(path: Path) -> dict[str, Any]:
     """Return the parameters in a YAML file: as of a ROS node, `ros__parameters` under any name, or plain names.
 
     Raises
@@ -453,52 +471,32 @@ def read_yaml(path: Path) -> dict[str, Any]:
     ParameterError
         The file holds no mapping.
     """
-    import yaml
+    from plow_twin.scene_file.yaml_text import read_yaml
 
-    try:
-        given: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ParameterError([Problem("file", str(error), "YAML")], str(path)) from error
+    given, found = read_yaml(path, "parameter", "a mapping of names to values")
+    if found:
+        raise ParameterError(found, str(path))
     nodes = [given] if isinstance(given, dict) else []
     nodes += [node for node in nodes[0].values() if isinstance(node, dict)] if nodes else []
-    found = next((node["ros__parameters"] for node in nodes if "ros__parameters" in node), given)
-    if not isinstance(found, dict):
-        raise ParameterError([Problem("file", type(found).__name__, "a mapping of names to values")], str(path))
-    return {str(name): value for name, value in found.items()}
+    values = next((node["ros__parameters"] for node in nodes if "ros__parameters" in node), given)
+    if not isinstance(values, dict):
+        raise ParameterError([Problem("file", type(values).__name__, "a mapping of names to values")], str(path))
+    return {str(name): value for name, value in values.items()}
 
 
 def read_value(text: str) -> Any:
     """Return a value as YAML has it; what is no YAML stays a text."""
-    import yaml
+    from plow_twin.scene_file.yaml_text import load_yaml
 
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        return text
+    value, found = load_yaml(text, "value", "a value")
+    return text if found else value
 
 
-def unknown(names: Iterable[str]) -> dict[str, str]:
-    """Return the names that no parameter bears, each with the nearest one that exists, or an empty text."""
-    return {
-        name: next(iter(difflib.get_close_matches(name, SPECS, 1)), "")
-        for name in names
-        if name not in SPECS and name not in _FOREIGN and not name.startswith("qos_overrides.")
-    }
-
-
-def _admissible(spec: Field[Any], value: Any) -> bool:
-    default: Any = spec.default
-    if type(value) is not type(default):
-        return False
-    if "choices" in spec.metadata:
-        return value in spec.metadata["choices"]
-    if "unit" in spec.metadata:
-        low, high = spec.metadata["low"], spec.metadata["high"]
-        numbers = value if isinstance(value, tuple) else (value,)
-        return len(numbers) == (len(default) if isinstance(default, tuple) else 1) and all(
-            math.isfinite(number) and low <= number <= high for number in numbers
-        )
-    return True
+def unknown(names: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Yield the names of no parameter, each with the nearest name of one, or an empty text."""
+    for name in names:
+        if name not in SPECS and name not in _FOREIGN and not name.startswith("qos_overrides."):
+            yield name, next(iter(difflib.get_close_matches(name[:100], SPECS, 1)), "")
 
 
 def _yaml_value(value: Any) -> str:

@@ -4,31 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.map_file import LOAD_MODEL, QUANTITIES, ROLES, UNITS, map_error, read_map_file
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
-from plow_twin.scene_file.yaml_text import load_yaml
 
-#: What a recording can hold, and the numbers of each, with the fields where they stand by default, by type.
-ROLES: Final[dict[str, tuple[str, ...]]] = {
-    "excitation": ("fx", "fy", "m"),
-    "head_pose": ("x", "y", "theta"),
-    "travel": ("speed",),
-    "gaps": PAIR_NAMES,
-    "forces": PAIR_NAMES,
-    "drive": ("power", "chain_force", "speed", "depth", "position"),
-}
 #: How a reason begins under which messages are counted that a role cannot use.
 UNFIT: Final = "unfit, "
-#: Key of a mapping that is no role: how a live twin makes the load of what the drive tells.
-LOAD_MODEL: Final = "load_model"
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("excitation", "geometry_msgs/msg/WrenchStamped"): _WRENCH,
@@ -59,32 +48,6 @@ _NAMES: Final = {
     "travel": ("travel",),
     "forces": ("measured_forces", "forces"),
     "gaps": ("gaps",),
-}
-_KEYS: Final = (
-    *("topic", "type", "fields", "scale", "offset", "unit", "limits"),
-    *("stamp", "stamp_unit", "clock_offset", "sequence"),
-)
-#: Units in SI, by what they measure.
-UNITS: Final[dict[str, dict[str, float]]] = {
-    "force": {"N": 1.0, "kN": 1e3, "MN": 1e6},
-    "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},
-    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
-    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0},
-    "power": {"W": 1.0, "kW": 1e3, "MW": 1e6},
-    "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
-}
-_QUANTITIES: Final = {
-    **{("excitation", name): "force" for name in ("fx", "fy")},
-    ("excitation", "m"): "moment",
-    **{("head_pose", name): "length" for name in ("x", "y")},
-    ("head_pose", "theta"): "angle",
-    ("travel", "speed"): "speed",
-    ("drive", "power"): "power",
-    ("drive", "chain_force"): "force",
-    ("drive", "speed"): "speed",
-    **{("drive", name): "length" for name in ("depth", "position")},
-    **{("gaps", name): "length" for name in PAIR_NAMES},
-    **{("forces", name): "force" for name in PAIR_NAMES},
 }
 
 
@@ -282,69 +245,43 @@ def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[
 
     Raises
     ------
-    RecordingError
+    MapError
         The file cannot be used; the message names key, value got and value expected.
     """
     if path is None:
         topics = topics or {}
         return {role: found for role in _NAMES if (found := _guess(role, topics)) is not None}
     given = read_map_file(path)
-    return {str(role): _role(path, str(role), entry, topics) for role, entry in given.items() if role != LOAD_MODEL}
+    return {role: _role(path, role, entry, topics) for role, entry in given.items() if role != LOAD_MODEL}
 
 
-def read_map_file(path: Path) -> dict[Any, Any]:
-    """Return what the YAML file of a mapping holds, unchecked.
-
-    Raises
-    ------
-    RecordingError
-        It holds no mapping.
-    """
-    try:
-        given, problems = load_yaml(path.read_text(encoding="utf-8-sig"), "file", ", ".join(ROLES))
-    except (OSError, UnicodeDecodeError, RecursionError) as error:
-        raise RecordingError(f"{path}: cannot be read as YAML: {error}") from error
-    if problems:
-        raise RecordingError(f"{path}: cannot be read as YAML: {'; '.join(map(str, problems))}")
-    if not isinstance(given, dict) or not given:
-        raise RecordingError(f"{path}: got {type(given).__name__}, expected a mapping with {', '.join(ROLES)}")
-    return given
-
-
-def _role(path: Path, role: str, entry: Any, topics: Mapping[str, TopicType] | None) -> Role:
-    if role not in ROLES:
-        raise RecordingError(f"{path}: got {role!r}, expected one of {', '.join(ROLES)}")
-    if not isinstance(entry, dict) or not isinstance(entry.get("topic"), str):
-        raise RecordingError(f"{path}: {role}: got {entry!r}, expected a mapping with a topic")
-    unknown = sorted(set(map(str, entry)) - set(_KEYS))
-    if unknown:
-        raise RecordingError(f"{path}: {role}: got {', '.join(unknown)}, expected keys among {', '.join(_KEYS)}")
+def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, TopicType] | None) -> Role:
     topic, kind = _topic(path, role, entry, topics)
     fields = entry.get("fields") or _default_fields(role, kind)
     if not fields:
-        raise RecordingError(f"{path}: {role}: fields are missing, and there are no default ones for {kind}")
-    stamp, sequence = (
-        _path(path, role, key, entry.get(key, usual)) for key, usual in (("stamp", "header"), ("sequence", ""))
-    )
+        raise map_error(path, f"{role}.fields", "nothing", f"fields: {kind} has no default ones")
+    if role == "excitation" and (missing := set(ROLES[role]) - set(fields)):
+        raise map_error(path, f"{role}.fields", sorted(fields), f"{', '.join(sorted(missing))} too")
+    units = entry.get("unit", {})
     found = Role(
         topic,
         kind,
-        _named(path, role, "fields", fields, _text),
-        _named(path, role, "scale", _given(entry, "scale"), _number),
-        _named(path, role, "offset", _given(entry, "offset"), _number),
-        stamp,
-        _factors(path, role, entry.get("unit") or {}),
-        _limits(path, role, entry.get("limits") or {}),
-        _choice(path, role, "stamp_unit", entry.get("stamp_unit", "s"), STAMP_UNITS),
-        round(_clock_offset(path, role, entry.get("clock_offset", 0.0)) * 1e9),
-        sequence,
+        {name: str(field) for name, field in fields.items()},
+        entry.get("scale", {}),
+        entry.get("offset", {}),
+        str(entry.get("stamp", "header")),
+        {name: UNITS[QUANTITIES[role, name]][unit] for name, unit in units.items()},
+        {name: _limits(path, f"{role}.limits.{name}", given) for name, given in entry.get("limits", {}).items()},
+        entry.get("stamp_unit", "s"),
+        round(entry.get("clock_offset", 0.0) * 1e9),
+        str(entry.get("sequence", "")),
         "stamp_unit" in entry,
     )
     _check_columns(path, role, found)
     if "stamp_unit" in entry:
         _check_stamp_unit(path, role, found)
-    if not isinstance(kind, Columns) and kind != "json" and stamp not in ("header", "log"):
-        raise RecordingError(f"{path}: {role}: stamp: got {stamp!r}, expected header or log for {kind}")
+    if not isinstance(kind, Columns) and kind != "json" and found.stamp not in ("header", "log"):
+        raise map_error(path, f"{role}.stamp", found.stamp, f"header or log for {kind}")
     return found
 
 
@@ -368,15 +305,23 @@ def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str,
             there = sorted({field for role in roles.values() for field in role.fields} | {"t"})
             raise RecordingError(f"unit of {name}: got an unknown name, expected one of {', '.join(there)}")
         for key in having:
-            known = UNITS[_QUANTITIES[key, name]]
+            known = UNITS[QUANTITIES[key, name]]
             if unit not in known:
                 raise RecordingError(f"unit of {name}: got {unit!r}, expected one of {', '.join(known)}")
             changed[key] = replace(changed[key], factor={**changed[key].factor, name: known[unit]})
     return changed
 
 
+def _limits(path: Path, key: str, given: float | list[float]) -> tuple[float, float]:
+    """Return smallest and largest; one number stands for both signs."""
+    low, high = given if isinstance(given, list) else (-given, given)
+    if not low < high:
+        raise map_error(path, key, given, "the smallest number, then the largest")
+    return float(low), float(high)
+
+
 def _check_columns(path: Path, name: str, role: Role) -> None:
-    """Raise a `RecordingError` for what is neither a column of a file of lines nor lies in one (`load.f[0]`)."""
+    """Raise a `MapError` for a name that is neither a column of a file of lines nor a place in one (`load.f[0]`)."""
     columns = role.message_type
     if not isinstance(columns, Columns):
         return
@@ -385,11 +330,11 @@ def _check_columns(path: Path, name: str, role: Role) -> None:
     named += [("sequence", role.sequence)] if role.sequence else []
     for key, column in named:
         if not {column, re.split(r"[.\[]", column, maxsplit=1)[0]} & set(columns.names):
-            raise RecordingError(f"{path}: {name}: {key}: got {column!r}, expected one of the {columns}")
+            raise map_error(path, f"{name}.{key}", column, f"one of the {columns}")
 
 
 def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
-    """Raise a `RecordingError` where no stamp is read in the unit that was asked for."""
+    """Raise a `MapError` for a unit in which no stamp is read."""
     kind, why = role.message_type, ""
     if role.stamp == "log":
         why = "none beside stamp: log"
@@ -398,7 +343,7 @@ def _check_stamp_unit(path: Path, name: str, role: Role) -> None:
     elif role.stamp == "header" and not isinstance(kind, Columns) and kind != "json":
         why = f"none: {kind} has stamps in ns"
     if why:
-        raise RecordingError(f"{path}: {name}: stamp_unit: got {role.stamp_unit!r}, expected {why}")
+        raise map_error(path, f"{name}.stamp_unit", role.stamp_unit, why)
 
 
 def _topic(
@@ -412,102 +357,11 @@ def _topic(
         topic if topic in topics else next((name for name in topics if name.lstrip("/") == topic.lstrip("/")), topic)
     )
     if topic not in topics:
-        raise RecordingError(f"{path}: {role}: topic: got {topic!r}, expected one of {', '.join(sorted(topics))}")
+        raise map_error(path, f"{role}.topic", topic, f"one of {', '.join(sorted(topics))}")
     kind = topics[topic]
     if not isinstance(kind, Columns) and entry.get("type", kind) != kind:
-        raise RecordingError(f"{path}: {role}: type: got {entry['type']!r}, but {topic} is of type {kind!r}")
+        raise map_error(path, f"{role}.type", entry["type"], f"{kind}, the type of {topic}")
     return topic, kind
-
-
-def _factors(path: Path, role: str, given: Any) -> dict[str, float]:
-    """Return what takes each number to SI."""
-    if isinstance(given, str):
-        given = dict.fromkeys(ROLES[role], given)
-    units = _named(path, role, "unit", given, _text)
-    return {
-        name: UNITS[_QUANTITIES[role, name]][_choice(path, role, "unit", unit, UNITS[_QUANTITIES[role, name]])]
-        for name, unit in units.items()
-    }
-
-
-def _limits(path: Path, role: str, given: Any) -> dict[str, tuple[float, float]]:
-    """Return smallest and largest of each number; one number given stands for both signs."""
-    if isinstance(given, list):
-        given = dict.fromkeys(ROLES[role], given)
-
-    def pair(value: Any) -> tuple[float, float]:
-        low, high = map(_number, value) if isinstance(value, list) else (-_number(value), _number(value))
-        if not low < high:
-            raise ValueError(value)
-        return low, high
-
-    return _named(path, role, "limits", given, pair)
-
-
-def _choice(path: Path, role: str, key: str, given: Any, known: Mapping[str, Any]) -> str:
-    if not isinstance(given, str) or given not in known:
-        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected one of {', '.join(known)}")
-    return given
-
-
-def _path(path: Path, role: str, key: str, given: Any) -> str:
-    """Return where something stands in a message."""
-    try:
-        return _text(given)
-    except TypeError as error:
-        expected = "expected the name of a column or a path"
-        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, {expected}") from error
-
-
-def _text(given: Any) -> str:
-    """Return a name; one of digits is an integer in YAML."""
-    if isinstance(given, bool) or not isinstance(given, str | int):
-        raise TypeError(given)
-    return str(given)
-
-
-def _number(given: Any) -> float:
-    if isinstance(given, bool):
-        raise TypeError(given)
-    return float(given)
-
-
-def _given(entry: Mapping[str, Any], key: str) -> Any:
-    """Return what stands under a key; a number of 0 is one."""
-    value = entry.get(key)
-    return {} if value is None else value
-
-
-def _clock_offset(path: Path, role: str, given: Any) -> float:
-    if isinstance(given, bool) or not isinstance(given, int | float) or not abs(given) < 1e9:
-        raise RecordingError(f"{path}: {role}: clock_offset: got {given!r}, expected a number of seconds")
-    return float(given)
-
-
-_EXPECTED: Final = {
-    "fields": "names of columns, or paths",
-    "scale": "numbers",
-    "offset": "numbers",
-    "unit": "units",
-    "limits": "numbers, or pairs of smallest and largest",
-}
-
-
-def _named(path: Path, role: str, key: str, given: Any, kind: Callable[[Any], Any]) -> dict[str, Any]:
-    names = ROLES[role]
-    if isinstance(given, int | float) and not isinstance(given, bool) and key != "fields":
-        given = dict.fromkeys(names, given)
-    if not isinstance(given, dict) or not set(map(str, given)) <= set(names):
-        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected a mapping of {', '.join(names)}")
-    try:
-        values = {str(name): kind(value) for name, value in given.items()}
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected {_EXPECTED[key]}") from error
-    if any(isinstance(value, float) and not math.isfinite(value) for value in values.values()):
-        raise RecordingError(f"{path}: {role}: {key}: got {given!r}, expected finite numbers")
-    if key == "fields" and role == "excitation" and set(values) != set(names):
-        raise RecordingError(f"{path}: {role}: fields: got {sorted(values)}, expected all of {', '.join(names)}")
-    return values
 
 
 def _default_fields(role: str, kind: TopicType) -> dict[str, str]:

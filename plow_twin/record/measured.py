@@ -24,7 +24,8 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.bag import readable_beside
 from plow_twin.record.entries import Holes
 from plow_twin.record.estimated import stated
-from plow_twin.record.mapping import ROLES, UNFIT, messages_of, readings, roles_by_source
+from plow_twin.record.map_file import ROLES
+from plow_twin.record.mapping import UNFIT, messages_of, readings, roles_by_source
 from plow_twin.record.reader import RunReader, own_run
 from plow_twin.record.sources import open_source, read_table
 from plow_twin.record.times import EPOCH_S, time_ns

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import Problem, RecordingError
 from plow_twin.record.cdr import type_hash
 from plow_twin.record.durable import sync_path
-from plow_twin.scene_file.yaml_text import load_yaml as read_yaml
+from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
@@ -59,20 +59,6 @@ def qos_text(base_name: str) -> str:
     return dump_yaml([qos_profile(base_name)]).strip()
 
 
-def load_yaml(text: str) -> Any:
-    """Return what YAML holds, read as a scene is: by libyaml where it is there.
-
-    Raises
-    ------
-    RecordingError
-        It is no YAML.
-    """
-    found, problems = read_yaml(text, "metadata", "those of a bag")
-    if problems:
-        raise RecordingError(f"{problems[0]}")
-    return found
-
-
 def dump_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
     """Return YAML in block style."""
     from ruamel.yaml import YAML
@@ -118,7 +104,9 @@ def bag_metadata(parts: Sequence[PartFacts], custom: Mapping[str, str]) -> dict[
                 "name": topic.topic,
                 "type": topic.message_type,
                 "serialization_format": "cdr",
-                "offered_qos_profiles": load_yaml(topic.qos) if topic.qos else [qos_profile("")],
+                "offered_qos_profiles": _parsed(load_yaml(topic.qos, "QoS", "profiles"))
+                if topic.qos
+                else [qos_profile("")],
                 "type_description_hash": topic.type_hash or type_hash(topic.message_type),
             },
             "message_count": topic.count,
@@ -151,19 +139,30 @@ def listed_parts(folder: Path) -> list[str]:
     """
     path = folder / "metadata.yaml"
     try:
-        found = load_yaml(path.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]["relative_file_paths"]
-    except Exception as error:  # the library's own, for each kind of damage another
+        found = _information(folder)["relative_file_paths"]
+    except (RecordingError, LookupError, TypeError) as error:
         raise RecordingError(f"{path}: cannot be read as the metadata of a bag") from error
     return [str(name) for name in found]
+
+
+def _information(folder: Path) -> Any:
+    return _parsed(read_yaml(folder / "metadata.yaml", "metadata", "those of a bag"))["rosbag2_bagfile_information"]
+
+
+def _parsed(read: tuple[Any, list[Problem]]) -> Any:
+    """Return a document that was read; raises `RecordingError` for one with problems."""
+    document, problems = read
+    if problems:
+        raise RecordingError(f"{problems[0]}")
+    return document
 
 
 def told_lost(folder: Path) -> dict[str, int]:
     """Return by topic what `metadata.yaml` says that its recorder has lost; nothing where it cannot be read."""
     try:
-        found = load_yaml((folder / "metadata.yaml").read_text(encoding="utf-8"))
-        custom = found["rosbag2_bagfile_information"]["custom_data"] or {}
+        custom = _information(folder)["custom_data"] or {}
         return {key.removeprefix(LOST): int(count) for key, count in custom.items() if key.startswith(LOST)}
-    except Exception:
+    except (RecordingError, LookupError, TypeError, AttributeError, ValueError):
         return {}
 
 

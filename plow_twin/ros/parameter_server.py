@@ -68,7 +68,7 @@ class ParameterServer:
         self._refusals = refusals
         found: dict[str, Any] = dict(node.get_parameters_by_prefix(""))
         given = {name: parameter.value for name, parameter in found.items()}
-        self.unknown = parameters.unknown(given)
+        self.unknown = dict(parameters.unknown(given))
         for name, nearest in self.unknown.items():
             hint = f"; did you mean {nearest}?" if nearest else ""
             node.get_logger().warning(f"unknown parameter {name}: {given[name]!r} is not used{hint}")

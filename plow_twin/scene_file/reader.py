@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -23,11 +24,12 @@ from plow_twin.model.scene import (
     Table,
 )
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS
+from plow_twin.scene_file.schema import LOAD_KINDS, SECTIONS, scene_schema
 from plow_twin.scene_file.table import read_table, sample_table
-from plow_twin.scene_file.validation import validate
-from plow_twin.scene_file.yaml_text import load_yaml
+from plow_twin.scene_file.validation import Schema, validate
+from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
+_SECTIONS: Final = "the sections of a scene"
 #: Stands in for a part with problems, so that the other parts can still be checked against each other.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
@@ -58,12 +60,7 @@ def load_scene(path: str | Path) -> Scene:
         When the file cannot be read or used; it lists every problem.
     """
     path = scene_path(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
-        raise SceneError([Problem("file", str(path), f"a readable scene file ({reason})")], str(path)) from None
-    return loads_scene(text, path.parent, source=str(path))
+    return _scene(*read_yaml(path, "scene", _SECTIONS), path.parent, str(path))
 
 
 def loads_scene(text: str, base: str | Path | None = None, *, source: str = "scene") -> Scene:
@@ -83,13 +80,22 @@ def loads_scene(text: str, base: str | Path | None = None, *, source: str = "sce
     SceneError
         When the scene cannot be used; it lists every problem.
     """
-    raw, problems = load_yaml(text)
+    return _scene(*load_yaml(text, "scene", _SECTIONS), Path(base or "."), source)
+
+
+@cache
+def _schema() -> Schema:
+    return scene_schema()
+
+
+def _scene(raw: Any, problems: list[Problem], base: Path, source: str) -> Scene:
+    """Return the scene in a document that was read with these problems."""
     if raw is None and problems:
         raise SceneError(problems, source)
-    problems += validate(raw)
+    problems += validate(raw, _schema(), "scene")
     bad = {problem.key.partition(".")[0] for problem in problems}
     marks: dict[str, Provenance] = {}
-    parts = _read_parts(raw, bad, marks, Path(base or "."), problems) if isinstance(raw, dict) else {}
+    parts = _read_parts(raw, bad, marks, base, problems) if isinstance(raw, dict) else {}
     if problems:
         raise SceneError([*problems, *_problems_across(parts)], source)
     try:

@@ -26,8 +26,7 @@ from plow_twin.model.scene import (
     describe,
     must_be_given,
 )
-
-Schema = dict[str, Any]
+from plow_twin.scene_file.validation import Schema
 
 #: Sections of the file that are one dataclass each.
 SECTIONS: Final[dict[str, type]] = {

@@ -1,11 +1,16 @@
-"""Check of a scene's plain data against its schema, with messages for people: key, value got, value expected."""
+"""Check of plain data against a JSON schema, with messages for people: key, value got, value expected.
+
+Every mapping that a user writes is checked here: scenes, parameters, mappings of recordings, load models. Each schema
+says under `description` what stands in a place; that is what a message expects there.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from difflib import get_close_matches
 from functools import cache
+from itertools import islice
 from typing import Any, Final, cast
 
 from jsonschema import Draft202012Validator
@@ -14,42 +19,53 @@ from jsonschema.protocols import Validator
 from jsonschema.validators import extend
 
 from plow_twin.errors import Problem
-from plow_twin.scene_file.schema import scene_schema
+
+Schema = dict[str, Any]
 
 
-class _Nothing:
-    """The value of a key that is missing."""
+class _Shown:
+    """Words that stand for a value in a message."""
 
-    def __repr__(self) -> str:
-        return "nothing"
-
-
-class _Long:
-    """A value too long to print."""
-
-    def __init__(self, value: list[Any] | dict[Any, Any]) -> None:
-        self.text = f"a {'list' if isinstance(value, list) else 'mapping'} of {len(value)}"
+    def __init__(self, text: str) -> None:
+        self.text = text
 
     def __repr__(self) -> str:
         return self.text
 
 
-NOTHING: Final = _Nothing()
-_LONGEST_VALUE: Final = 200
+#: The value of a key that is missing.
+NOTHING: Final = _Shown("nothing")
+#: Longest value that is printed, and longest name [characters].
+_LONGEST: Final = 200
+#: Most problems that are listed: nobody reads more, and looking up the nearest key for each takes a while.
+MOST_PROBLEMS: Final = 50
 
 
-def validate(raw: Any) -> list[Problem]:
-    """Return every problem of a scene's plain data, in the order of the schema."""
-    problems = (problem for error in _validator().iter_errors(raw) for problem in _explain(error))
-    # jsonschema reports a mapping once for each key that it misses
-    return list({str(problem): _brief(problem) for problem in problems}.values())
+def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
+    """Return the problems of plain data, which are called by `name` as a whole, in the order of the schema."""
+    problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
+    unique: dict[str, Problem] = {}  # jsonschema reports a mapping once for each key that it misses
+    for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
+        unique[str(problem)] = problem
+    return list(unique.values())[:MOST_PROBLEMS]
+
+
+def _validator(schema: Schema) -> Validator:
+    validator: Validator = _validator_class()(schema)
+    return validator
 
 
 @cache
-def _validator() -> Validator:
-    checker = Draft202012Validator.TYPE_CHECKER.redefine("number", lambda _, value: _is_number(value))
-    validator: Validator = extend(Draft202012Validator, type_checker=checker)(scene_schema())  # type: ignore[no-untyped-call]
-    return validator
+def _validator_class() -> Callable[[Schema], Validator]:
+    """Return a validator for YAML: NaN, infinity and integers beyond float64 are no numbers, 1.0 is no integer."""
+    checker = Draft202012Validator.TYPE_CHECKER.redefine_many(
+        {
+            "number": lambda _, value: _is_number(value),
+            "integer": lambda _, value: isinstance(value, int) and not isinstance(value, bool),
+            "array": lambda _, value: isinstance(value, list | tuple),
+        }
+    )
+    return cast("Callable[[Schema], Validator]", extend(Draft202012Validator, type_checker=checker))  # type: ignore[no-untyped-call]
 
 
 def _is_number(value: Any) -> bool:
@@ -61,9 +77,9 @@ def _is_number(value: Any) -> bool:
         return False
 
 
-def _explain(error: ValidationError) -> Iterator[Problem]:
+def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
     key, instance = _key(error.absolute_path), cast(Any, error.instance)
-    schema = cast(dict[str, Any], error.schema)
+    schema = cast(Schema, error.schema)
     if error.validator == "required":
         for name in schema["required"]:
             if name not in instance:
@@ -75,44 +91,55 @@ def _explain(error: ValidationError) -> Iterator[Problem]:
             Problem(_join(key, name), name, "a text as label") for name in instance if not isinstance(name, str)
         )
     elif error.validator == "anyOf":
-        yield from _closest_branch(key, error)
+        yield from _closest_branch(key or whole, error, whole)
     elif error.validator == "oneOf":
-        yield Problem(key, sorted(map(str, instance)), schema["description"])
+        yield Problem(key or whole, sorted(map(str, instance)), schema["description"])
     else:
-        yield Problem(key or "scene", instance, schema.get("description", error.message))
+        yield Problem(key or whole, instance, schema.get("description", error.message))
 
 
-def _closest_branch(key: str, error: ValidationError) -> Iterator[Problem]:
+def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
     """Explain the branch whose type fits the value; when none fits, what the key takes at all."""
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
         branches.setdefault(inner.schema_path[0], []).append(inner)
     for errors in branches.values():
-        misfit = any(not inner.relative_path and inner.validator in ("type", "const", "enum") for inner in errors)
-        if not misfit:
+        if not any(not inner.relative_path and _is_misfit(inner) for inner in errors):
             for inner in errors:
-                yield from _explain(inner)
+                yield from _explain(inner, whole)
             return
-    yield Problem(key, error.instance, cast(dict[str, Any], error.schema)["description"])
+    yield Problem(key, error.instance, cast(Schema, error.schema)["description"])
+
+
+def _is_misfit(error: ValidationError) -> bool:
+    """Tell whether an error says that a branch is for another kind of value, or for other keys."""
+    keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
+    return keys_alone or error.validator in ("type", "const", "enum")
 
 
 def _brief(problem: Problem) -> Problem:
-    """Say of a long value only what it is."""
-    if isinstance(problem.got, list | dict) and len(repr(problem.got)) > _LONGEST_VALUE:
-        return Problem(problem.key, _Long(problem.got), problem.expected)
-    return problem
+    """Return the problem with words for a value that is too long to print."""
+    got = problem.got
+    if isinstance(got, list | tuple | dict) and len(repr(got)) > _LONGEST:
+        shown = _Shown(f"a {'mapping' if isinstance(got, dict) else 'list'} of {len(got)}")
+    elif isinstance(got, str) and len(got) > _LONGEST:
+        shown = _Shown(f"{got[:_LONGEST]!r}... ({len(got)} characters)")
+    else:
+        return problem
+    return Problem(problem.key, shown, problem.expected)
 
 
-def _unknown_keys(key: str, instance: dict[Any, Any], known: dict[str, Any]) -> Iterator[Problem]:
+def _unknown_keys(key: str, instance: dict[Any, Any], known: Schema) -> Iterator[Problem]:
     for name in instance:
         if name not in known:
-            near = get_close_matches(str(name), known, n=1, cutoff=0.5)
-            expected = f"a known key, nearest is {near[0]}" if near else f"a known key: {', '.join(known)}"
+            near = get_close_matches(str(name)[:_LONGEST], known, n=1, cutoff=0.5)
+            expected = f"a known key; did you mean {near[0]}?" if near else f"a known key: {', '.join(known)}"
             yield Problem(_join(key, name), instance[name], expected)
 
 
 def _join(key: str, name: Any) -> str:
-    return f"{key}.{name}" if key else str(name)
+    name = str(name)[:_LONGEST]
+    return f"{key}.{name}" if key else name
 
 
 def _key(path: Iterable[Any]) -> str:

@@ -1,9 +1,16 @@
-"""YAML for scene files: safe, numbers by the YAML 1.2 core schema, repeated keys found, floats written exactly."""
+"""YAML of files that a user names: safe, bounded, numbers by the YAML 1.2 core schema, floats written exactly.
+
+A file may come from anybody. Its parser events are counted before any of it is built: libyaml builds nested
+collections by recursion in C, and aliases make a few lines stand for any number of values.
+"""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import yaml
@@ -17,8 +24,15 @@ except ImportError:
     from yaml import SafeDumper as _Dumper  # type: ignore[assignment]
     from yaml import SafeLoader as _Loader  # type: ignore[assignment]
 
-#: A scene is nested about six deep; more is an alias to itself.
-_MAX_DEPTH: Final = 20
+#: Largest file [B] and most values in it: a table of 200,000 rows, which takes ten seconds; longer ones stand in CSV.
+LARGEST_FILE: Final = 64 * 2**20
+MOST_VALUES: Final = 1_000_000
+#: Deepest nesting of collections; a scene has six levels.
+DEEPEST: Final = 20
+#: Most keys of a document: a scene has some hundred, the `metadata.yaml` of 1,000 parts 20,000.
+MOST_KEYS: Final = 50_000
+#: Most values that the aliases of a document stand for together.
+MOST_REPEATED: Final = 50_000
 
 _FLOAT: Final = re.compile(r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan)$", re.I)
 # tag, pattern, first characters; the first match decides
@@ -52,28 +66,112 @@ SceneLoader.add_constructor("tag:yaml.org,2002:int", lambda _, node: int(node.va
 SceneDumper.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
 
 
-def load_yaml(text: str, name: str = "scene", sections: str = "the sections of a scene") -> tuple[Any, list[Problem]]:
+def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]:
+    """Return what a YAML file holds and its problems, as `load_yaml`, within `LARGEST_FILE` and `MOST_VALUES`."""
+    try:
+        with path.open("rb") as stream:
+            data = stream.read(LARGEST_FILE + 1)
+        if len(data) > LARGEST_FILE:
+            return None, [Problem("file", str(path), f"at most {LARGEST_FILE >> 20} MiB of YAML")]
+        text = data.decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8"
+        return None, [Problem("file", str(path), f"a readable {name} file ({reason})")]
+    return load_yaml(text, name, sections, most_values=MOST_VALUES)
+
+
+def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.inf) -> tuple[Any, list[Problem]]:
     """Return the document and its problems, which call it by `name`; it is None when it cannot be read at all."""
     try:
+        excess = _excess(text, most_values)
+        if excess is not None:
+            return None, [excess]
         loader = SceneLoader(text)
         try:
             node = loader.get_single_node()
             if node is None:
                 return None, [Problem(name, "an empty file", sections)]
-            problems = list(_repeated_keys(node, "", 0))
-            if any(problem.got == "an alias to itself" for problem in problems):
-                return None, problems
+            problems = list(_repeated_keys(node, ""))
             return loader.construct_document(node), problems
         finally:
             loader.dispose()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else name
-        return None, [Problem(where, str(error.problem), "YAML")]
+        return None, [Problem(_place(mark) if mark else name, str(error.problem), "YAML")]
     except yaml.YAMLError as error:
         return None, [Problem(name, " ".join(str(error).split()), "YAML")]
     except ValueError as error:  # an integer of thousands of digits
         return None, [Problem(name, str(error), "numbers")]
+
+
+@dataclass
+class _Size:
+    """Size of a node with all below it, each alias counted as the node that it stands for."""
+
+    values: int = 1
+    keys: int = 0
+    depth: int = 0
+
+
+def _excess(text: str, most_values: float) -> Problem | None:
+    """Return the bound that a document exceeds, by its events alone; errors of YAML are raised."""
+    scalar = _Size()
+    values = repeated = 0
+    sizes: dict[str, _Size | None] = {}  # by anchor; None: the node has not ended
+    outer, is_mapping, anchor = _Size(), False, None
+    stack: list[tuple[_Size, bool, str | None]] = []  # the same of the collections around it
+    event: Any
+    for event in yaml.parse(text, SceneLoader):
+        kind = type(event)
+        node, depth = scalar, len(stack)
+        if kind is yaml.ScalarEvent:
+            if event.anchor:
+                sizes[event.anchor] = scalar
+        elif kind is yaml.SequenceStartEvent or kind is yaml.MappingStartEvent:
+            stack.append((outer, is_mapping, anchor))
+            outer, is_mapping, anchor = _Size(), kind is yaml.MappingStartEvent, event.anchor
+            if anchor:
+                sizes[anchor] = None
+            if len(stack) > DEEPEST:
+                return _above(event, len(stack), DEEPEST, "levels of nesting")
+            continue
+        elif kind is yaml.SequenceEndEvent or kind is yaml.MappingEndEvent:
+            node = outer
+            if anchor:
+                sizes[anchor] = outer
+            outer, is_mapping, anchor = stack.pop()
+        elif kind is yaml.AliasEvent:
+            known = sizes.get(event.anchor, scalar)  # the composer says where an anchor is missing
+            if known is None:
+                return Problem(_place(event.start_mark), "an alias to itself", "an alias to a node before it")
+            node = known
+            repeated += node.values
+            if repeated > MOST_REPEATED:
+                return _above(event, repeated, MOST_REPEATED, "values by aliases")
+            if depth + node.depth > DEEPEST:
+                return _above(event, depth + node.depth, DEEPEST, "levels of nesting")
+        else:
+            continue
+        values += 1
+        if values > most_values:
+            return _above(event, values, most_values, "values", " (a longer table can stand in a csv file)")
+        outer.values += node.values
+        if is_mapping:
+            outer.keys += 1
+        outer.keys += node.keys
+        if outer.keys > 2 * MOST_KEYS:  # an item is a key or its value
+            return _above(event, (outer.keys + 1) // 2, MOST_KEYS, "keys")
+        if outer.depth <= node.depth:
+            outer.depth = node.depth + 1
+    return None
+
+
+def _above(event: Any, got: int, most: float, unit: str, more: str = "") -> Problem:
+    return Problem(_place(event.start_mark), f"{got} {unit}", f"at most {most} {unit}{more}")
+
+
+def _place(mark: Any) -> str:
+    return f"line {mark.line + 1}, column {mark.column + 1}"
 
 
 def dump_yaml(data: Any) -> str:
@@ -81,14 +179,12 @@ def dump_yaml(data: Any) -> str:
     return yaml.dump(data, Dumper=SceneDumper, sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
 
 
-def _repeated_keys(node: yaml.Node, path: str, depth: int) -> Iterator[Problem]:
-    if depth > _MAX_DEPTH:
-        yield Problem(path, "an alias to itself", f"nesting of at most {_MAX_DEPTH}")
-    elif isinstance(node, yaml.SequenceNode):
+def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
+    if isinstance(node, yaml.SequenceNode):
         # the rows of long tables hold no mappings
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
-                yield from _repeated_keys(item, f"{path}[{index}]", depth + 1)
+                yield from _repeated_keys(item, f"{path}[{index}]")
     elif isinstance(node, yaml.MappingNode):
         lines: dict[str, int] = {}
         for key, value in node.value:
@@ -98,4 +194,4 @@ def _repeated_keys(node: yaml.Node, path: str, depth: int) -> Iterator[Problem]:
             if name in lines:
                 yield Problem(here, f"the key twice, in lines {lines[name]} and {line}", "each key once")
             lines[name] = line
-            yield from _repeated_keys(value, here, depth + 1)
+            yield from _repeated_keys(value, here)

@@ -9,7 +9,8 @@ from itertools import pairwise
 from plow_twin.live.load_model import LoadModel
 from plow_twin.live.runtime import Runtime
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.mapping import ROLES, Role
+from plow_twin.record.map_file import ROLES
+from plow_twin.record.mapping import Role
 from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict

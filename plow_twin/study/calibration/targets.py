@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.scene import Mark, Scene
-from plow_twin.scene_file.yaml_text import load_yaml
+from plow_twin.scene_file.yaml_text import read_yaml
 from plow_twin.study.parameters import StudyError, Value, check_path
 from plow_twin.study.statistics import statistic
 
@@ -148,10 +148,7 @@ def load_targets(path: Path, scene: Scene) -> TargetSet:
     StudyError
         When it cannot be read or used; lists every problem.
     """
-    try:
-        raw, found = load_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path}: got no readable target file ({error})") from None
+    raw, found = read_yaml(path, "target", "version, t_end, targets")
     problems = [str(problem) for problem in found]
     if not problems and not (isinstance(raw, dict) and isinstance(raw.get("targets"), list) and raw["targets"]):
         problems.append("got no list `targets`, expected version, t_end, targets")

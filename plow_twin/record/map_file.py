@@ -1,0 +1,186 @@
+"""The file of a mapping: roles of topics, units, and how a live twin makes the load from the drive's signals."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
+
+from plow_twin.errors import InputError, Problem, RecordingError
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.times import STAMP_UNITS
+
+Schema = dict[str, Any]
+
+#: Roles that a topic can have, and the numbers of each.
+ROLES: Final[dict[str, tuple[str, ...]]] = {
+    "excitation": ("fx", "fy", "m"),
+    "head_pose": ("x", "y", "theta"),
+    "travel": ("speed",),
+    "gaps": PAIR_NAMES,
+    "forces": PAIR_NAMES,
+    "drive": ("power", "chain_force", "speed", "depth", "position"),
+}
+#: Key of a mapping beside the roles: how a live twin makes the load from the drive's signals.
+LOAD_MODEL: Final = "load_model"
+#: Units in SI, by what they measure.
+UNITS: Final[dict[str, dict[str, float]]] = {
+    "force": {"N": 1.0, "kN": 1e3, "MN": 1e6},
+    "moment": {"N m": 1.0, "Nm": 1.0, "kN m": 1e3, "kNm": 1e3},
+    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0},
+    "power": {"W": 1.0, "kW": 1e3, "MW": 1e6},
+    "speed": {"m/s": 1.0, "mm/s": 1e-3, "m/min": 1.0 / 60.0, "km/h": 1.0 / 3.6},
+}
+#: What each number measures.
+QUANTITIES: Final = {
+    **{("excitation", name): "force" for name in ("fx", "fy")},
+    ("excitation", "m"): "moment",
+    **{("head_pose", name): "length" for name in ("x", "y")},
+    ("head_pose", "theta"): "angle",
+    ("travel", "speed"): "speed",
+    ("drive", "power"): "power",
+    ("drive", "chain_force"): "force",
+    ("drive", "speed"): "speed",
+    **{("drive", name): "length" for name in ("depth", "position")},
+    **{("gaps", name): "length" for name in PAIR_NAMES},
+    **{("forces", name): "force" for name in PAIR_NAMES},
+}
+
+_PLACE: Final[Schema] = {"type": ["string", "integer"], "description": "the name of a column or a path"}
+_NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
+_LIMITS: Final[Schema] = {
+    "anyOf": [
+        {"type": "number", "exclusiveMinimum": 0.0, "description": "a finite number > 0"},
+        {"type": "array", "items": _NUMBER, "minItems": 2, "maxItems": 2, "description": "two numbers"},
+    ],
+    "description": "a number, or the smallest and the largest",
+}
+#: Largest difference of two clocks [s].
+_MOST_OFFSET_S: Final = 1e9
+
+
+class MapError(InputError, RecordingError):
+    """A mapping cannot be used, alone or with the recording it is for."""
+
+
+def read_map_file(path: Path) -> dict[str, Any]:
+    """Return the roles and the load model of a mapping file, numbers and texts for all of a role given to each.
+
+    Raises
+    ------
+    MapError
+        The file cannot be used.
+    """
+    from plow_twin.scene_file.validation import validate
+    from plow_twin.scene_file.yaml_text import read_yaml
+
+    given, problems = read_yaml(path, "mapping", ", ".join(ROLES))
+    if isinstance(given, dict):
+        given = {role: _for_each(role, entry) for role, entry in given.items()}
+    problems = problems or validate(given, map_schema(), "mapping")
+    if problems:
+        raise MapError(problems, str(path))
+    checked: dict[str, Any] = given
+    return checked
+
+
+def _for_each(role: Any, entry: Any) -> Any:
+    """Return a role without empty keys, its numbers, units and limits for all given to each name."""
+    if role not in ROLES or not isinstance(entry, dict):
+        return entry
+    kinds: dict[str, tuple[type, ...]] = {
+        "scale": (int, float),
+        "offset": (int, float),
+        "unit": (str,),
+        "limits": (int, float, list),
+    }
+    return {
+        key: dict.fromkeys(ROLES[role], value)
+        if isinstance(value, kinds.get(key, ())) and not isinstance(value, bool)
+        else value
+        for key, value in entry.items()
+        if value is not None
+    }
+
+
+def map_error(path: Path, key: str, got: object, expected: str) -> MapError:
+    """Return the error of one value in a mapping file."""
+    return MapError([Problem(key, got, expected)], str(path))
+
+
+@cache
+def map_schema() -> Schema:
+    """Return the JSON Schema (draft 2020-12) of a mapping file."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "plow_twin mapping",
+        **_mapping({**{role: _role(role) for role in ROLES}, LOAD_MODEL: _load_model()}, ()),
+        "minProperties": 1,
+    }
+
+
+def _mapping(properties: dict[str, Schema], required: tuple[str, ...]) -> Schema:
+    return {
+        "type": "object",
+        "properties": properties,
+        "required": list(required),
+        "additionalProperties": False,
+        "description": f"a mapping with {', '.join(properties)}",
+    }
+
+
+def _role(role: str) -> Schema:
+    names = ROLES[role]
+    units = {name: tuple(UNITS[QUANTITIES[role, name]]) for name in names}
+    keys = {
+        "topic": {"type": "string", "description": "the name of a topic"},
+        "type": {"type": "string", "description": "the type of the topic"},
+        "fields": _mapping(dict.fromkeys(names, _PLACE), ()),
+        "scale": _mapping(dict.fromkeys(names, _NUMBER), ()),
+        "offset": _mapping(dict.fromkeys(names, _NUMBER), ()),
+        "unit": _mapping({name: _choice(units[name]) for name in names}, ()),
+        "limits": _mapping(dict.fromkeys(names, _LIMITS), ()),
+        "stamp": {**_PLACE, "description": f"header, log, {_PLACE['description']}"},
+        "stamp_unit": _choice(tuple(STAMP_UNITS)),
+        "clock_offset": {
+            "type": "number",
+            "exclusiveMinimum": -_MOST_OFFSET_S,
+            "exclusiveMaximum": _MOST_OFFSET_S,
+            "description": "a number of seconds",
+        },
+        "sequence": _PLACE,
+    }
+    return _mapping(keys, ("topic",))
+
+
+def _choice(choices: tuple[str, ...]) -> Schema:
+    return {"enum": list(choices), "description": f"one of {', '.join(choices)}"}
+
+
+def _load_model() -> Schema:
+    point = _pair([_NUMBER, _NUMBER], "two finite numbers: x and y [m]")
+    spread = {"type": "number", "minimum": 0.0, "description": "a standard deviation >= 0"}
+    coefficient = _pair([_NUMBER, spread], "a mean and a standard deviation >= 0")
+    factor = {"type": "number", "minimum": 0.0, "description": "a factor >= 0"}
+    resistance = {
+        "position_m": {"type": "array", "items": _NUMBER, "minItems": 1, "description": "a list of places [m]"},
+        "factor": {"type": "array", "items": factor, "minItems": 1, "description": "a list of factors >= 0"},
+    }
+    sources = ("efficiency", "specific_force_n_m", "idle_force_n")
+    names = ("push_ratio", "lateral_ratio", *sources)
+    keys = {
+        **dict.fromkeys(names, coefficient),
+        "at_m": point,
+        "resistance": _mapping(resistance, ("position_m", "factor")),
+    }
+    return {
+        **_mapping(keys, ("push_ratio", "at_m")),
+        "anyOf": [{"required": [key]} for key in sources],
+        "description": f"a mapping with push_ratio, at_m and {' or '.join(sources)} (for chain_force)",
+    }
+
+
+def _pair(items: list[Schema], expected: str) -> Schema:
+    return {"type": "array", "prefixItems": items, "minItems": 2, "maxItems": 2, "description": expected}

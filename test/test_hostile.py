@@ -1,0 +1,157 @@
+"""YAML from anybody: a few lines that stand for millions of values, nesting without end, files without end."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from plow_twin.scene_file.validation import MOST_PROBLEMS
+from plow_twin.scene_file.yaml_text import (
+    DEEPEST,
+    LARGEST_FILE,
+    MOST_KEYS,
+    MOST_REPEATED,
+    MOST_VALUES,
+    load_yaml,
+    read_yaml,
+)
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def nested(opening: str, levels: int) -> str:
+    """Open collections without closing one."""
+    return opening * levels
+
+
+def laughs(levels: int, times: int = 9) -> str:
+    """Return lists of aliases to lists of aliases: `times` to the power of `levels` values."""
+    lines = ["a0: &a0 [x]"]
+    lines += [f"a{level}: &a{level} [{', '.join([f'*a{level - 1}'] * times)}]" for level in range(1, levels + 1)]
+    return "\n".join(lines)
+
+
+def merges(levels: int, times: int = 9) -> str:
+    """Return mappings that merge mappings that merge mappings."""
+    lines = ["a0: &a0 {k: 1}"]
+    lines += [
+        f"a{level}: &a{level} {{<<: [{', '.join([f'*a{level - 1}'] * times)}]}}" for level in range(1, levels + 1)
+    ]
+    return "\n".join(lines)
+
+
+def keys(count: int) -> str:
+    """Return a mapping of so many keys."""
+    return "\n".join(f"key{number:07d}: 1" for number in range(count))
+
+
+FILES: dict[str, Callable[[], str]] = {
+    "flow sequences": lambda: nested("[", 2_000_000),
+    "flow mappings": lambda: nested("{a: ", 500_000),
+    "block sequences": lambda: nested("- ", 1_000_000),
+    "complex keys": lambda: nested("? ", 1_000_000),
+    "aliases": lambda: laughs(9),
+    "aliases of aliases in depth": lambda: "\n".join(
+        ["- &a0 [x]", *(f"- &a{level} [*a{level - 1}]" for level in range(1, 2 * DEEPEST))]
+    ),
+    "merge keys": lambda: merges(9),
+    "keys": lambda: keys(250_000),
+    "values": lambda: f"[{'0,' * (MOST_VALUES + 10)}]",
+    "unknown keys": lambda: keys(MOST_KEYS),
+    "an alias to itself": lambda: "a: &a {b: *a}",
+    "a scalar of 20 MB": lambda: "a: " + "x" * 20_000_000,
+}
+#: Files that are read, and hold nothing that a reader expects.
+WITHIN = {"unknown keys", "a scalar of 20 MB"}
+#: Each reader of YAML that a user names: arguments of `plow-twin`.
+READERS = {
+    "scene": ["simulate", "FILE", "--t-end", "1"],
+    "mapping": ["live", "load.csv", "--map", "FILE"],
+    "parameters": ["live", "load.csv", "--params", "FILE"],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_files_that_stand_for_too_much_are_refused_in_a_line(reader: str, tmp_path: Path) -> None:
+    """Each ends with exit code 2 and a line; all of them take 60 s of processor time at most, and no signal."""
+    for name, make in FILES.items():
+        (tmp_path / f"{name}.yaml").write_text(make())
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,0,0,0\n1,0,0,0\n")
+    code = f"""
+import resource, sys
+resource.setrlimit(resource.RLIMIT_CPU, (60, 60))
+from plow_twin.cli.app import run
+for name in {list(FILES)!r}:
+    print(name, file=sys.stderr)
+    code = run([word.replace("FILE", name + ".yaml") for word in {READERS[reader]!r}])
+    print("code", code, file=sys.stderr)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "10000"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    said = done.stderr
+    for name in FILES:
+        _, _, rest = said.partition(f"{name}\n")
+        text, code_line, said = rest.partition("\ncode ")
+        assert code_line and said.startswith("2\n"), (name, text[:500])
+        lines = [line for line in text.splitlines() if ": got " in line]
+        assert "Traceback" not in text and len(text) < 20_000, (name, text[:500])
+        assert len(lines) == 1 or name in WITHIN, (name, text[:500])
+
+
+@pytest.mark.parametrize(
+    ("text", "got", "bound"),
+    [
+        (nested("[", DEEPEST + 1), f"{DEEPEST + 1} levels of nesting", DEEPEST),
+        (laughs(9), "values by aliases", MOST_REPEATED),
+        (merges(9), "values by aliases", MOST_REPEATED),
+        (keys(MOST_KEYS + 1), f"{MOST_KEYS + 1} keys", MOST_KEYS),
+        (f"[{'0,' * (MOST_VALUES + 1)}]", f"{MOST_VALUES + 1} values", MOST_VALUES),
+    ],
+    ids=["nesting", "aliases", "merge keys", "keys", "values"],
+)
+def test_what_exceeds_a_bound_is_named_with_its_place(text: str, got: str, bound: int) -> None:
+    found, problems = load_yaml(text, "scene", "sections", most_values=MOST_VALUES)
+    assert found is None and len(problems) == 1
+    assert problems[0].key.startswith("line ")
+    assert got in str(problems[0].got) and f"at most {bound} " in problems[0].expected
+
+
+def test_what_stays_within_the_bounds_is_read() -> None:
+    deep = "[" * DEEPEST + "]" * DEEPEST
+    assert load_yaml(deep, "scene", "sections")[1] == []
+    shared = "head: &one {mass: 1}\nframe: {<<: *one, width: 2}\nloads: [*one, *one]"
+    found, problems = load_yaml(shared, "scene", "sections")
+    assert not problems and found["frame"] == {"mass": 1, "width": 2} and found["loads"] == [{"mass": 1}] * 2
+    assert len(load_yaml(laughs(4), "scene", "sections")[0]["a4"]) == 9
+    assert len(load_yaml(keys(MOST_KEYS), "scene", "sections")[0]) == MOST_KEYS
+
+
+def test_a_file_without_end_is_read_up_to_the_largest(tmp_path: Path) -> None:
+    found, problems = read_yaml(Path("/dev/zero"), "scene", "sections")
+    assert found is None and problems[0].expected == f"at most {LARGEST_FILE >> 20} MiB of YAML"
+    (tmp_path / "latin.yaml").write_bytes(b"a: \xff")
+    assert "not UTF-8" in read_yaml(tmp_path / "latin.yaml", "scene", "sections")[1][0].expected
+
+
+def test_thousands_of_unknown_keys_are_listed_up_to_a_number(tmp_path: Path) -> None:
+    from plow_twin.errors import SceneError
+    from plow_twin.scene_file import loads_scene
+
+    with pytest.raises(SceneError) as caught:
+        loads_scene(keys(MOST_KEYS))
+    assert len(caught.value.problems) == MOST_PROBLEMS
+    with pytest.raises(SceneError) as caught:
+        loads_scene("version: " + "x" * 1_000_000)
+    assert len(str(caught.value)) < 2000 and "(1000000 characters)" in str(caught.value)
