@@ -7,8 +7,10 @@ from collections.abc import Callable
 import click
 
 from plow_twin.cli.app import commands
+from plow_twin.estimate.priors import DEFAULTS
 from plow_twin.live.diagnostics import markdown_tables
 from plow_twin.live.parameters import markdown_table
+from plow_twin.model.scene import Mark
 from plow_twin.stream.topics import TOPICS
 
 
@@ -46,7 +48,16 @@ def _verb(name: str, command: click.Command) -> str:
     return f"| `{f'{name} {arguments}'.strip()}` | {does} | {', '.join(options)} |"
 
 
+def priors() -> str:
+    """Return the prior's standard deviations of a scene's numbers, by mark."""
+    marks = (Mark.MEASURED, Mark.GIVEN, Mark.RECONSTRUCTED, Mark.ASSUMED)
+    lines = ["| number | " + " | ".join(mark.value for mark in marks) + " |", "|---" * (1 + len(marks)) + "|"]
+    for name, by_mark in DEFAULTS.items():
+        lines.append(f"| {name} | " + " | ".join(f"{by_mark[mark]:g}" for mark in marks) + " |")
+    return "\n".join(lines)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "topics": topics, "parameters": markdown_table, "status_keys": lambda: markdown_tables()["status"],
-    "diagnostics": diagnostics, "verbs": verbs,
+    "diagnostics": diagnostics, "verbs": verbs, "priors": priors,
 }  # fmt: skip

@@ -58,24 +58,24 @@ class Settings:
     """All parameters with their defaults; numbers in SI units."""
 
     autostart: bool = _plain(True, Effect.START, "configure and activate at start; false: wait for lifecycle requests")
-    hardware_id: str = _plain("plough_head", Effect.START, "serial of the head, in status and diagnostics")
+    hardware_id: str = _plain("plough_head", Effect.START, "serial number of the head, shown in status and diagnostics")
     priority: int = _number(
         0,
         "SCHED_FIFO",
         0,
         99,
         Effect.START,
-        "priority of the thread that computes; 0: as any other; what the system refuses is a warning",
+        "priority of the computing thread; 0: normal; a refusal by the system is a warning",
     )
-    cpu_affinity: str = _plain("", Effect.START, "processors to run on, e.g. 2,3; empty: all; refused: a warning")
-    lock_memory: bool = _plain(False, Effect.START, "keep all memory from being paged out; refused: a warning")
+    cpu_affinity: str = _plain("", Effect.START, "processors to run on, e.g. 2,3; empty: all; a refusal is a warning")
+    lock_memory: bool = _plain(False, Effect.START, "keep all memory from being paged out; a refusal is a warning")
     scene: str = _plain("paper", Effect.CONFIGURE, "scene file, or the name of a preset: paper, bench_kv, bench_hc")
     tolerance: float = _number(1e-9, "1", 1e-13, 1e-3, Effect.CONFIGURE, "relative tolerance of the solver")
     excitation_source: str = _choice(
         "excitation",
         ("excitation", "tool_forces", "scene"),
         Effect.CONFIGURE,
-        "topic that drives the model, or the scene's own loads by the node's clock; samples on the other topic are "
+        "source of the load: a topic, or the scene's own loads by the node's clock; samples on the other topic are "
         "counted and ignored",
     )
     input_depth: int = _number(1000, "messages", 200, 100000, Effect.CONFIGURE, "queue depth of the excitation topics")
@@ -85,13 +85,13 @@ class Settings:
         0.0,
         1e5,
         Effect.CONFIGURE,
-        "rate of the samples, to count missing ones by gaps in their stamps; 0: off",
+        "expected rate of the samples; missing ones are counted by gaps in the stamps; 0: off",
     )
     publish_mode: str = _choice(
         "on_sample",
         ("on_sample", "fixed_rate"),
         Effect.CONFIGURE,
-        "publish after each sample used, or at publish_rate; in both the stamp is that of the newest sample used",
+        "publish after each sample used, or at publish_rate; the stamp is that of the newest sample used",
     )
     publish_rate: float = _number(100.0, "Hz", 0.1, 1000.0, Effect.CONFIGURE, "rate of publish_mode fixed_rate")
     missed_periods: int = _number(
@@ -100,7 +100,7 @@ class Settings:
         0,
         1000000,
         Effect.NOW,
-        "periods of publish_rate or step_rate left out between two reports from which on there is a warning; 0: none",
+        "number of missed periods between two reports that gives a warning; 0: never",
     )
     step_rate: float = _number(
         100.0, "Hz", 1.0, 1000.0, Effect.CONFIGURE, "rate of advances under the scene's own loads and the hold policy"
@@ -111,18 +111,23 @@ class Settings:
         0.0,
         600.0,
         Effect.CONFIGURE,
-        "how much older than the newest sample a late one may be and still be worked in; 0: late samples are dropped",
+        "largest age of a late sample that is worked in, against the newest; 0: late samples are dropped",
     )
     estimate: bool = _plain(
         False,
         Effect.CONFIGURE,
-        "estimate clearances and contact from head_pose and the samples of the load, in a process of its own",
+        "estimate clearances and contact from load and head_pose or gaps, in a process of its own",
     )
     estimate_window: float = _number(
-        32.0, "s", 1.0, 600.0, Effect.CONFIGURE, "length of the window that an estimate is made of, ten load periods"
+        32.0, "s", 1.0, 600.0, Effect.CONFIGURE, "length of the window of an estimate; ten load periods are enough"
     )
     estimate_interval: float = _number(
-        10.0, "s", 0.5, 3600.0, Effect.CONFIGURE, "distance of the ends of the windows; one takes some seconds of work"
+        10.0,
+        "s",
+        0.5,
+        3600.0,
+        Effect.CONFIGURE,
+        "time between the ends of two windows",
     )
     estimate_forces: int = _number(
         0,
@@ -130,8 +135,7 @@ class Settings:
         0,
         4096,
         Effect.CONFIGURE,
-        "twins drawn from each estimate, whose forces give the intervals on force_intervals: at least 20, 256 is "
-        "plenty; 0: none",
+        "number of twins drawn from each estimate for force_intervals, at least 20; 256 is plenty; 0: no intervals",
     )
     forecast_limits: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -139,11 +143,10 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "limits of the horizontal and the vertical clearance, both: the time until one is reached follows from each "
-        "estimate; 0: no forecast",
+        "limits of the horizontal and the vertical clearance for the forecast after each estimate; 0: no forecast",
     )
     forecast_horizon: float = _number(
-        1.44e7, "s", 1.0, 1e10, Effect.CONFIGURE, "hours of operation, in s, beyond which a limit counts as not reached"
+        1.44e7, "s", 1.0, 1e10, Effect.CONFIGURE, "time of operation beyond which a limit counts as not reached"
     )
     forecast_stop: float = _number(
         0.0,
@@ -151,19 +154,19 @@ class Settings:
         0.0,
         1e10,
         Effect.CONFIGURE,
-        "time of operation to a planned stop, for the probability of a limit before it; 0: none",
+        "time of operation to a planned stop; the forecast gives the probability of a limit before it; 0: no stop",
     )
     forecast_scenarios: str = _plain(
         "",
         Effect.CONFIGURE,
-        "what may come otherwise, as multiples of load and wear coefficient: NAME:load=X,coefficient=Y; NAME:...; each "
-        "is forecast too and stands in the answer of ~/forecast",
+        "scenarios as multiples of load and wear coefficient: NAME:load=X,coefficient=Y; NAME:...; the answer of "
+        "~/forecast has a forecast of each",
     )
     wear_state_path: str = _plain(
         "",
         Effect.CONFIGURE,
-        "folder that keeps the wear of the pads, which outlives the process then; that of another head or scene is "
-        "refused; empty: none",
+        "folder that keeps the wear of the pads beyond the process; the wear of another head or scene is refused; "
+        "empty: not kept",
     )
     wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, Effect.CONFIGURE, "interval at which the wear is saved")
     frame_id: str = _plain("slide_frame", Effect.CONFIGURE, "frame of all outputs: centre of the slide, x right, y up")
@@ -171,25 +174,25 @@ class Settings:
     record_path: str = _plain(
         "",
         Effect.CONFIGURE,
-        "folder to make for the recording of each configured run, with _2, _3, ... when it exists; empty: none",
+        "folder for the recording of each configured run, with _2, _3, ... if it exists; empty: no recording",
     )
     record_outputs: str = _choice(
         "all",
         ("all", "decimated", "none"),
         Effect.CONFIGURE,
-        "outputs in the recording; with none the journal alone, from which `plow-twin replay --write` makes them",
+        "recorded outputs; none: the journal alone, from which `plow-twin replay --write` computes them",
     )
     record_rate: float = _number(
-        50.0, "Hz", 0.1, 10000.0, Effect.CONFIGURE, "rate of the outputs in a decimated recording; no peak is lost"
+        50.0, "Hz", 0.1, 10000.0, Effect.CONFIGURE, "rate of the outputs in a decimated recording; peaks are kept"
     )
     record_part_mb: float = _number(
-        0.0, "MB", 0.0, 1e6, Effect.CONFIGURE, "size at which the recording goes on in a new part; 0: never"
+        0.0, "MB", 0.0, 1e6, Effect.CONFIGURE, "size at which the recording continues in a new part; 0: never"
     )
     record_part_s: float = _number(
-        0.0, "s", 0.0, 1e9, Effect.CONFIGURE, "time after which the recording goes on in a new part; 0: never"
+        0.0, "s", 0.0, 1e9, Effect.CONFIGURE, "time after which the recording continues in a new part; 0: never"
     )
     record_keep_mb: float = _number(
-        0.0, "MB", 0.0, 1e9, Effect.CONFIGURE, "the oldest parts are removed when the ended ones are larger; 0: never"
+        0.0, "MB", 0.0, 1e9, Effect.CONFIGURE, "total size of closed parts above which the oldest are removed; 0: never"
     )
     record_ring: float = _number(
         0.0,
@@ -197,8 +200,7 @@ class Settings:
         0.0,
         3600.0,
         Effect.CONFIGURE,
-        "only the last so many seconds are kept, in memory, and written to a folder each time at an alarm or a mark; "
-        "0: everything is recorded",
+        "keep only the last seconds, in memory, and write them to a folder at each alarm or mark; 0: record everything",
     )
     record_sync: bool = _plain(False, Effect.CONFIGURE, "wait for the disk every half second, against a loss of power")
     excitation_timeout: float = _number(
@@ -210,38 +212,43 @@ class Settings:
         "silence after which the excitation counts as stale; unused under use_sim_time",
     )
     hold_policy: str = _choice(
-        "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last one held, or zero"
+        "hold", ("hold", "zero"), Effect.NOW, "load while the excitation is stale: the last load, or zero"
     )
     hold_limit: float = _number(
         60.0, "s", 0.0, 86400.0, Effect.NOW, "silence beyond the timeout after which the model stands still"
     )
     limit_force: float = _number(
-        0.0, "N", 0.0, 1e300, Effect.NOW, "largest force component that is used; 0: ten times what the scene comes to"
+        0.0,
+        "N",
+        0.0,
+        1e300,
+        Effect.NOW,
+        "largest plausible force component; 0: ten times the scene's loads and weight",
     )
     limit_moment: float = _number(
-        0.0, "N m", 0.0, 1e300, Effect.NOW, "largest moment that is used; 0: ten times what the scene comes to"
+        0.0, "N m", 0.0, 1e300, Effect.NOW, "largest plausible moment; 0: ten times the scene's"
     )
     limit_force_rate: float = _number(
-        0.0, "N/s", 0.0, 1e300, Effect.NOW, "fastest change of a force that is used; 0: limit_force in a millisecond"
+        0.0, "N/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a force; 0: limit_force in a millisecond"
     )
     limit_moment_rate: float = _number(
-        0.0, "N m/s", 0.0, 1e300, Effect.NOW, "fastest change of the moment; 0: limit_moment in a millisecond"
+        0.0, "N m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of the moment; 0: limit_moment in a millisecond"
     )
-    limit_travel: float = _number(10.0, "m/s", 0.0, 1000.0, Effect.NOW, "largest speed along the face that is used")
+    limit_travel: float = _number(10.0, "m/s", 0.0, 1000.0, Effect.NOW, "largest plausible speed along the face")
     limit_travel_rate: float = _number(
-        0.0, "m/s^2", 0.0, 1e300, Effect.NOW, "fastest change of that speed; 0: limit_travel in a millisecond"
+        0.0, "m/s^2", 0.0, 1e300, Effect.NOW, "largest plausible rate of that speed; 0: limit_travel in a millisecond"
     )
     limit_pose: float = _number(
-        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest measured displacement that is used; 0: half the frame's larger side"
+        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest plausible measured displacement; 0: half the frame's larger side"
     )
     limit_pose_rate: float = _number(
-        0.0, "m/s", 0.0, 1e300, Effect.NOW, "fastest change of a displacement; 0: limit_pose in a millisecond"
+        0.0, "m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a displacement; 0: limit_pose in a millisecond"
     )
     limit_gap: float = _number(
-        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest measured gap that is used; 0: half the frame's larger side"
+        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest plausible measured gap; 0: half the frame's larger side"
     )
     limit_gap_rate: float = _number(
-        0.0, "m/s", 0.0, 1e300, Effect.NOW, "fastest change of a gap; 0: limit_gap in a millisecond"
+        0.0, "m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a gap; 0: limit_gap in a millisecond"
     )
     set_wear: tuple[float, ...] = _list(
         (0.0,) * 8,
@@ -249,7 +256,7 @@ class Settings:
         0.0,
         1.0,
         Effect.NOW,
-        "wear depth of the eight pads that the service ~/set_wear sets; all 0: new pads",
+        "wear depth of the eight pads for the service ~/set_wear; all 0: new pads",
     )
     mark: str = _plain("", Effect.NOW, "text that the service ~/mark puts into the journal")
     clearance_horizontal: float = _number(
@@ -279,14 +286,14 @@ class Settings:
         0,
         1000000000,
         Effect.CONFIGURE,
-        "most evaluations of the equations of motion in an advance, at least 16; the rest of it is coarse then, and "
-        "its error is estimated; 0: as many as it takes",
+        "largest number of evaluations of the equations of motion in an advance, at least 16; the rest is computed "
+        "coarsely, with an estimate of its error; 0: unlimited",
     )
     head_pose_type: str = _choice(
         "pose",
         ("pose", "pose_with_covariance"),
         Effect.CONFIGURE,
-        "message of head_pose: PoseStamped, or PoseWithCovarianceStamped, whose variances of x, y and theta go on",
+        "message of head_pose: PoseStamped, or PoseWithCovarianceStamped with variances of x, y and theta",
     )
     head_pose_deviation: tuple[float, ...] = _list(
         (0.0, 0.0, 0.0),
@@ -294,18 +301,16 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "standard deviation of head_pose, x, y, theta, in the recording's header; 0: not known",
+        "standard deviation of head_pose: x, y, theta; 0: not known",
     )
-    gaps_deviation: float = _number(
-        0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "standard deviation of gaps, in the recording's header; 0: not known"
-    )
+    gaps_deviation: float = _number(0.0, "m", 0.0, 1.0, Effect.CONFIGURE, "standard deviation of gaps; 0: not known")
     excitation_deviation: tuple[float, ...] = _list(
         (0.0, 0.0, 0.0),
         "N, N, N m",
         0.0,
         1e12,
         Effect.CONFIGURE,
-        "standard deviation of the excitation, Fx, Fy, M, in the recording's header; 0: not known",
+        "standard deviation of the excitation: Fx, Fy, M; 0: not known",
     )
     alarm_force: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -313,7 +318,7 @@ class Settings:
         0.0,
         1e12,
         Effect.CONFIGURE,
-        "largest force at which a warning, an error begins; 0: none",
+        "force from which a warning and an error begin; 0: never",
     )
     alarm_clearance: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -321,7 +326,7 @@ class Settings:
         0.0,
         10.0,
         Effect.CONFIGURE,
-        "larger of the two clearances at which a warning, an error begins; 0: none",
+        "clearance, the larger of the two, from which a warning and an error begin; 0: never",
     )
     alarm_wear_rate: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -329,7 +334,7 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "fastest wear of a pad at which a warning, an error begins; 0: none",
+        "wear rate of a pad from which a warning and an error begin; 0: never",
     )
     alarm_clearance_rate: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -337,7 +342,7 @@ class Settings:
         0.0,
         1.0,
         Effect.CONFIGURE,
-        "growth of the larger clearance, over 10 s, at which a warning, an error begins; 0: none",
+        "growth of the larger clearance over 10 s from which a warning and an error begin; 0: never",
     )
     alarm_residual: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -345,10 +350,10 @@ class Settings:
         0.0,
         10.0,
         Effect.CONFIGURE,
-        "distance of head_pose from the model at its stamp at which a warning, an error begins; 0: none",
+        "distance of head_pose from the model at its stamp from which a warning and an error begin; 0: never",
     )
     alarm_duration: float = _number(
-        0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "how long a level must last before there is an alarm"
+        0.0, "s", 0.0, 3600.0, Effect.CONFIGURE, "time that a level must last before it raises an alarm"
     )
     jump_back: float = _number(
         1.0, "s", 0.0, 3600.0, Effect.NOW, "a stamp older than the newest by more than this resets the model"
