@@ -32,7 +32,7 @@ SUBPACKAGES = {
     "estimate": CORE,
     "record": CORE | {"build", "scene_file", "stream", "estimate"},
     "view": CORE | {"scene_file", "stream", "estimate", "record"},
-    "study": CORE | {"build", "scene_file", "stream", "record", "view"},
+    "study": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},
     "live": CORE | {"scene_file", "stream", "estimate", "record"},
     "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "live"},
     "cli": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros"},

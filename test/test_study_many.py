@@ -27,9 +27,9 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry
 from plow_twin.study.analysis import many
 from plow_twin.study.analysis.analyse import expand, left_out
-from plow_twin.study.analysis.many import analyse_many
+from plow_twin.study.analysis.many import run_many
 from plow_twin.study.analysis.report import write_table_of_runs
-from plow_twin.study.analysis.task import Task, analyse_task, names_apart
+from plow_twin.study.analysis.task import Task, names_apart, run_task
 from plow_twin.study.parameters import StudyError
 
 RUNS = 4
@@ -80,7 +80,7 @@ def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(run
     stored = [task.stored() for task in tasks(runs, out)]
     assert [facts is None for facts in stored] == [False, False, True, False]
     assert stored[0] == report["runs"][0]
-    again = analyse_task(tasks(runs, out)[2])
+    again = run_task(tasks(runs, out)[2])
     assert again["input"] == report["runs"][2]["input"] and tasks(runs, out)[2].stored() is not None
     other = Task(runs / "r0", Path("paper_best_fit"), None, (), out / "r0")
     assert other.stored() is None
@@ -127,7 +127,7 @@ def test_the_others_go_on_together_when_a_worker_died_before_the_first_result(
         return []
 
     monkeypatch.setattr(many, "_round", one_dies)
-    found = analyse_many([Task(Path(str(n)), None, None, (), None) for n in range(5)], workers=2)
+    found = run_many([Task(Path(str(n)), None, None, (), None) for n in range(5)], workers=2)
     assert rounds == [[0, 1, 2, 3, 4], [0], [1], [2, 3, 4]]
     assert ["error" in facts for facts in found] == [False, True, False, False, False]
 
@@ -138,7 +138,7 @@ def test_a_cluster_gives_the_same_results(runs: Path, tmp_path: Path) -> None:
 
     some = tasks(runs, tmp_path / "out")[:2]
     with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
-        found = analyse_many(some, workers=1, dask=cluster.scheduler_address)
+        found = run_many(some, workers=1, dask=cluster.scheduler_address)
     assert [facts["input"]["samples_used"] for facts in found] == [2000, 2001]
     assert all(task.stored() is not None for task in some)
 
@@ -153,7 +153,7 @@ def test_a_cluster_without_workers_is_not_waited_for_without_end(
         LocalCluster(n_workers=0, processes=False, dashboard_address=None) as cluster,
         pytest.raises(StudyError, match="got no worker"),
     ):
-        analyse_many(tasks(runs, tmp_path / "out"), workers=1, dask=cluster.scheduler_address)
+        run_many(tasks(runs, tmp_path / "out"), workers=1, dask=cluster.scheduler_address)
 
 
 def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
@@ -193,7 +193,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
 def test_whatever_one_of_many_fails_by_is_its_row(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(10)))
     (tmp_path / "taken").write_text("no folder")
-    found = analyse_task(Task(run.folder, None, None, (), tmp_path / "taken"))
+    found = run_task(Task(run.folder, None, None, (), tmp_path / "taken"))
     assert found["run"] == str(run.folder) and "FileExistsError" in found["error"]
 
 
@@ -204,7 +204,7 @@ def test_no_recording_of_a_folder_is_left_out_unsaid(tmp_path: Path, capsys: pyt
         part.unlink()
     (tmp_path / "empty").mkdir()
     assert expand([tmp_path]) == [tmp_path / "gone", tmp_path / "good"] and left_out(tmp_path) == [tmp_path / "empty"]
-    rows = [analyse_task(Task(path, None, None, (), None)) for path in expand([tmp_path])]
+    rows = [run_task(Task(path, None, None, (), None)) for path in expand([tmp_path])]
     assert ["error" in row for row in rows] == [True, False]
     write_table_of_runs(rows, out := tmp_path.with_name("out"), [tmp_path / "empty"])
     table = parquet.read_table(out / "runs.parquet")

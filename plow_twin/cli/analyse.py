@@ -134,10 +134,10 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
     """Analyse on all cores or a cluster; what is there already is taken, so that an interrupted call goes on."""
-    from plow_twin.study.analysis.many import analyse_many
+    from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
-        return analyse_many(tasks, workers=workers, dask=dask, on_progress=on_progress)
+        return run_many(tasks, workers=workers, dask=dask, on_progress=on_progress)
 
 
 def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any]:

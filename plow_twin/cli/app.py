@@ -13,6 +13,7 @@ import click
 
 from plow_twin.build import package_version
 from plow_twin.cli.analyse import analyse
+from plow_twin.cli.compare import compare
 from plow_twin.cli.console import FAILED, WRONG_INPUT, say_error
 from plow_twin.cli.demo import demo
 from plow_twin.cli.doctor import doctor
@@ -63,7 +64,22 @@ def commands() -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
 
 
-for _verb in (simulate, demo, live, estimate, forecast, record, replay, analyse, export, doctor, view, info, study):
+for _verb in (
+    simulate,
+    demo,
+    live,
+    estimate,
+    forecast,
+    record,
+    replay,
+    analyse,
+    compare,
+    export,
+    doctor,
+    view,
+    info,
+    study,
+):
     commands.add_command(_verb)
 
 

@@ -12,7 +12,7 @@ from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait
 from typing import Any
 
-from plow_twin.study.analysis.task import Task, analyse_task
+from plow_twin.study.analysis.task import RunTask, run_task
 from plow_twin.study.cluster import completed, connect
 
 #: Receives the share of the recordings that are done.
@@ -20,10 +20,10 @@ OnProgress = Callable[[float], object]
 _OnDone = Callable[[int, dict[str, Any]], object]
 
 
-def analyse_many(
-    tasks: Sequence[Task], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
+def run_many(
+    tasks: Sequence[RunTask], *, workers: int, dask: str | None = None, on_progress: OnProgress = lambda share: None
 ) -> list[dict[str, Any]]:
-    """Return the facts of each analysis, `error` where one failed; those that are there already are taken.
+    """Return the facts of each task, `error` where one failed; those that are stored already are taken.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def analyse_many(
     return [results[number] for number in range(len(tasks))]
 
 
-def _here(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone) -> None:
+def _here(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> None:
     while waiting:
         left = _round(tasks, waiting, workers, done)
         if len(left) == len(waiting):  # one of those that came first has ended its worker: each of them alone
@@ -62,13 +62,13 @@ def _here(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone
         waiting = left
 
 
-def _round(tasks: Sequence[Task], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
+def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _OnDone) -> list[int]:
     """Run some tasks and return those that were lost: when a worker dies, with all that had not ended."""
     left = []
     others = active_children()
     pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _belong_to_the_caller)
     try:
-        futures = {pool.submit(analyse_task, tasks[number]): number for number in waiting}
+        futures = {pool.submit(run_task, tasks[number]): number for number in waiting}
         for future in as_completed(futures):
             try:
                 done(futures[future], future.result())
@@ -96,9 +96,9 @@ def _belong_to_the_caller() -> None:
     threading.Thread(target=follow, daemon=True, name="plow_twin caller").start()
 
 
-def _on_cluster(tasks: Sequence[Task], waiting: list[int], address: str, done: _OnDone) -> None:
+def _on_cluster(tasks: Sequence[RunTask], waiting: list[int], address: str, done: _OnDone) -> None:
     with connect(address) as client:
-        futures = {client.submit(analyse_task, tasks[number], pure=False, retries=2): number for number in waiting}
+        futures = {client.submit(run_task, tasks[number], pure=False, retries=2): number for number in waiting}
         for future in completed(client, futures):
             number = futures[future]
             try:

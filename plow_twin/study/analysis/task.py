@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from plow_twin.build import package_version
 from plow_twin.errors import PlowTwinError, RecordingError
@@ -44,6 +44,20 @@ def names_apart(paths: Sequence[Path]) -> list[str]:
         next(("_".join(part[-n:]) for n in range(1, deepest) if ends[n - 1][part[-n:]] == 1), "_".join(part))
         for part in parts
     ]
+
+
+class RunTask(Protocol):
+    """Work on one recording, for a process of its own."""
+
+    @property
+    def path(self) -> Path:
+        """The recording."""
+
+    def stored(self) -> dict[str, Any] | None:
+        """Return the facts where the same work has been done before."""
+
+    def run(self) -> dict[str, Any]:
+        """Return the facts."""
 
 
 @dataclass(frozen=True)
@@ -201,8 +215,8 @@ def _scene_state(scene: Path | None) -> list[str] | None:
     return [str(scene), hashlib.blake2b(text.encode(), digest_size=16).hexdigest()]
 
 
-def analyse_task(task: Task) -> dict[str, Any]:
-    """Return the facts of one analysis; `error` when it failed. Its results are written to `out`."""
+def run_task(task: RunTask) -> dict[str, Any]:
+    """Return the facts of one task, `error` where it failed."""
     try:
         return task.run()
     except PlowTwinError as error:

@@ -1,0 +1,128 @@
+"""`plow-twin compare`: runs of one machine beside each other, by run, day or shift."""
+
+from __future__ import annotations
+
+import json
+import os
+from datetime import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import (
+    DONE,
+    DONE_WITH_LOSS,
+    POSITIVE,
+    json_option,
+    output_console,
+    progress,
+    quiet_option,
+    say_error,
+    table,
+)
+
+if TYPE_CHECKING:
+    from plow_twin.study.comparison.compare import Comparison
+
+
+@click.command(
+    short_help="Compare runs: do the contacts change, and is it the load or the machine?",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, 3 done, and a run was left out.",
+)
+@click.argument("recordings", metavar="RUN...", type=click.Path(path_type=Path, exists=True), nargs=-1, required=True)
+@click.option("--by", type=click.Choice(["run", "day", "shift"]), default="run", show_default=True, help="Groups.")
+@click.option("--shifts", default="06:00,14:00,22:00", show_default=True, help="Begins of the shifts.")
+@click.option("--zone", default="UTC", show_default=True, help="Time zone of days and shifts, e.g. Europe/Berlin.")
+@click.option("--window", type=POSITIVE, metavar="S", help="Length of a window; by default the load's period.")
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for compare.html and Parquet.")
+@click.option("--workers", type=click.IntRange(1), help="Processes; by default one a core.")
+@click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster, e.g. tcp://host:8786.")
+@json_option
+@quiet_option
+def compare(
+    recordings: tuple[Path, ...],
+    by: str,
+    shifts: str,
+    zone: str,
+    window: float | None,
+    out: Path | None,
+    workers: int | None,
+    dask: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Compare runs, or folders of runs, with the first: peaks, impacts, duty, impulse, dissipation, wear by pad."""
+    from plow_twin.study.analysis.analyse import expand
+    from plow_twin.study.analysis.many import run_many
+    from plow_twin.study.analysis.task import names_apart
+    from plow_twin.study.comparison.compare import WindowsTask
+    from plow_twin.study.comparison.compare import compare as compared
+
+    label = _label(by, shifts, zone)
+    found = list(dict.fromkeys(expand(recordings)))
+    tasks = [WindowsTask(path, window) for path in found]
+    with progress("reading", quiet or as_json) as on_progress:
+        results = run_many(tasks, workers=workers or os.cpu_count() or 1, dask=dask, on_progress=on_progress)
+    failed = [result["error"] for result in results if "error" in result]
+    for error in failed:
+        say_error(f"plow-twin: left out: {error}")
+    names = names_apart(found)
+    runs = [(name, result["windows"]) for name, result in zip(names, results, strict=True) if "error" not in result]
+    lost = {result["run"]: result["lost"] for result in results if result.get("lost")}
+    for run, counts in lost.items():
+        say_error(f"plow-twin: {run}: lost {counts}")
+    comparison = compared(runs, label)
+    if out is not None:
+        from plow_twin.study.comparison.report import write_comparison
+
+        write_comparison(comparison, lost, out)
+    if as_json:
+        click.echo(json.dumps({**comparison.facts(), "lost": lost, "left_out": failed}, indent=2, allow_nan=False))
+    elif not quiet:
+        _show(comparison)
+        if out is not None:
+            click.echo(str(out / "compare.html"))
+    return DONE_WITH_LOSS if failed or lost else DONE
+
+
+def _label(by: str, shifts: str, zone: str) -> Any:
+    from zoneinfo import ZoneInfo
+
+    from plow_twin.study.comparison.compare import by_run, by_time
+
+    if by == "run":
+        return by_run
+    try:
+        begins = [time.fromisoformat(text.strip()) for text in shifts.split(",")]
+    except ValueError as error:
+        raise click.BadParameter(
+            f"got {shifts!r}, expected times like 06:00,14:00,22:00", param_hint="--shifts"
+        ) from error
+    try:
+        return by_time(by, begins, ZoneInfo(zone))
+    except (OSError, ValueError, KeyError) as error:
+        raise click.BadParameter(f"got {zone!r}, expected a zone like Europe/Berlin", param_hint="--zone") from error
+
+
+def _show(found: Comparison) -> None:
+    console = output_console()
+    groups = table("Groups", "group", "windows", "load, RMS [kN]", "horizontal [mm]", "vertical [mm]")
+    for name, windows in found.groups.items():
+        clearance = 1e3 * windows.clearance.mean(axis=0)
+        numbers = (1e-3 * windows.load[:, 0].mean(), *clearance)
+        groups.add_row(name, str(len(windows.start_ns)), *(f"{number:.3f}" for number in numbers))
+    console.print(groups)
+    first = next(iter(found.groups))
+    for name, by_pair in found.changes.items():
+        quantities = list(next(iter(by_pair.values())))
+        view = table(f"{name} beside {first}: change of the means, and its cause", "pad", *quantities)
+        for pair, by_quantity in by_pair.items():
+            view.add_row(
+                pair,
+                *(
+                    "-" if change is None else f"{100.0 * change.share:+.1f} % {change.verdict}"
+                    for change in by_quantity.values()
+                ),
+            )
+        console.print(view)

@@ -1,0 +1,107 @@
+"""Groups of windows beside each other: distributions, changes with intervals, and the load's share in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+#: Draws of the bootstrap: the 2.5 % point of an interval is then known to 0.5 % of probability.
+_DRAWS: Final = 1000
+#: Fewer windows do not tell chance from change.
+FEWEST: Final = 8
+#: Of the load's variation within groups so much at least, relative to its mean, tells how a quantity follows it.
+_LEAST_VARIATION: Final = 0.01
+#: Loads of two groups that differ by less than this share count as equal.
+_EQUAL_LOAD: Final = 0.01
+
+
+@dataclass(frozen=True)
+class Change:
+    """Change of a mean from one group to another, as shares of the first mean.
+
+    Attributes
+    ----------
+    share, low, high : float
+        The change and its 95 % interval.
+    machine, machine_low, machine_high : float or None
+        The same at equal load; None where the load does not tell how the quantity follows it.
+    """
+
+    share: float
+    low: float
+    high: float
+    machine: float | None
+    machine_low: float | None
+    machine_high: float | None
+
+    @property
+    def verdict(self) -> str:
+        """`chance`, or the cause of a change that is more: `machine`, `load`, or `load or machine`."""
+        if self.low <= 0.0 <= self.high:
+            return "chance"
+        if self.machine_low is None or self.machine_high is None:
+            return "load or machine"
+        return "load" if self.machine_low <= 0.0 <= self.machine_high else "machine"
+
+
+def points(values: Array) -> dict[str, float]:
+    """Return mean, 5 %, 50 % and 95 % points of the values of windows, shape (n,)."""
+    p05, p50, p95 = np.percentile(values, (5.0, 50.0, 95.0)).tolist()
+    return {"mean": float(values.mean()), "p05": p05, "p50": p50, "p95": p95}
+
+
+def change(
+    before: tuple[Array, Array], after: tuple[Array, Array], random: np.random.Generator, draws: int = _DRAWS
+) -> Change | None:
+    """Return the change between two groups of windows, None where it cannot be told.
+
+    Means are compared by a bootstrap over windows. At equal load: less the part that follows the load, by the slope
+    over the load's variation within the groups (analysis of covariance).
+
+    Parameters
+    ----------
+    before, after
+        Values of a quantity, shape (n,), and load, shape (n,), of the windows of each group.
+    random
+        Source of the draws.
+    """
+    if min(len(before[0]), len(after[0])) < FEWEST or not before[0].mean() > 0.0:
+        return None
+    shares, machine = [], []
+    for draw in range(draws + 1):
+        first, second = (_drawn(group, random) if draw else group for group in (before, after))
+        mean = float(first[0].mean())
+        if mean > 0.0:
+            shares.append(float(second[0].mean()) / mean - 1.0)
+            machine.append(_at_equal_load(first, second))
+    low, high = np.percentile(shares[1:], (2.5, 97.5)).tolist()
+    known = np.array([share for share in machine[1:] if share is not None])
+    if machine[0] is None or len(known) < 0.9 * draws:
+        return Change(shares[0], low, high, None, None, None)
+    machine_low, machine_high = np.percentile(known, (2.5, 97.5)).tolist()
+    return Change(shares[0], low, high, machine[0], machine_low, machine_high)
+
+
+def _drawn(group: tuple[Array, Array], random: np.random.Generator) -> tuple[Array, Array]:
+    chosen = random.integers(0, len(group[0]), len(group[0]))
+    return group[0][chosen], group[1][chosen]
+
+
+def _at_equal_load(before: tuple[Array, Array], after: tuple[Array, Array]) -> float | None:
+    """Return the change of the mean at the first group's load, as a share of the first mean."""
+    (first, load_before), (second, load_after) = before, after
+    mean, difference = float(first.mean()), float(load_after.mean() - load_before.mean())
+    if abs(difference) < _EQUAL_LOAD * float(load_before.mean()):
+        return float(second.mean()) / mean - 1.0
+    centred_load = np.concatenate((load_before - load_before.mean(), load_after - load_after.mean()))
+    centred = np.concatenate((first - first.mean(), second - second.mean()))
+    variation = float(np.sqrt((centred_load**2).mean()))
+    if variation < _LEAST_VARIATION * float(load_before.mean()):
+        return None
+    slope = float((centred * centred_load).sum() / (centred_load**2).sum())
+    return (float(second.mean()) - slope * difference) / mean - 1.0

@@ -1,0 +1,190 @@
+"""A run as windows of about a load period: peaks, impacts, duty, impulse and dissipation of each pair, and the load."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import RecordingError
+from plow_twin.estimate.measurements import Load
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.record.recording import Batched, Recording, read_recording
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
+
+Array = NDArray[np.float64]
+Indexes = NDArray[np.int64]
+
+#: Quantities of each pair in a window, with their units.
+QUANTITIES: Final[Mapping[str, str]] = {
+    "peak": "N",
+    "impacts": "1/min",
+    "duty": "1",
+    "impulse": "N",
+    "dissipation": "W",
+    "wear": "m/h",
+}
+#: Span of the load in which a period is looked for [s].
+_PERIOD_SPAN_S: Final = 60.0
+#: Length of a window where the load has no period [s].
+_NO_PERIOD_S: Final = 10.0
+#: A window with fewer of the messages of a full one is left out: it is cut by an end or a gap.
+_FULL: Final = 0.9
+_PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
+_TOTALS: Final = np.array([CLEARANCE_NAMES.index(name) for name in ("horizontal", "vertical")])
+
+
+@dataclass
+class Windows:
+    """Windows of a run, n of them.
+
+    Attributes
+    ----------
+    start_ns : ndarray, shape (n,)
+        Their first stamps [ns].
+    pairs : dict of str to ndarray, shape (n, 8)
+        `QUANTITIES`: largest force, impacts a minute, share of time in contact, impulse and dissipated energy a second,
+        wear an hour.
+    load : ndarray, shape (n, 2)
+        Root mean square of the force [N] and of the moment [N m] of the load.
+    clearance : ndarray, shape (n, 2)
+        Horizontal and vertical clearance [m].
+    """
+
+    start_ns: Indexes
+    pairs: dict[str, Array]
+    load: Array
+    clearance: Array
+
+
+@dataclass
+class _Sums:
+    """Sums over the messages of each window, by the window's number."""
+
+    width: int
+    rows: dict[int, Array] = field(default_factory=dict)
+
+    def add(self, window: Indexes, values: Array, reduce: Any = np.add) -> None:
+        """Take in values (n, width) of windows (n,), whose numbers do not fall."""
+        if not len(window):
+            return
+        first = np.flatnonzero(np.r_[True, np.diff(window) != 0])
+        for number, value in zip(window[first].tolist(), reduce.reduceat(values, first, axis=0), strict=True):
+            self.rows[number] = reduce(self.rows[number], value) if number in self.rows else value
+
+    def of(self, numbers: list[int]) -> Array:
+        """Return the sums of some windows, zero where there are no values."""
+        return np.array([self.rows.get(number, np.zeros(self.width)) for number in numbers]).reshape(-1, self.width)
+
+
+def windows_of(path: Path, window_s: float | None = None) -> Windows:
+    """Return the windows of a run of plow_twin whose outputs were recorded.
+
+    Parameters
+    ----------
+    path
+        The run.
+    window_s
+        Length of a window [s]; by default the period of the load, or 10 s where it has none.
+
+    Raises
+    ------
+    RecordingError
+        It is no run of plow_twin, or has no outputs.
+    """
+    recording = read_recording(path)
+    window_ns = round(1e9 * (window_s or _load_period(recording)))
+    peak, moved, contact, load = _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT), _Sums(2 * PAIR_COUNT + 1), _Sums(3)
+    slow, slow_count = _Sums(2 + PAIR_COUNT), _Sums(1)
+    messages = _Sums(1)
+    touches: Array | None = None
+    newest: tuple[Indexes, Array] | None = None
+    pads: dict[int, tuple[Array, Array]] = {}
+    for found in recording.batches("excitation", "contact_forces", "contact_peaks", "clearance"):
+        for part, name in ((part, name) for name, part in found.items() if len(part.stamp_ns)):
+            window = part.stamp_ns // window_ns
+            if (np.diff(window) < 0).any():
+                part, window = _risen(part, window)
+            if name == "excitation":
+                force2, moment2 = (part.values[:, :2] ** 2).sum(axis=1), part.values[:, 2] ** 2
+                load.add(window, np.column_stack((force2, moment2, np.ones(len(window)))))
+            elif name == "contact_peaks":
+                total, impulse, largest = np.split(part.values, 3, axis=1)
+                before = total[:1] if touches is None else touches[None]
+                made = np.clip(np.diff(np.concatenate((before, total)), axis=0), 0.0, None)
+                touches = total[-1]
+                moved.add(window, np.hstack((made, impulse)))
+                peak.add(window, largest, np.maximum)
+                messages.add(window, np.ones((len(window), 1)))
+            elif name == "contact_forces":
+                stamps, power, in_contact = _powers(part, newest)
+                newest = part.stamp_ns[-1:], part.values[-1:]
+                step_s = np.diff(stamps) * 1e-9
+                near = (step_s < 0.1 * window_ns * 1e-9)[:, None]
+                work = np.where(near, 0.5 * (power[1:] + power[:-1]) * step_s[:, None], 0.0)
+                count = len(work)
+                ends = window[len(window) - count :]
+                contact.add(ends, np.hstack((work, in_contact[len(in_contact) - count :], np.ones((count, 1)))))
+            else:
+                slow.add(window, part.values[:, [*_TOTALS, *_PADS]])
+                slow_count.add(window, np.ones((len(window), 1)))
+                for number in np.unique(window).tolist():
+                    rows = part.values[window == number][:, _PADS]
+                    pads[number] = (pads[number][0] if number in pads else rows[0], rows[-1])
+    if not messages.rows:
+        raise RecordingError(f"{path}: got no contact_peaks, expected a run with outputs: plow-twin replay --write")
+    full = _FULL * float(np.median([row[0] for row in messages.rows.values()]))
+    numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full)
+    seconds = window_ns * 1e-9
+    sums, touched = moved.of(numbers), contact.of(numbers)
+    squares = load.of(numbers)
+    grown = np.array([pads[number][1] - pads[number][0] if number in pads else np.zeros(8) for number in numbers])
+    return Windows(
+        np.array(numbers, np.int64) * window_ns,
+        {
+            "peak": peak.of(numbers),
+            "impacts": sums[:, :PAIR_COUNT] * 60.0 / seconds,
+            "duty": touched[:, PAIR_COUNT : 2 * PAIR_COUNT] / np.maximum(touched[:, -1:], 1.0),
+            "impulse": sums[:, PAIR_COUNT:] / seconds,
+            "dissipation": touched[:, :PAIR_COUNT] / seconds,
+            "wear": grown.reshape(-1, PAIR_COUNT) * 3600.0 / seconds,
+        },
+        np.sqrt(squares[:, :2] / np.maximum(squares[:, 2:], 1.0)),
+        (slow.of(numbers) / np.maximum(slow_count.of(numbers), 1.0))[:, :2],
+    )
+
+
+def _risen(part: Batched, window: Indexes) -> tuple[Batched, Indexes]:
+    """Return rows in order of their stamps: late samples and steps of the clock bring older ones."""
+    order = np.argsort(part.stamp_ns, kind="stable")
+    return Batched(part.stamp_ns[order], part.values[order]), window[order]
+
+
+def _powers(part: Batched, newest: tuple[Indexes, Array] | None) -> tuple[Indexes, Array, Array]:
+    """Return stamps, power into each contact [W] and whether it carries force, with the newest row before first."""
+    stamps, values = part.stamp_ns, part.values
+    if newest is not None and newest[0][0] < stamps[0]:
+        stamps, values = np.concatenate((newest[0], stamps)), np.concatenate((newest[1], values))
+    _, rate, force = np.split(values, 3, axis=1)
+    return stamps, force * rate, (force > 0.0).astype(float)
+
+
+def _load_period(recording: Recording) -> float:
+    """Return the period of the load in the first minute [s]."""
+    stamps, wrench, span = list[Indexes](), list[Array](), 0.0
+    for part in recording["excitation"].batches():
+        stamps.append(part.stamp_ns)
+        wrench.append(part.values)
+        span = (int(stamps[-1][-1]) - int(stamps[0][0])) * 1e-9
+        if span > _PERIOD_SPAN_S:
+            break
+    if not stamps or span <= 0.0:
+        return _NO_PERIOD_S
+    times = (np.concatenate(stamps) - stamps[0][0]) * 1e-9
+    first = times <= _PERIOD_SPAN_S
+    load, _ = Load.of(times[first], np.concatenate(wrench)[first])
+    return load.oscillation() or _NO_PERIOD_S

@@ -1,0 +1,129 @@
+"""Runs compared: windows hold the recorded numbers; chance, load and machine are told apart."""
+
+from __future__ import annotations
+
+import json
+from datetime import time
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
+
+from plow_twin.cli.app import run as cli
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.messages import JointState
+from plow_twin.stream.journal import Parameter, Sample
+from plow_twin.study.comparison.change import change
+from plow_twin.study.comparison.compare import by_time
+from plow_twin.study.comparison.windows import windows_of
+
+SECONDS = 8
+
+
+def _run(folder: Path, scale: float) -> Run:
+    samples = (paper_sample(index) for index in range(SECONDS * 1000))
+    return record_run(folder, (Sample(s.stamp_ns, tuple(scale * part for part in s.wrench)) for s in samples))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
+    folder = tmp_path_factory.mktemp("compare")
+    return _run(folder / "monday", 1.0), _run(folder / "tuesday", 1.3)
+
+
+def test_windows_hold_the_recorded_numbers(runs: tuple[Run, Run]) -> None:
+    windows = windows_of(runs[0].folder, 1.0)
+    assert len(windows.start_ns) == SECONDS and (windows.start_ns % 10**9 == 0).all()
+    peaks = [m for topic, m in runs[0].outputs if topic == "/contact_peaks" and isinstance(m, JointState)]
+    forces = [m for topic, m in runs[0].outputs if topic == "/contact_forces" and isinstance(m, JointState)]
+    number = np.array([message.stamp_ns // 10**9 for message in peaks]) - BASE_NS // 10**9
+    effort, impulse, total = (
+        np.array([getattr(m, part) for m in peaks]) for part in ("effort", "velocity", "position")
+    )
+    force, rate = (np.array([getattr(m, part) for m in forces]) for part in ("effort", "velocity"))
+    for window in range(SECONDS):
+        inside = number == window
+        np.testing.assert_array_equal(windows.pairs["peak"][window], effort[inside].max(axis=0))
+        np.testing.assert_allclose(windows.pairs["impulse"][window], impulse[inside].sum(axis=0), rtol=1e-12)
+        if window:
+            assert windows.pairs["duty"][window] == pytest.approx((force[inside] > 0.0).mean(axis=0))
+    np.testing.assert_array_equal(windows.pairs["impacts"].sum(axis=0) / 60.0, total[-1] - total[0])
+    work = (0.5 * (force[1:] * rate[1:] + force[:-1] * rate[:-1])).sum(axis=0) * STEP_NS * 1e-9
+    np.testing.assert_allclose(windows.pairs["dissipation"].sum(axis=0), work, rtol=1e-9)
+    load = np.array([paper_sample(index).wrench for index in range(1000)])
+    np.testing.assert_allclose(windows.load[0], np.sqrt([(load[:, :2] ** 2).sum() / 1e3, (load[:, 2] ** 2).mean()]))
+
+
+def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:
+    starts = windows_of(runs[0].folder).start_ns
+    assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)  # 2 rad/s, seen for two and a half periods
+
+
+def test_chance_is_taken_for_change_once_in_twenty() -> None:
+    random = np.random.default_rng(1)
+    verdicts = []
+    for _ in range(200):
+        groups = [(random.gamma(4.0, 25e3, 60), np.full(60, 1.0)) for _ in range(2)]
+        found = change(*groups, random, draws=200)
+        assert found is not None
+        verdicts.append(found.verdict)
+    assert 1 <= sum(verdict != "chance" for verdict in verdicts) <= 22
+
+
+@pytest.mark.parametrize(("factor", "load_factor", "verdict"), [(1.15, 1.0, "machine"), (1.0, 1.15, "load")])
+def test_a_change_of_the_machine_is_told_from_one_of_the_load(factor: float, load_factor: float, verdict: str) -> None:
+    random = np.random.default_rng(2)
+    load = [random.normal(mean, 0.08, 300) for mean in (1.0, load_factor)]
+    force = [
+        scale * 1e5 * loads * random.normal(1.0, 0.05, 300) for scale, loads in zip((1.0, factor), load, strict=True)
+    ]
+    found = change((force[0], load[0]), (force[1], load[1]), random, draws=300)
+    assert found is not None and found.verdict == verdict and found.low < 0.15 < found.high
+    steady = change((force[0], np.ones(300)), (force[1], np.full(300, 1.2)), random, draws=300)
+    assert steady is not None and steady.verdict == "load or machine"
+    assert change((force[0][:5], load[0][:5]), (force[1], load[1]), random) is None
+
+
+def test_days_and_shifts_begin_in_their_zone() -> None:
+    late = 1_800_000_000 - 1_800_000_000 % 86_400 + 23 * 3600  # 23:00 UTC
+    stamp = late * 10**9
+    assert by_time("day")("run", stamp) == "2027-01-15"
+    assert by_time("day", zone=ZoneInfo("Europe/Berlin"))("run", stamp) == "2027-01-16"
+    assert by_time("shift")("run", stamp) == "2027-01-15 22:00"
+    assert by_time("shift")("run", stamp + 5 * 3600 * 10**9) == "2027-01-15 22:00"  # 04:00, still the night shift
+    assert by_time("shift", [time(0), time(12)])("run", stamp + 5 * 3600 * 10**9) == "2027-01-16 00:00"
+
+
+def test_two_runs_are_compared_on_the_terminal_as_json_and_as_a_page(
+    runs: tuple[Run, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [str(run.folder) for run in runs]
+    assert cli(["compare", *folders, "--window", "0.5", "--json", "--workers", "1", "--out", str(tmp_path)]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert list(facts["groups"]) == ["monday", "tuesday"] and facts["groups"]["monday"]["windows"] == 2 * SECONDS
+    ratio = (
+        facts["groups"]["tuesday"]["load"]["force_rms_n"]["mean"]
+        / facts["groups"]["monday"]["load"]["force_rms_n"]["mean"]
+    )
+    assert ratio == pytest.approx(1.3)
+    changes = facts["changes"]["tuesday"]
+    assert set(changes) == set(PAIR_NAMES) and changes["top_right_top"]["peak"]["verdict"] != "machine"
+    page = (tmp_path / "compare.html").read_text(encoding="utf-8")
+    assert "tuesday beside monday" in page and "data:image/png;base64," in page and "http" not in page
+    table = pyarrow.parquet.read_table(tmp_path / "windows.parquet")
+    assert len(table) == 4 * SECONDS and set(table["group"].to_pylist()) == {"monday", "tuesday"}
+    assert cli(["compare", *folders, "--window", "0.5", "--workers", "1"]) == 0
+    assert "tuesday beside monday" in capsys.readouterr().out
+
+
+def test_one_group_and_a_run_without_outputs_are_refused(
+    runs: tuple[Run, Run], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli(["compare", str(runs[0].folder), "--workers", "1"]) == 1
+    assert "got 1 group of windows (monday), expected two or more" in capsys.readouterr().err
+    bare = record_run(tmp_path / "bare", [Parameter("hold", "hold"), *map(paper_sample, range(99))], frame_every=10**9)
+    assert cli(["compare", str(runs[0].folder), str(bare.folder), "--workers", "1"]) == 1
+    assert "bare: got no contact_peaks" in capsys.readouterr().err
