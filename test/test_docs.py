@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
 import yaml
 
@@ -37,6 +38,32 @@ def test_links_and_named_files_exist(page: Path) -> None:
     subpackages = "|".join(path.parent.name for path in (ROOT / "plow_twin").glob("*/__init__.py"))
     for name in re.findall(rf"`((?:{subpackages})/[\w/]+\.py)`", text):
         assert (ROOT / "plow_twin" / name).exists(), name
+
+
+def shown_calls() -> list[tuple[str, str]]:
+    """Return each call of `plow-twin` in a block of a page, with the page's name."""
+    pages = [*PAGES, *sorted((ROOT / "examples").rglob("*.md"))]
+    return [
+        (page.name, call.partition("#")[0])
+        for page in pages
+        for block in re.findall(r"^ *```\w*\n(.*?)^ *```", page.read_text(), re.DOTALL | re.MULTILINE)
+        for call in re.findall(r"plow-twin (.*)", block.replace("\\\n", " "))
+    ]
+
+
+def test_every_call_that_a_page_shows_has_a_verb_and_options_that_exist() -> None:
+    calls = shown_calls()
+    assert len(calls) > 40
+    unknown = []
+    for page, call in calls:
+        command, words = commands, re.split(r"\s+", re.split(r"[|&<>]", call)[0].strip())
+        while isinstance(command, click.Group) and words and words[0] in command.commands:
+            command = command.commands[words.pop(0)]
+        known = {option for one in command.params for option in one.opts} | {"--help"}
+        given = {word for word in words if word.startswith("--") and not word.startswith("---")}
+        if (isinstance(command, click.Group) and given != {"--help"}) or given - known:
+            unknown.append((page, call))
+    assert unknown == []
 
 
 def public_names() -> set[str]:
