@@ -59,7 +59,7 @@ def test_every_call_that_a_page_shows_has_a_verb_and_options_that_exist() -> Non
         command, words = commands, re.split(r"\s+", re.split(r"[|&<>]", call)[0].strip())
         while isinstance(command, click.Group) and words and words[0] in command.commands:
             command = command.commands[words.pop(0)]
-        known = {option for one in command.params for option in one.opts} | {"--help"}
+        known = {option for one in command.params for option in (*one.opts, *one.secondary_opts)} | {"--help"}
         given = {word for word in words if word.startswith("--") and not word.startswith("---")}
         if (isinstance(command, click.Group) and given != {"--help"}) or given - known:
             unknown.append((page, call))
