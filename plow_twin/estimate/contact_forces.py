@@ -15,11 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import PlowTwinError
 from plow_twin.estimate.fit import Fit, Problem, Window, depth_of
-from plow_twin.estimate.forward import TOLERANCE, bodies
+from plow_twin.estimate.forward import TOLERANCE
 from plow_twin.estimate.measurements import Poses, usable_rows
 from plow_twin.estimate.unknowns import BIAS, DELAY
 from plow_twin.model.contact import free_force
-from plow_twin.model.geometry import penetration_rows
+from plow_twin.model.geometry import body_states, penetration_rows
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import compile_scene
@@ -149,7 +149,7 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
     `depth`, shape (8,), is by how much each pad lies further out, in m. The law's damping must be the scene's own, not
     one that a restitution and the speed of the touch give.
     """
-    x, y, vx, vy, omega, c, s, _ = bodies(np.hstack((q, v)), scene.head.com_offset_m).T
+    x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)
     penetration = np.stack([c, s, x, y], axis=1) @ rows[:4] + rows[4] - (0.0 if depth is None else depth)
     rate = np.stack([-omega * s, omega * c, vx + omega * y, vy - omega * x], axis=1) @ rows[:4]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.measurements import EstimateError, Load
+from plow_twin.model.geometry import body_states
 from plow_twin.model.loads import Pieces
 from plow_twin.model.scene import Scene
 from plow_twin.solve.compiled_scene import compile_scene, inertias
@@ -101,7 +102,7 @@ class Forward:
         """
         params, segments = self._compiled(scene, gain, depth)
         records = new_records(state_type(self._terms), len(starts))
-        records["y"] = bodies(states, scene.head.com_offset_m)
+        records["y"] = body_states(states, scene.head.com_offset_m)
         if self._terms.hysteretic is not None:
             records["damping_factor"] = scene.contact.damping or 0.0
         records["step_start"] = starts
@@ -132,17 +133,3 @@ class Forward:
             params["penetration_rows"][4] -= depth
         self._last = scene, others, params, segments
         return params, segments
-
-
-def bodies(states: Array, offset: tuple[float, float]) -> Array:
-    """Convert poses and rates, shape (s, 6), to body coordinates, shape (s, 8) (`geometry.body_state`, row by row)."""
-    x, y, theta, vx, vy, omega = states.T
-    c, s = np.cos(theta), np.sin(theta)
-    rx, ry = offset
-    return np.stack(
-        [
-            c * x + s * y + rx, -s * x + c * y + ry, c * vx + s * vy - omega * ry, -s * vx + c * vy + omega * rx,
-            omega, c, s, theta,
-        ],
-        axis=1,
-    )  # fmt: skip

@@ -133,6 +133,20 @@ def body_state(
     )
 
 
+def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDArray[np.float64]:
+    """Convert poses and rates, shape (s, 6), to body coordinates, shape (s, 8) (`body_state`, row by row)."""
+    x, y, theta, vx, vy, omega = states.T
+    c, s = np.cos(theta), np.sin(theta)
+    rx, ry = offset
+    return np.stack(
+        [
+            c * x + s * y + rx, -s * x + c * y + ry, c * vx + s * vy - omega * ry, -s * vx + c * vy + omega * rx,
+            omega, c, s, theta,
+        ],
+        axis=1,
+    )  # fmt: skip
+
+
 def length_scale(scene: Scene) -> float:
     """Return the length in m that a tolerance refers to: the smallest clearance that is not negligible.
 

@@ -20,6 +20,7 @@ from plow_twin.run.twin import DEFAULT_BUDGET, read_snapshot
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.implicit import new_implicit
+from plow_twin.solve.modes import settle_moved
 from plow_twin.solve.state import PARAMS, ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_records, new_work, state_type
 
 __all__ = ["TwinBatch"]
@@ -80,6 +81,7 @@ class TwinBatch:
         for index, compiled in enumerate(self._compiled):
             self._params[index] = compiled.params
         terms = _merge(self._compiled)
+        self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
         self._wrench = np.zeros((len(scenes), 3))
         self._masses = np.array([inertias(scene) for scene in scenes])[:, None]
@@ -210,6 +212,21 @@ class TwinBatch:
             there = pose + away[index]
             offset = self.scenes[index].head.com_offset_m
             self._states["y"][index] = geometry.body_state(there[:3], there[3:], offset)
+
+    def move(self, which: ArrayLike, q: ArrayLike, v: ArrayLike) -> None:
+        """Put some twins elsewhere at the present time; their wear and counts stay.
+
+        Parameters
+        ----------
+        which : array_like of int, shape (k,)
+            Their numbers.
+        q, v : array_like, shape (k, 3)
+            Poses x, y [m], theta [rad] and their rates. A contact that goes on keeps the damping of its touch.
+        """
+        index = np.asarray(which, dtype=np.int64)
+        states = np.concatenate([np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)], axis=1)
+        places = geometry.body_states(states, self.scenes[0].head.com_offset_m)
+        settle_moved(self._params, self._states, index, places, self.time, self._stick)
 
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
         """Set the speed along the face from here on; only wear depends on it.

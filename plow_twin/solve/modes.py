@@ -8,6 +8,7 @@ import numpy as np
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, row, splat
+from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.grip import grasp, weigh_grips
@@ -125,6 +126,26 @@ def settle_modes(p, state, stick) -> None:
     state.touch_time = -np.inf
     state.touching = 0
     state.events_at_once = 0
+
+
+@kernel(entry=True)
+def settle_moved(params, states, which, places, time, stick) -> None:
+    """Put states `which` into body coordinates `places` at a time; a contact that goes on keeps its touch's damping."""
+    touched = np.zeros(PAIR_COUNT, np.int64)
+    damping = np.zeros(PAIR_COUNT)
+    for i in range(which.size):
+        p, state = params[which[i]], states[which[i]]
+        for pair in range(PAIR_COUNT):
+            touched[pair] = 0 if state.mode[pair] == OFF else 1
+            damping[pair] = state.damping_factor[pair]
+        for k in range(STATE_SIZE):
+            state.y[k] = places[i, k]
+        state.step_start = time
+        state.time = time
+        settle_modes(p, state, stick)
+        for pair in range(PAIR_COUNT):
+            if touched[pair] == 1:
+                state.damping_factor[pair] = damping[pair]
 
 
 @kernel(inline="source")
