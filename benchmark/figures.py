@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import estimate_pages
+import follow
 import lives
 import month
 import targets
@@ -122,6 +123,11 @@ def month_table() -> str:
     return "\n".join(head + [f"| {1e-3 * day:g} {own[2]}" for day, own in zip(days, tables, strict=True)])
 
 
+def follow_table() -> str:
+    """Return how well a twin follows its machine."""
+    return follow.as_markdown(_lines("follow.jsonl"))
+
+
 def siconos() -> str:
     """Return the slider of the literature beside this solver: two references of Siconos."""
     with (RESULTS / "siconos.csv").open(newline="", encoding="utf-8") as file:
@@ -150,7 +156,7 @@ def _in_unit(row: dict[str, str], key: str) -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "speed": speed, "located": located, "work": work, "missed": missed,
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "month": month_table,
-    **estimate_pages.FIGURES,
+    "follow": follow_table, **estimate_pages.FIGURES,
     **{name: stored(name) for name in ("live_node", "replay", "estimate_forces", "estimate_scales", "estimate_live")},
 }  # fmt: skip
 

@@ -29,7 +29,8 @@ from plow_twin.errors import UnitError
 
 if TYPE_CHECKING:
     from plow_twin.estimate.forces import Forces
-    from plow_twin.estimate.measurements import Load
+    from plow_twin.estimate.gaps import Gaps
+    from plow_twin.estimate.measurements import Load, Poses
     from plow_twin.estimate.result import Estimate
     from plow_twin.model.scene import Scene
     from plow_twin.record.measured import Measured
@@ -49,13 +50,37 @@ if TYPE_CHECKING:
     help="YAML that says which topic of a recording is the excitation, which the head_pose, the gaps or the forces.",
 )
 @json_option
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), help="Folder for estimate.json, forces.csv.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for estimate.json, forces.csv, followed.csv.",
+)
 @click.option(
     "--forces",
     "members",
     metavar="N",
     type=click.IntRange(20, 4096),
     help="Forces of each pair with 90 % intervals, from N twins drawn from the estimate (256 is plenty).",
+)
+@click.option(
+    "--follow",
+    "following",
+    is_flag=True,
+    help="Write followed.csv: forces and clearances as known at each time.",
+)
+@click.option(
+    "--follow-dt",
+    metavar="S",
+    type=click.FloatRange(min=0.0, min_open=True),
+    help="Distance of its rows in s; one at each sample of the load by default.",
+)
+@click.option(
+    "--follow-members",
+    metavar="N",
+    type=click.IntRange(20, 4096),
+    default=128,
+    show_default=True,
+    help="Twins that follow.",
 )
 @quiet_option
 def estimate(
@@ -65,6 +90,9 @@ def estimate(
     as_json: bool,
     out: Path | None,
     members: int | None,
+    following: bool,
+    follow_dt: float | None,
+    follow_members: int,
     quiet: bool,
 ) -> int:
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
@@ -74,6 +102,9 @@ def estimate(
     columns named after pairs: measured gaps) and contact_forces.csv (the same: measured forces), a run of ours, or
     another recording (MCAP, rosbag2's sqlite3). Where the node of a run estimated, its newest estimate is made again
     from the journal and compared, bit for bit; else the measured pose is one recorded beside the run.
+
+    With --follow each row of followed.csv tells forces and clearances, with 90 % intervals, from what was measured up
+    to its time.
     """
     import numpy as np
 
@@ -82,6 +113,8 @@ def estimate(
     from plow_twin.record.measured import LOAD_FILE
     from plow_twin.record.reader import own_run
 
+    if following and out is None:
+        raise click.UsageError("--follow: got no --out, expected the folder for followed.csv")
     folder = mapping is None and (source / LOAD_FILE).is_file()
     live = scene is None and mapping is None and not folder and own_run(source) is not None
     task = (_repeated(source) if live else None) or _given(source, scene, mapping, folder)
@@ -104,6 +137,12 @@ def estimate(
             names, rows = forces.table()
             with whole_file(out / "forces.csv") as stream:
                 np.savetxt(stream, rows, fmt="%.9g", delimiter=",", header=",".join(names), comments="")
+        if following:
+            with busy("following", quiet or as_json):
+                names, rows = _followed(_measured(source, scene, mapping, folder), follow_members, follow_dt)
+            with whole_file(out / "followed.csv") as stream:
+                form = ["%.15g", *["%.9g"] * (len(names) - 1)]
+                np.savetxt(stream, rows, fmt=form, delimiter=",", header=",".join(names), comments="")
         write_whole(out / "estimate.json", (text + "\n").encode())
     if as_json:
         click.echo(text)
@@ -130,9 +169,19 @@ class _Task:
     run: Callable[[], tuple[Estimate, dict[str, Any]]]
 
 
-def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
-    """Return the task of estimating from all that was measured."""
-    from plow_twin.estimate.estimate import estimate as run
+@dataclass(frozen=True)
+class _Given:
+    """What was measured, and how many rows of it could not be used."""
+
+    measured: Measured
+    load: Load
+    poses: Poses
+    gaps: Gaps | None
+    lost: int
+
+
+def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Given:
+    """Return all that was measured."""
     from plow_twin.estimate.gaps import Gaps
     from plow_twin.estimate.measurements import Load, Poses
     from plow_twin.record.measured import read_measured, read_recording
@@ -143,14 +192,34 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     poses, lost_poses = Poses.of(measured.poses[:, 0], measured.poses[:, 1:], measured.pose_deviation)
     gaps, lost_gaps = Gaps.of(measured.gaps[:, 0], measured.gaps[:, 1:], measured.gaps_deviation)
     lost = measured.unreadable + lost_load + lost_poses + lost_gaps
-    told, forces = gaps if len(gaps.t) else None, None
+    return _Given(measured, load, poses, gaps if len(gaps.t) else None, lost)
+
+
+def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
+    """Return the task of estimating from all that was measured."""
+    from plow_twin.estimate.estimate import estimate as run
+
+    given = _measured(source, scene, mapping, folder)
+    measured, lost, forces = given.measured, given.lost, None
     if len(measured.forces):
         from plow_twin.estimate.contact_forces import ContactForces
 
         forces, lost_forces = ContactForces.of(measured.forces[:, 0], measured.forces[:, 1:])
         lost += lost_forces
     losses = {"losses": dict(measured.lost)}
-    return _Task(measured.scene, load, lambda: (run(measured.scene, load, poses, lost, told, forces), losses))
+
+    def found() -> tuple[Estimate, dict[str, Any]]:
+        return run(measured.scene, given.load, given.poses, lost, given.gaps, forces), losses
+
+    return _Task(measured.scene, given.load, found)
+
+
+def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
+    """Return names and rows of what was known at each time."""
+    from plow_twin.estimate import followed as offline
+
+    stretch = offline.follow(given.measured.scene, given.load, given.poses, members, dt, gaps=given.gaps)
+    return offline.table(stretch.rows)
 
 
 def _check_units(source: Path, measured: Measured) -> None:

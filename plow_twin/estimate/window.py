@@ -34,6 +34,8 @@ Row = tuple[int, tuple[float, ...]]
 MOST_KEPT = 600_000
 #: Share of the window's full length from which on it is worth an estimate.
 LEAST_SHARE = 0.5
+#: The same of early windows: a load period of a window of ten; and how much longer the next one is.
+EARLY_SHARE, EARLY_GROWTH = 0.1, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,8 @@ class Windows:
         they bring no larger one.
     gaps : float
         Stated deviation of a gap sensor in m.
+    early : bool
+        Form shorter windows too, from `EARLY_SHARE` of the length on, until there are longer ones.
     """
 
     def __init__(
@@ -77,7 +81,9 @@ class Windows:
         poses: Deviation = UNSTATED,
         load: Deviation = UNSTATED,
         gaps: float = 0.0,
+        early: bool = False,
     ) -> None:
+        self._early = early
         self._pose_deviation, self._load_deviation, self._gaps_deviation = poses, load, gaps
         self._length_ns, self._interval_ns = round(length_s * 1e9), round(interval_s * 1e9)
         self._wait_ns = round(wait_s * 1e9)
@@ -90,6 +96,7 @@ class Windows:
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
+        self._first_ns: int | None = None
 
     def take_spread(self, deviation: Deviation) -> None:
         """Take in how well the load is known from here on: Fx, Fy [N], M [N m]."""
@@ -110,12 +117,23 @@ class Windows:
             return None
         self._newest_ns = stamp_ns
         end_ns = (stamp_ns - self._wait_ns) // self._interval_ns * self._interval_ns
+        if self._early:
+            end_ns = max(end_ns, self._early_end(stamp_ns))
         if self._end_ns is None:
             self._end_ns = end_ns
         if end_ns <= self._end_ns:
             return None
         self._end_ns = end_ns
         return self._form(end_ns)
+
+    def _early_end(self, stamp_ns: int) -> int:
+        """Return the end of the longest early window that is due; they count from the first sample."""
+        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        span, end_ns = EARLY_SHARE * self._length_ns, self._first_ns
+        while span < LEAST_SHARE * self._length_ns and self._first_ns + round(span) <= stamp_ns - self._wait_ns:
+            end_ns = self._first_ns + round(span)
+            span *= EARLY_GROWTH
+        return end_ns
 
     def _form(self, end_ns: int) -> Window | None:
         start_ns = end_ns - self._length_ns
@@ -132,7 +150,8 @@ class Windows:
         poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
         measured = [row for row in self._gaps if start_ns <= row[0] < end_ns]
         most = max(len(poses), len(measured))
-        if end_ns - start_ns < LEAST_SHARE * self._length_ns or most < FEWEST_POSES or len(stamps) < 2:
+        least = EARLY_SHARE if self._early else LEAST_SHARE
+        if end_ns - start_ns < least * self._length_ns or most < FEWEST_POSES or len(stamps) < 2:
             return None
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]
         load, lost_load = Load.of(*_table(rows, start_ns), self._load_deviation)

@@ -1,0 +1,170 @@
+"""The twin that follows its machine, on fresh truths: forces, peaks, impulses and clearances beside the nominal twin's.
+
+    python benchmark/follow.py --group soft --group hard --truths 12 --seed 72000
+    python benchmark/follow.py --table                       # of what the file holds
+
+All is causal: what is told at a time comes from what was measured up to it. Everything was set on seeds below 72000.
+Each truth is written as soon as it is done; what the file holds already is not run again.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from estimate_truths import PERIOD, Group, Truth, draw
+from numpy.typing import NDArray
+
+from plow_twin import Scene, simulate
+from plow_twin.errors import SolverError
+from plow_twin.estimate.estimate import warm_up
+from plow_twin.estimate.follow import MEMBERS
+from plow_twin.estimate.followed import Stretch, follow
+
+Array = NDArray[np.float64]
+RESULTS = Path(__file__).resolve().parent / "results" / "follow.jsonl"
+GROUPS = {
+    "soft": Group("K 3e6 .. 3e8", stiffness=(3e6, 3e8)),
+    "hard": Group("K 1e9 .. 1e11", stiffness=(1e9, 1e11)),
+}
+#: Forces count from the beginning of the fifth load period on; pairs with a hundredth of the largest impulse.
+FIRST_PERIOD, LEAST_SHARE = 4, 0.01
+#: Distance of rows in s from which peaks and impulses of the truth are told: the hardest contact lasts five of them.
+_FINE = 1e-4
+
+
+def run_one(name: str, seed: int, members: int) -> dict[str, Any]:
+    """Follow one truth and compare."""
+    try:
+        truth = draw(GROUPS[name], seed)
+    except SolverError as error:  # a wall that jumps through the head: no such machine
+        return {"group": name, "seed": seed, "not_drawn": str(error)}
+    true, nominal = (Motion(scene, truth) for scene in (truth.scene, truth.nominal))
+    begin = time.process_time()
+    stretch = follow(truth.nominal, truth.load, truth.poses, members, span=PERIOD)
+    cpu_s = time.process_time() - begin
+    return {
+        "group": name, "seed": seed, "stiffness": truth.scene.contact.stiffness,
+        "estimates": len(stretch.taken_over), "cores": cpu_s / float(truth.load.t[-1]),
+        **_forces(stretch, true, nominal), **_spans(stretch, true, nominal), **_clearance(stretch, truth),
+    }  # fmt: skip
+
+
+class Motion:
+    """Forces at the samples of the load, and peaks and impulses of each load period."""
+
+    def __init__(self, scene: Scene, truth: Truth) -> None:
+        end = float(truth.load.t[-1])
+        run = simulate(scene, end, _FINE, 1e-6)
+        self.force = run.force[:: round(float(truth.load.t[1]) / _FINE)]
+        edges = np.searchsorted(run.t, PERIOD * np.arange(int(end / PERIOD) + 1))
+        pieces = [run.force[first:last] for first, last in pairwise(edges.tolist())]
+        self.peak = np.stack([piece.max(axis=0) for piece in pieces])
+        self.impulse = np.stack([piece.sum(axis=0) * _FINE for piece in pieces])
+
+
+def _forces(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]:
+    count = min(len(stretch.rows.t), len(true.force))
+    told, force = stretch.rows, true.force[:count]
+    late = told.t[:count] >= FIRST_PERIOD * PERIOD
+    size = np.sqrt((force[late] ** 2).sum())
+    inside = (told.low[:count] <= force) & (force <= told.high[:count])
+    touching = force > 0.0
+    width = (told.high[:count] - told.low[:count])[touching & late[:, None]]
+    return {
+        "rms": float(np.sqrt(((told.force[:count] - force)[late] ** 2).sum()) / size),
+        "rms_nominal": float(np.sqrt(((nominal.force[:count] - force)[late] ** 2).sum()) / size),
+        "coverage": float(inside[touching].mean()),
+        "coverage_late": float(inside[touching & late[:, None]].mean()),
+        "width": float(np.median(width) / np.sqrt((force[touching] ** 2).mean())),
+    }
+
+
+def _spans(stretch: Stretch, true: Motion, nominal: Motion) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for what in ("peak", "impulse"):
+        truth, other = getattr(true, what), getattr(nominal, what)
+        told = np.stack([getattr(span, what) for span in stretch.spans])
+        count = min(len(told), len(truth))
+        counts = true.impulse[:count] > LEAST_SHARE * true.impulse.max()
+        counts[:FIRST_PERIOD] = False
+        known, low, high = told[:count].transpose(1, 0, 2)
+        error = np.abs(known - truth[:count])[counts] / truth[:count][counts]
+        inside = (low <= truth[:count]) & (truth[:count] <= high)
+        out[what] = float(np.median(error))
+        out[f"{what}_nominal"] = float(np.median(np.abs(other[:count] - truth[:count])[counts] / truth[:count][counts]))
+        out[f"{what}_coverage"] = float(inside[counts].mean())
+    return out
+
+
+def _clearance(stretch: Stretch, truth: Truth) -> dict[str, float]:
+    told, out = stretch.rows, {}
+    first = next((one.t for one in stretch.taken_over if one.taken), float(told.t[-1]))
+    for axis, name in enumerate(("horizontal", "vertical")):
+        value, low, high = told.clearance[:, axis].T
+        before = told.t < first
+        out[f"{name}_coverage"] = float(((low <= truth.clearance[axis]) & (truth.clearance[axis] <= high)).mean())
+        out[f"{name}_before"] = float((low <= truth.clearance[axis])[before].mean()) if before.any() else float("nan")
+        out[f"{name}_width_before_mm"] = 1e3 * float((high - low)[before][-1]) if before.any() else float("nan")
+        out[f"{name}_width_mm"] = 1e3 * float((high - low)[-1])
+        out[f"{name}_error_mm"] = 1e3 * float((value - truth.clearance[axis])[-1])
+    return out
+
+
+def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the table of the page: medians over the truths, coverage as means."""
+    lines = [
+        "| group | truths | RMS error of the forces: nominal, followed | largest force a pair and period | "
+        "impulse | "
+        "coverage of forces in contact, peaks, impulses | clearance: coverage over all rows | cores |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, group in GROUPS.items():
+        own = [row for row in rows if row["group"] == name and "not_drawn" not in row]
+        if not own:
+            continue
+
+        def middle(key: str, own: list[dict[str, Any]] = own) -> str:
+            return f"{100 * float(np.median([row[key] for row in own])):.1f} %"
+
+        def mean(key: str, own: list[dict[str, Any]] = own) -> float:
+            return float(np.nanmean([row[key] for row in own]))
+
+        clearance = 0.5 * (mean("horizontal_coverage") + mean("vertical_coverage"))
+        lines.append(
+            f"| {group.title} | {len(own)} | {middle('rms_nominal')}, {middle('rms')} | {middle('peak_nominal')}, "
+            f"{middle('peak')} | {middle('impulse_nominal')}, {middle('impulse')} | {mean('coverage_late'):.2f}, "
+            f"{mean('peak_coverage'):.2f}, {mean('impulse_coverage'):.2f} | {clearance:.2f} | {mean('cores'):.2f} |"
+        )
+    return "\n".join(lines)
+
+
+@click.command()
+@click.option("--group", "groups", multiple=True, type=click.Choice(list(GROUPS)))
+@click.option("--truths", default=12, show_default=True)
+@click.option("--seed", default=72000, show_default=True, help="First seed.")
+@click.option("--members", default=MEMBERS, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), default=RESULTS, show_default=True)
+@click.option("--table", "alone", is_flag=True, help="Run nothing.")
+def main(groups: tuple[str, ...], truths: int, seed: int, members: int, out: Path, alone: bool) -> None:
+    """Run the groups and write one line of JSON a truth."""
+    rows = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    done = {(row["group"], row["seed"]) for row in rows}
+    warm_up(draw(Group("start", periods=1.0), 0).nominal)
+    for number in range(seed, seed + (0 if alone else truths)):
+        for name in groups or tuple(GROUPS):
+            if (name, number) not in done:
+                rows.append(run_one(name, number, members))
+                with out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(rows[-1]) + "\n")
+    click.echo(as_markdown(rows))
+
+
+if __name__ == "__main__":
+    main()
