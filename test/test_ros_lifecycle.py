@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,60 +48,101 @@ def _set(running: Bench, name: str, given: Any) -> Any:
     return running.probe.call(SetParameters, f"{running.namespace}/plow_twin/set_parameters", request).results[0]
 
 
-def test_a_managed_node_waits_refuses_nonsense_and_goes_through_all_states(tmp_path: Path) -> None:
-    with bench(tmp_path, "unconfigured", autostart="false", scene="no/such.yaml") as running:
-        probe = running.probe
-        assert _state(running) == "unconfigured"
-        assert not _change(running, Transition.TRANSITION_ACTIVATE)
-        assert not _change(running, Transition.TRANSITION_CONFIGURE)
-        assert _state(running) == "unconfigured"
-        assert "no/such.yaml" in probe.status[-1].message and probe.status[-1].level == b"\x02"
-        assert "no/such.yaml" in probe.figures("state")["reason"]
+@pytest.fixture(scope="module")
+def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """A node that a manager configures: without `autostart` it stays unconfigured."""
+    with bench(tmp_path_factory.mktemp("managed"), "unconfigured", autostart="false") as running:
+        yield running
 
-        assert _set(running, "scene", "paper").successful
-        assert _set(running, "record_path", str(tmp_path / "first")).successful
-        assert _change(running, Transition.TRANSITION_CONFIGURE)
-        assert _state(running) == "inactive"
-        forces = probe.listen(JointState, "contact_forces")
-        send = probe.excitation()
-        send(T0, (1.0, 2.0, 3.0))
-        probe.until_figure("input", "dropped_inactive", "1")
-        assert _change(running, Transition.TRANSITION_ACTIVATE)
-        send(T0 + 1_000_000, (1.0, 2.0, 3.0))
-        probe.until(lambda: forces, "an answer of the active node")
-        assert not _change(running, Transition.TRANSITION_CONFIGURE)
-        assert not _set(running, "scene", "bench_kv").successful
-        assert _change(running, Transition.TRANSITION_DEACTIVATE)
-        assert _change(running, Transition.TRANSITION_CLEANUP)
-        reader = RunReader(tmp_path / "first")
-        assert [type(getattr(record, "entry", None)).__name__ for record in reader].count("Sample") == 1
-        assert reader.status is FileStatus.COMPLETE
-        probe.until(lambda: probe.node.count_publishers("contact_forces") == 0, "released publishers")
 
-        # a recording that cannot be made leaves nothing behind
-        assert _set(running, "record_path", str(tmp_path / "first" / "metadata.yaml" / "below")).successful
-        assert not _change(running, Transition.TRANSITION_CONFIGURE)
-        assert probe.node.count_publishers("contact_forces") == 0
+@pytest.fixture
+def managed(waiting: Bench) -> Iterator[Bench]:
+    """The same node, unconfigured and with the parameters of a start; left so again."""
+    for name, given in (("scene", "paper"), ("record_path", ""), ("wear_state_path", "")):
+        assert _set(waiting, name, given).successful
+    yield waiting
+    if _state(waiting) == "active":
+        assert _change(waiting, Transition.TRANSITION_DEACTIVATE)
+    if _state(waiting) == "inactive":
+        assert _change(waiting, Transition.TRANSITION_CLEANUP)
 
-        # nor is wear that could not be kept accepted: /proc takes no files, whoever asks
-        assert _set(running, "record_path", "").successful
-        assert _set(running, "wear_state_path", "/proc/self/wear").successful
-        assert not _change(running, Transition.TRANSITION_CONFIGURE)
-        said = "wear_state_path: got '/proc/self/wear', expected a folder that can be written to: "
-        assert said in running.twin.output()
-        assert _set(running, "wear_state_path", "").successful
 
-        # around once more, on another scene, beside the first recording, and out by shutdown
-        assert _set(running, "scene", "bench_kv").successful
-        assert _set(running, "record_path", str(tmp_path / "first")).successful
-        assert _change(running, Transition.TRANSITION_CONFIGURE)
-        assert _change(running, Transition.TRANSITION_ACTIVATE)
-        probe.until_figure("state", "scene", "bench_kv")
+def test_a_missing_scene_refuses_configuration_and_the_status_names_it(managed: Bench) -> None:
+    assert _set(managed, "scene", "no/such.yaml").successful
+    assert not _change(managed, Transition.TRANSITION_CONFIGURE)
+    assert _state(managed) == "unconfigured"
+    managed.probe.until(lambda: "no/such.yaml" in managed.probe.status[-1].message, "the reason")
+    assert managed.probe.status[-1].level == b"\x02"
+    assert "no/such.yaml" in managed.probe.figures("state")["reason"]
+
+
+def test_a_recording_that_cannot_be_made_refuses_configuration_and_leaves_nothing(
+    managed: Bench, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    assert _set(managed, "record_path", str(tmp_path / "file" / "below")).successful
+    assert not _change(managed, Transition.TRANSITION_CONFIGURE)
+    assert managed.probe.node.count_publishers("contact_forces") == 0
+
+
+def test_a_folder_that_takes_no_wear_refuses_configuration_and_is_named(managed: Bench) -> None:
+    # /proc takes no files, whoever asks
+    assert _set(managed, "wear_state_path", "/proc/self/wear").successful
+    assert not _change(managed, Transition.TRANSITION_CONFIGURE)
+    expected = "wear_state_path: got '/proc/self/wear', expected a folder that can be written to: "
+    assert expected in managed.twin.output()
+
+
+def test_only_an_active_node_uses_samples_and_cleanup_closes_its_recording(managed: Bench, tmp_path: Path) -> None:
+    probe = managed.probe
+    assert _set(managed, "record_path", str(tmp_path / "run")).successful
+    assert not _change(managed, Transition.TRANSITION_ACTIVATE)
+    assert _change(managed, Transition.TRANSITION_CONFIGURE)
+    assert _state(managed) == "inactive"
+    forces = probe.listen(JointState, "contact_forces")
+    send = probe.excitation()
+    send(T0, (1.0, 2.0, 3.0))
+    probe.until_figure("input", "dropped_inactive", "1")
+    assert _change(managed, Transition.TRANSITION_ACTIVATE)
+    send(T0 + 1_000_000, (1.0, 2.0, 3.0))
+    probe.until(lambda: forces, "an answer of the active node")
+    assert _change(managed, Transition.TRANSITION_DEACTIVATE)
+    assert _change(managed, Transition.TRANSITION_CLEANUP)
+    reader = RunReader(tmp_path / "run")
+    assert [type(getattr(record, "entry", None)).__name__ for record in reader].count("Sample") == 1
+    assert reader.status is FileStatus.COMPLETE
+    probe.until(lambda: probe.node.count_publishers("contact_forces") == 0, "released publishers")
+
+
+def test_an_active_node_refuses_to_be_configured_and_another_scene(managed: Bench) -> None:
+    assert _change(managed, Transition.TRANSITION_CONFIGURE)
+    assert _change(managed, Transition.TRANSITION_ACTIVATE)
+    assert not _change(managed, Transition.TRANSITION_CONFIGURE)
+    assert not _set(managed, "scene", "bench_kv").successful
+    assert _state(managed) == "active"
+
+
+def test_a_node_configured_anew_has_another_scene_and_records_beside_the_first(managed: Bench, tmp_path: Path) -> None:
+    for scene in ("paper", "bench_kv"):
+        assert _set(managed, "scene", scene).successful
+        assert _set(managed, "record_path", str(tmp_path / "run")).successful
+        assert _change(managed, Transition.TRANSITION_CONFIGURE)
+        assert _change(managed, Transition.TRANSITION_ACTIVATE)
+        managed.probe.until_figure("state", "scene", scene)
+        assert _change(managed, Transition.TRANSITION_DEACTIVATE)
+        assert _change(managed, Transition.TRANSITION_CLEANUP)
+    found = [RunReader(tmp_path / name).header.parameters["scene"] for name in ("run", "run_2")]
+    assert found == ["paper", "bench_kv"]
+
+
+def test_a_shutdown_while_active_ends_in_finalized_and_a_clean_exit(tmp_path: Path) -> None:
+    with bench(tmp_path, record_path=str(tmp_path / "run")) as running:
         assert _change(running, Transition.TRANSITION_ACTIVE_SHUTDOWN)
         assert _state(running) == "finalized"
+        reader = RunReader(tmp_path / "run")
+        assert len(list(reader)) > 0 and reader.status is FileStatus.COMPLETE
         assert running.twin.stop() == 0
         assert "Traceback" not in running.twin.output()
-    assert RunReader(tmp_path / "first_2").header.parameters["scene"] == "bench_kv"
 
 
 def test_a_request_beside_a_cleanup_is_answered_and_the_node_lives(tmp_path: Path) -> None:

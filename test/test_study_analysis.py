@@ -11,15 +11,14 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import rainflow
+from bag_support import BIAS, COUNT, LAG_S, PAPER, STORE, measured, motion, pose_message, wrench_message, write_bag
 from pyarrow import parquet
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 from scenes import ROOT
 
 from plow_twin import Initial, Wear
@@ -33,7 +32,6 @@ from plow_twin.record.replay import replay
 from plow_twin.run.energy_balance import elastic_energy
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry, Pose, Restore, SetModel, Travel
 from plow_twin.stream.session import Session
 from plow_twin.study.analysis import loads, thinned
@@ -42,71 +40,7 @@ from plow_twin.study.analysis.loads import reversals
 from plow_twin.study.analysis.report import _write_tables, write_report
 from plow_twin.study.analysis.signals import LARGEST_LAG_S, compare
 
-COUNT = 8000
-LAG_S = 0.037
-BIAS = (0.002, -0.003, 0.004)
-STORE = get_typestore(Stores.ROS2_JAZZY)
-PAPER = scene_path("paper")
 BEST_FIT = PAPER.with_name("paper_best_fit.yaml")
-MAP = """
-excitation: {topic: /load, type: geometry_msgs/msg/WrenchStamped, stamp: header, scale: {fx: 1000, fy: 1000, m: 1000},
-  fields: {fx: wrench.force.x, fy: wrench.force.y, m: wrench.torque.z}}
-head_pose: {topic: /pose}
-"""
-
-
-@pytest.fixture(scope="module")
-def motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times, loads and poses of 8 s of the paper's head."""
-    twin = Twin(load_scene(PAPER), excitation="sampled")
-    times = np.arange(COUNT) * 1e-3
-    wrench = np.array([paper_sample(index).wrench for index in range(COUNT)])
-    return times, wrench, twin.advance_samples(times, wrench).q
-
-
-def measured(motion: tuple[np.ndarray, ...]) -> Iterable[tuple[float, np.ndarray]]:
-    """Poses at 100 Hz: late, biased, with noise."""
-    times, _, q = motion
-    rng = np.random.default_rng(4)
-    for t in np.arange(0.1, times[-1], 0.01):
-        late = np.array([np.interp(t - LAG_S, times, q[:, k]) for k in range(3)])
-        yield t, late - BIAS + rng.normal(0.0, [1e-4, 1e-4, 2e-4])
-
-
-def wrench_message(stamp_ns: int, wrench: Any) -> bytes:
-    types = STORE.types
-    vector = types["geometry_msgs/msg/Vector3"]
-    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
-    header = types["std_msgs/msg/Header"](stamp, "f")
-    body = types["geometry_msgs/msg/Wrench"](vector(wrench[0], wrench[1], 0.0), vector(0.0, 0.0, wrench[2]))
-    message = types["geometry_msgs/msg/WrenchStamped"](header, body)
-    return bytes(STORE.serialize_cdr(message, "geometry_msgs/msg/WrenchStamped"))
-
-
-def pose_message(stamp_ns: int, q: Any) -> bytes:
-    types = STORE.types
-    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
-    turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, np.sin(q[2] / 2), np.cos(q[2] / 2))
-    pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](q[0], q[1], 0.0), turn)
-    message = types["geometry_msgs/msg/PoseStamped"](types["std_msgs/msg/Header"](stamp, "f"), pose)
-    return bytes(STORE.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
-
-
-def write_bag(folder: Path, motion: tuple[np.ndarray, ...], plugin: StoragePlugin) -> Path:
-    messages = [
-        (BASE_NS + i * STEP_NS, "/load", wrench_message(BASE_NS + i * STEP_NS, wrench / 1000.0))
-        for i, wrench in enumerate(motion[1])
-    ]
-    messages += [
-        (BASE_NS + round(t * 1e9), "/pose", pose_message(BASE_NS + round(t * 1e9), q)) for t, q in measured(motion)
-    ]
-    with Writer(folder, version=9, storage_plugin=plugin) as writer:
-        kinds = {"/load": "geometry_msgs/msg/WrenchStamped", "/pose": "geometry_msgs/msg/PoseStamped"}
-        connections = {topic: writer.add_connection(topic, kind, typestore=STORE) for topic, kind in kinds.items()}
-        for time_ns, topic, data in sorted(messages):
-            writer.write(connections[topic], time_ns + 1_000_000, data)
-    (folder.parent / "map.yaml").write_text(MAP)
-    return folder
 
 
 def check(found: Analysis, bias: tuple[float, ...] = BIAS) -> None:
@@ -120,10 +54,8 @@ def check(found: Analysis, bias: tuple[float, ...] = BIAS) -> None:
 
 
 @pytest.mark.parametrize("plugin", [StoragePlugin.SQLITE3, StoragePlugin.MCAP])
-def test_a_bag_shows_bias_and_lag_of_the_sensor_and_becomes_a_run(
-    plugin: StoragePlugin, motion: tuple[np.ndarray, ...], tmp_path: Path
-) -> None:
-    bag = write_bag(tmp_path / "bag", motion, plugin)
+def test_a_bag_shows_bias_and_lag_of_the_sensor_and_becomes_a_run(plugin: StoragePlugin, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", motion(), plugin)
     found = analyse(bag, scene=PAPER, mapping=tmp_path / "map.yaml", out=tmp_path / "out")
     check(found)
     assert found.input == {"samples_in": COUNT, "samples_used": COUNT} and not found.lossy
@@ -133,26 +65,24 @@ def test_a_bag_shows_bias_and_lag_of_the_sensor_and_becomes_a_run(
     assert report.compared["contact_forces"] == COUNT
 
 
-def test_csv_files_are_read_by_their_columns(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+def test_csv_files_are_read_by_their_columns(tmp_path: Path) -> None:
     with (tmp_path / "load.csv").open("w", newline="") as stream:
         rows = csv.writer(stream)
         rows.writerow(["t", "fx", "fy", "m"])
-        rows.writerows([t, *wrench] for t, wrench in zip(motion[0], motion[1], strict=True))
+        rows.writerows([t, *wrench] for t, wrench in zip(motion()[0], motion()[1], strict=True))
     with (tmp_path / "pose.csv").open("w", newline="") as stream:
         rows = csv.writer(stream)
         rows.writerow(["t", "x", "y", "theta"])
-        rows.writerows([t, q[0], "", q[2]] for t, q in measured(motion))
+        rows.writerows([t, q[0], "", q[2]] for t, q in measured(motion()))
     found = analyse(tmp_path, scene=PAPER)
     signals = found.comparisons(found.predictions[0])
     assert set(signals) == {"x", "theta"}  # a cell left empty was not measured
     assert signals["x"].lag_s == pytest.approx(LAG_S, abs=0.004)
 
 
-def test_values_of_another_clock_and_impossible_ones_are_counted(
-    motion: tuple[np.ndarray, ...], tmp_path: Path
-) -> None:
+def test_values_of_another_clock_and_impossible_ones_are_counted(tmp_path: Path) -> None:
     load, pose = tmp_path / "load.csv", tmp_path / "pose.csv"
-    rows = [f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion[0][:500], motion[1], strict=False)]
+    rows = [f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion()[0][:500], motion()[1], strict=False)]
     load.write_text("t,fx,fy,m\n" + "".join(rows))
     poses = [(0.01 + 0.01 * n, [n * 1e-5, 0.0, 0.0]) for n in range(40)]
     poses[7][1][0] = 1e200
@@ -174,8 +104,8 @@ def test_values_of_another_clock_and_impossible_ones_are_counted(
     assert found.lost == {"measured_outside_the_load": 120} and found.lossy and found.facts()["signals"] == {}
 
 
-def test_other_scenes_are_predicted_beside_it_in_one_pass(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / "bag", motion, StoragePlugin.MCAP)
+def test_other_scenes_are_predicted_beside_it_in_one_pass(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", motion(), StoragePlugin.MCAP)
     command = [sys.executable, "-m", "plow_twin", "analyse", str(bag), "--scene", "paper", "--with", str(BEST_FIT)]
     command += ["--map", str(tmp_path / "map.yaml"), "--out", str(tmp_path / "out"), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False)
@@ -247,8 +177,8 @@ def test_late_samples_of_a_run_take_their_places_among_whatever_stands_between(t
     assert found.predictions[0].loads.impulse == pytest.approx(series.impulse.sum(axis=0), rel=1e-9)
 
 
-def test_a_gap_is_compared_with_what_is_left_to_the_wall(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
-    load = np.column_stack(motion[:2])[:1000]
+def test_a_gap_is_compared_with_what_is_left_to_the_wall(tmp_path: Path) -> None:
+    load = np.column_stack(motion()[:2])[:1000]
     pair = PAIR_NAMES.index("top_right_right")
     penetration = Twin(load_scene(PAPER), excitation="sampled").advance_samples(load[:, 0], load[:, 1:]).penetration
     gap = np.column_stack([load[:, 0], 1e-3 - penetration[:, pair]])  # 1 mm too much
@@ -318,10 +248,10 @@ def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> N
         analyse(bag / "run", scene=PAPER, mapping=mapping)
 
 
-def test_travel_makes_passes_of_the_face(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
+def test_travel_makes_passes_of_the_face(tmp_path: Path) -> None:
     with (tmp_path / "load.csv").open("w") as stream:
         stream.write("t,fx,fy,m\n")
-        stream.writelines(f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion[0], motion[1], strict=True))
+        stream.writelines(f"{t},{w[0]},{w[1]},{w[2]}\n" for t, w in zip(motion()[0], motion()[1], strict=True))
     (tmp_path / "travel.csv").write_text("t,speed\n0.5,2.0\n4.0,-2.0\n")
     worn = replace(load_scene(PAPER), wear=Wear(1e-12, 0.015, 0.0, pad_length_m=0.3))
     (scene := tmp_path / "worn.yaml").write_text(dump_scene(worn))
@@ -400,11 +330,9 @@ def test_duty_is_a_share_of_time_however_coarsely_the_load_is_sampled(tmp_path: 
 
 
 @pytest.mark.parametrize("clock_s", [2.0, 3600.0])
-def test_measured_values_are_compared_with_the_stretch_they_belong_to(
-    clock_s: float, motion: tuple[np.ndarray, ...], tmp_path: Path
-) -> None:
+def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: float, tmp_path: Path) -> None:
     """The clock steps back into what was, or an hour ahead: either stretch is predicted as it was measured."""
-    times, wrench, q = motion
+    times, wrench, q = motion()
     short = 3000
     weak = 0.3 * wrench[:short]
     after = Twin(load_scene(PAPER), excitation="sampled").advance_samples(times[:short], weak).q
@@ -483,11 +411,9 @@ def test_speeds_act_at_the_stamps_that_the_mapping_reads(
         assert one == pytest.approx(known, abs=0.05)
 
 
-def test_late_repeated_and_non_finite_samples_are_counted_as_live(
-    motion: tuple[np.ndarray, ...], tmp_path: Path
-) -> None:
+def test_late_repeated_and_non_finite_samples_are_counted_as_live(tmp_path: Path) -> None:
     stamps = [BASE_NS + i * STEP_NS for i in range(200)]
-    arrivals = [(stamp, motion[1][i]) for i, stamp in enumerate(stamps)]
+    arrivals = [(stamp, motion()[1][i]) for i, stamp in enumerate(stamps)]
     arrivals[50], arrivals[51] = arrivals[51], arrivals[50]
     arrivals.insert(100, arrivals[99])
     arrivals[150] = (arrivals[150][0], np.array([np.nan, 0.0, 0.0]))
@@ -535,8 +461,8 @@ def read_everything(path: Path, read: Callable[[Path], object]) -> None:
         assert str(error)
 
 
-def mutate_many(tmp_path: Path, motion: tuple[np.ndarray, ...], seeds: Iterable[int]) -> None:
-    short = (motion[0][:150], motion[1][:150], motion[2][:150])
+def mutate_many(tmp_path: Path, seeds: Iterable[int]) -> None:
+    short = (motion()[0][:150], motion()[1][:150], motion()[2][:150])
     files = [
         record_run(tmp_path / "run", map(paper_sample, range(150))).file,
         next(write_bag(tmp_path / "sqlite", short, StoragePlugin.SQLITE3).glob("*.db3")),
@@ -560,14 +486,14 @@ def mutate_many(tmp_path: Path, motion: tuple[np.ndarray, ...], seeds: Iterable[
             raise AssertionError(f"seed {seed}: {error!r}") from error
 
 
-def test_mutated_files_give_an_error_or_counted_loss(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
-    mutate_many(tmp_path, motion, range(500))
+def test_mutated_files_give_an_error_or_counted_loss(tmp_path: Path) -> None:
+    mutate_many(tmp_path, range(500))
 
 
 @pytest.mark.stress
 @pytest.mark.timeout(3600)
-def test_mutated_files_many_times(motion: tuple[np.ndarray, ...], tmp_path: Path) -> None:
-    mutate_many(tmp_path, motion, range(1000, 11_000))
+def test_mutated_files_many_times(tmp_path: Path) -> None:
+    mutate_many(tmp_path, range(1000, 11_000))
 
 
 def test_rows_beyond_what_fits_are_kept_evenly(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bag_support import MAP, PAPER, STORE, wrench_message
 from mcap.writer import Writer
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
-from test_study_analysis import MAP, PAPER, STORE, wrench_message
 
 from plow_twin.errors import RecordingError
 from plow_twin.record.doctor import examine, repair

@@ -220,7 +220,7 @@ def compare(
 
     They are those of hard contacts, or have about the softness and damping of `near`, a vector of unknowns.
     """
-    eye = _Eye(unknowns, poses, period)
+    eye = MotionFeatures(unknowns, poses, period)
     measured = eye.features(eye.q)
     spread = _Spread.hard(unknowns) if near is None else _Spread.near(unknowns, near)
     drawn = _Drawn(forward, unknowns, eye, spread, np.random.default_rng(seed))
@@ -238,7 +238,7 @@ def compare(
             return None
         features = np.array(drawn.features)
         if found is None:
-            delay = _delay(eye, features[:, 5:], drawn.q, measured[5:])
+            delay = path_delay(eye, features[:, 5:], drawn.q, measured[5:])
             # those of the first round were seen at other times: only their phase is set right
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
             drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
@@ -249,7 +249,7 @@ def compare(
         if near is not None and found is not None:
             likely = _likeliest(features, targets, np.array(paths), measured, eye.paths(eye.q, _OF_DRAWN_S))
             like, seen = np.concatenate([like, likely[:-1]], axis=1), np.concatenate([seen, likely[-1]])
-        found = _regress(like, targets, seen)
+        found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
         # what still moves has not been found
@@ -275,7 +275,7 @@ def compare(
         (float(found.value[6]), float(found.deviation[6])),
         eye.noise,
         found.distance,
-        _off_path(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
+        path_deviate(eye.paths(eye.q, _LAGS_S), features[:, 5:], paths, measured[5:]),
         law,
         odds if near is None else -math.inf,  # its limit was set with draws of hard contacts
     )
@@ -311,7 +311,7 @@ class _Drawn:
     """Draws of one law: features, targets, changes and, until they are cleared, the motions as they are seen."""
 
     def __init__(
-        self, forward: Forward, unknowns: Unknowns, eye: _Eye, spread: _Spread, rng: np.random.Generator
+        self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator
     ) -> None:  # fmt: skip
         self.forward, self.unknowns, self.eye, self.spread, self.rng = forward, unknowns, eye, spread, rng
         self.features: list[Array] = []
@@ -387,7 +387,7 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, s
     return off
 
 
-def _delay(eye: _Eye, features: Array, drawn: list[Array], measured: Array) -> float:
+def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return the delay in s with which the measured path is nearest to that of motions drawn without one."""
     paths = np.array([eye.paths(q, np.zeros(1))[0] for q in drawn])
     seen = eye.paths(eye.q, _LAGS_S)
@@ -416,11 +416,11 @@ def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) ->
         return nothing
     eye = drawn.eye
     measured = np.concatenate([eye.features(eye.q)[5:], eye.changes(eye.q)])
-    more = _likelier(drawn.like(), other.like(), measured)
+    more = class_deviate(drawn.like(), other.like(), measured)
     return more, log_odds(drawn.told(), other.told(), np.concatenate([measured, eye.changes_by_phase(eye.q)]))
 
 
-def _likelier(believed: Array, other: Array, measured: Array) -> float:
+def class_deviate(believed: Array, other: Array, measured: Array) -> float:
     """Return how much more features (m,) are like `other` (k, m) than like `believed` (n, m), as a normal deviate.
 
     A label of the two, each class weighing the same, is regressed; the deviate is among those of the believed ones,
@@ -441,7 +441,7 @@ def _likelier(believed: Array, other: Array, measured: Array) -> float:
     return float((beta[0] - right.mean()) / right.std(ddof=1))
 
 
-def _off_path(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
+def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
     """Return how far off the measured path is among the drawn motions, a normal deviate; 0 without enough of it.
 
     Each of the drawn motions near the measured one is compared with all others as that is: how far right models are off
@@ -529,7 +529,7 @@ class _Near:
         return value, left
 
 
-def _regress(features: Array, targets: Array, measured: Array) -> _Regressed:
+def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
     """Regress targets (n, k) on features (n, m), the nearest to what was measured most.
 
     The deviations are those of a prediction at `measured`, which may lie at the edge of what was drawn.
@@ -560,7 +560,7 @@ def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> A
     return variance
 
 
-class _Eye:
+class MotionFeatures:
     """How motions are seen: at the poses' times, with their gaps and noise, as a few numbers."""
 
     def __init__(self, unknowns: Unknowns, poses: Poses, period: float) -> None:

@@ -190,7 +190,7 @@ def _estimate(
         result, following = _without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
     if forces is not None and result.forces_measured is None:
         result = replace(result, forces_measured=ForcesUsed(unused="the motion is not known moment by moment"))
-    return (result, following) if told is None else (_with_gaps(result, told), following)
+    return (result, following) if told is None else (with_gaps(result, told), following)
 
 
 def _from_motion(
@@ -276,7 +276,7 @@ def _searched(
     found, verdict = _with_turns(found, judge(*found, period), period)
     result = summarise(*found, verdict, lost, forces if bounced is None else None)
     following = () if verdict.model or verdict.sensor else _next_guess(*found)
-    return result if bounced is None else _with_bounced(result, bounced, spent), following
+    return result if bounced is None else with_bounced(result, bounced, spent), following
 
 
 def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
@@ -288,7 +288,7 @@ def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
     return unknowns.within(start)
 
 
-def _with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
+def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
     """Put together what a fit and a comparison of the same motion tell; what they disagree by widens the interval."""
     values = []
     for value, state, mean, deviation in zip(
@@ -334,7 +334,7 @@ def _moved_back(result: Estimate, bias: Array) -> Estimate:
     return replace(result, bias_x=x, bias_y=y, bias_theta=theta)
 
 
-def _with_gaps(result: Estimate, told: Told) -> Estimate:
+def with_gaps(result: Estimate, told: Told) -> Estimate:
     """Put together what the motion and what gap sensors tell; where they contradict each other, nothing holds."""
     found = []
     if told.contradiction > MOST_CONTRADICTION:

@@ -1,0 +1,24 @@
+"""Synthetic truths for the tests of the estimate, and two of them that are estimated once for all files."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import cache
+
+from scenes import ROOT
+
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.result import Estimate
+
+sys.path.insert(0, str(ROOT / "benchmark"))
+from estimate_truths import GROUPS, Truth, draw
+
+__all__ = ["GROUPS", "Truth", "draw", "known"]
+
+
+@cache
+def known() -> tuple[tuple[Truth, Estimate], ...]:
+    """Two truths of the paper's scene, five load periods each, with their estimates."""
+    truths = [draw(replace(GROUPS["plain"], periods=5.0), seed) for seed in (2, 3)]
+    return tuple((truth, estimate(truth.nominal, truth.load, truth.poses)) for truth in truths)

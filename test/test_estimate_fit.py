@@ -1,0 +1,49 @@
+"""The algebra of the fit: links between swings, normal equations, intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import truncnorm
+
+from plow_twin.estimate.arrow import Arrow
+from plow_twin.estimate.fit import link_weights
+from plow_twin.estimate.result import Interval
+
+
+def test_links_have_the_weight_of_white_noise_of_acceleration() -> None:
+    rng = np.random.default_rng(4)
+    span, drift, steps = 0.3, np.array([2.0, 0.5, 1.0]), 300
+    rate = np.cumsum(rng.standard_normal((20_000, steps, 1)) * np.sqrt(span / steps), axis=1)
+    added = np.hstack((rate.mean(axis=1) * span, rate[:, -1]))
+    weights = link_weights(np.array([span]), drift)[0]
+    for axis, density in enumerate(drift):
+        covariance = np.linalg.inv(weights[np.ix_([axis, axis + 3], [axis, axis + 3])])
+        assert covariance == pytest.approx(np.cov(added.T) * density, rel=0.05)
+
+
+@pytest.mark.parametrize("swings", [1, 2, 9])
+def test_the_normal_equations_of_linked_swings_agree_with_dense_ones(swings: int) -> None:
+    rng = np.random.default_rng(swings)
+    arrow, size = Arrow.empty(3, swings), 3 + 6 * swings
+    dense = np.zeros((size, size))
+    for swing, count in [(one, 6) for one in range(swings)] + [(one, 12) for one in range(swings - 1)]:
+        rows = rng.standard_normal((30, 3 + count))
+        arrow.add(swing, rows.T @ rows)
+        places = np.concatenate([np.arange(3), 3 + 6 * swing + np.arange(count)])
+        dense[np.ix_(places, places)] += rows.T @ rows
+    assert arrow.diagonal() == pytest.approx(np.diag(dense))
+    more, right = rng.random(size), rng.standard_normal((size, 2))
+    factor = arrow.plus(more).factorised()
+    inverse = np.linalg.inv(dense + np.diag(more))
+    assert factor.solve(right) == pytest.approx(inverse @ right, rel=1e-9, abs=1e-12)
+    assert factor.covariance() == pytest.approx(inverse[:3, :3], rel=1e-9, abs=1e-12)
+
+
+def test_an_interval_is_cut_off_where_the_head_has_been() -> None:
+    cut = Interval.normal(0.025, 0.008).above(0.03)
+    assert 0.03 < cut.p05 < cut.mean < cut.p95
+    assert Interval.normal(0.025, 0.001).above(0.0) == Interval.normal(0.025, 0.001)
+    for least in (-3.0, 0.0, 2.0, 20.0, 40.0):
+        one, other = Interval.normal(0.0, 1.0).above(least), truncnorm(least, np.inf)
+        assert (one.mean, one.p05, one.p95) == pytest.approx((other.mean(), *other.ppf([0.05, 0.95])), abs=2e-4)

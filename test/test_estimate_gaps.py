@@ -1,0 +1,76 @@
+"""Gap sensors beside the poses, or instead of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimate_support import Truth, draw, known
+from scenes import gaps_at
+
+from plow_twin.estimate.estimate import estimate, with_gaps
+from plow_twin.estimate.gaps import Gaps, GapsError, tell
+from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.result import State
+
+SENSOR_ERROR = 1e-4
+
+
+@pytest.fixture(scope="module")
+def gapped() -> tuple[Truth, np.ndarray]:
+    """A truth and the gaps that sensors at all pairs measure, each with a constant error, noise and places left out."""
+    truth = known()[0][0]
+    still = draw(replace(truth.group, noise_m=0.0), 2).poses.q
+    rng = np.random.default_rng(6)
+    gap = gaps_at(truth.scene, still) + 3e-4 * rng.standard_normal((len(still), 8))
+    return truth, gap + SENSOR_ERROR * rng.standard_normal(8)
+
+
+@pytest.mark.parametrize("pairs", [range(8), (0, 1, 3, 6, 7), (0, 1, 3, 6)])
+def test_gaps_give_the_clearances_without_a_contact_model(
+    gapped: tuple[Truth, np.ndarray], pairs: tuple[int, ...]
+) -> None:
+    truth, gap = gapped
+    some = np.full_like(gap, np.nan)
+    some[:, list(pairs)] = gap[:, list(pairs)]
+    gaps, _ = Gaps.of(truth.poses.t, some)
+    told = tell(truth.nominal, gaps, truth.poses)
+    assert told is not None
+    assert (np.abs(told.clearance - truth.clearance) < 3.0 * told.deviation).all() and (told.deviation < 1.5e-4).all()
+    assert len(told.poses.t) == (len(gap) if len(pairs) > 4 else 0)
+    if len(pairs) > 4:
+        assert np.abs(np.median(told.poses.q - truth.poses.q, axis=0)).max() < 1e-3
+    assert told.groups.keys() == ({"horizontal_top", "vertical_left"} if len(pairs) < 8 else set(told.groups))
+    for name, value in told.groups.items():
+        true = truth.clearance[0 if name.startswith("horizontal") else 1]
+        assert abs(value.mean - true) < 4.0 * SENSOR_ERROR
+
+
+def test_gaps_at_one_wall_alone_give_no_clearance(gapped: tuple[Truth, np.ndarray]) -> None:
+    truth, gap = gapped
+    gap = gap.copy()
+    gap[:, [3, 5]] = np.nan  # none at the right wall
+    gaps, _ = Gaps.of(truth.poses.t, gap)
+    assert tell(truth.nominal, gaps, truth.poses) is None
+    result = estimate(truth.nominal, truth.load, Poses(truth.poses.t[:0], truth.poses.q[:0]), gaps=gaps)
+    assert result.horizontal_state is State.PRIOR
+    with pytest.raises(GapsError, match=r"gap \(4, 3\), expected \(n,\) and \(n, 8\)"):
+        Gaps.of(np.arange(4.0), np.zeros((4, 3)))
+
+
+def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_one_is_found(gapped: tuple[Truth, np.ndarray]) -> None:
+    truth, gap = gapped
+    gaps, lost = Gaps.of(truth.poses.t, gap)
+    nothing, _ = Poses.of([], np.zeros((0, 3)))
+    result = estimate(truth.nominal, truth.load, nothing, lost, gaps)
+    assert (result.horizontal_state, result.model, result.sensor) == (State.ESTIMATED, "ok", "ok")
+    for value, true in zip((result.horizontal, result.vertical), truth.clearance, strict=True):
+        assert abs(value.mean - true) < 1e-4 and value.p95 - value.p05 < 2e-4
+    shifted = gap.copy()
+    shifted[:, 1] += 2e-3
+    told = tell(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)
+    assert told is not None and told.contradiction > 5.0
+    result = with_gaps(known()[0][1], told)
+    assert result.horizontal_state is result.vertical_state is State.WITHDRAWN and result.sensor == "suspect"
+    assert "gaps:" in result.reasons[0]

@@ -1,0 +1,43 @@
+"""A machine of another size is estimated in the paper's units, to the same bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from estimate_support import known
+from scenes import preset
+
+from plow_twin import Friction, Initial, simulate
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.forces import draw_scenes
+from plow_twin.estimate.similar import Units
+
+
+def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> None:
+    truth, result = known()[0]
+    desk = Units(8.0, 1024.0, 4.0)  # an eighth as large, a thousandth as heavy, four times as fast
+    scene = desk.scene(truth.nominal)
+    found = estimate(scene, desk.load(truth.load), desk.poses(truth.poses))
+    assert found.t_end == result.t_end / 4.0 and found.bias_x is not None and found.delay is not None
+    # in units that are powers of two each number is the same one
+    back = desk.in_si(found, truth.nominal)
+    assert back == replace(result, lost=back.lost) and found.horizontal.mean == result.horizontal.mean / 8.0
+    twins, gain = draw_scenes(scene, found, 20, np.random.default_rng(0))
+    alike, same = draw_scenes(truth.nominal, result, 20, np.random.default_rng(0))
+    assert gain == pytest.approx(same)
+    assert [8.0 * twin.clearance.vertical_m for twin in twins] == pytest.approx(
+        [twin.clearance.vertical_m for twin in alike]
+    )
+
+
+@pytest.mark.parametrize("friction", [Friction(0.2, 0.02), Friction(0.3, stick_stiffness_n_m=5e7)])
+def test_a_scene_in_other_units_moves_alike(friction: Friction) -> None:
+    thrown = Initial((1e-3, 0.0, 1e-3), (0.4, 0.3, 0.5))
+    scene = replace(preset("bench_kv"), friction=friction, initial=thrown, loads=())
+    units = Units(8.0, 1024.0, 4.0)
+    run, other = simulate(scene, 0.4, 0.01, 1e-9), simulate(units.scene(scene), 0.1, 0.0025, 1e-9)
+    assert np.ptp(run.q, axis=0).min() > 1e-3
+    assert other.q * [8.0, 8.0, 1.0] == pytest.approx(run.q, rel=1e-6, abs=1e-9)
+    assert other.force * units.force == pytest.approx(run.force, rel=1e-6, abs=1e-3)

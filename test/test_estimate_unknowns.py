@@ -1,0 +1,37 @@
+"""Priors and deviations of the unknowns: stated in the scene, by its marks, or defaults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import preset
+
+from plow_twin import Mark, Provenance
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.similar import Units
+from plow_twin.estimate.unknowns import Unknowns
+from plow_twin.model.loads import compile_loads
+
+
+def test_the_prior_is_what_the_scene_states_or_the_mark_says() -> None:
+    scene = preset("paper")
+    t = np.arange(0.0, 10.0, 0.1)
+    load, poses = Load(t, compile_loads(scene.loads).at(t)), Poses(t, np.zeros((len(t), 3)))
+    by_mark = Unknowns.stated(scene, load, poses).deviations()
+    np.testing.assert_array_equal(by_mark[:4], [8e-3, 8e-3, 2.5, 1.2])
+    marks = {
+        "clearance.horizontal_m": Provenance(Mark.ASSUMED, "", 2e-3),
+        "clearance.vertical_m": Provenance(Mark.MEASURED),
+        "contact.stiffness": Provenance(Mark.ASSUMED, "", 0.1 * scene.contact.stiffness),
+        "contact.damping": Provenance(Mark.ASSUMED, "", 0.2 * (scene.contact.damping or 0.0)),
+    }
+    stated = Unknowns.stated(replace(scene, marks=marks), load, poses).deviations()
+    # 10 % of the stiffness is 10 % of the penetration, of which 0.1 mm cannot be told from none
+    np.testing.assert_allclose(stated[:4], [2e-3, 2e-3, 0.1, 0.2], rtol=0.02)
+    # the same in the units of a machine of another size
+    units = Units(0.5, 2.0, 0.25)
+    other = units.scene(replace(scene, marks=marks))
+    far = Unknowns.stated(other, units.load(load), units.poses(poses)).deviations()
+    assert far[0] == 2.0 * stated[0] and far[3] == pytest.approx(stated[3])
