@@ -7,6 +7,7 @@ being accurate.
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import numpy as np
 
@@ -17,10 +18,13 @@ from plow_twin.solve.dense_output import evaluate, time_along, wear_depth_at
 from plow_twin.solve.events import first_event, note_switches
 from plow_twin.solve.grip import grasp, switch_grip
 from plow_twin.solve.method import flight, implicit, rest, taylor
+from plow_twin.solve.method.protocol import Method
 from plow_twin.solve.modes import penetration_and_rate, slow_touch, touch, weigh_pairs
 from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, SLIPS_FORWARD, THETA
 from plow_twin.solve.totals import log_event
 
+#: The methods in the order in which they are asked; a kernel calls each by its name.
+METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
 #: How far in sigma a step goes past an instant at which modes flip without end.
@@ -60,27 +64,13 @@ def lay_out_step(p, parts, state, w, stop_time) -> bool:
     span = min(state.stop_time - state.step_start, LONGEST_STEP)
     state.alpha, state.beta, state.elapsed, state.event_pair = 1.0, 0.0, 0.0, -1
     state.steps += 1
-    if flight.lay_out(p, parts, terms.flight, state, w, span, penetrating) or rest.lay_out(
-        p, parts, terms.rest, state, w, span, penetrating
+    if flight.lay_out(p, parts, flight.own(parts), state, w, span, penetrating) or rest.lay_out(
+        p, parts, rest.own(parts), state, w, span, penetrating
     ):
-        # no wall can be reached, or none is left
+        # no wall can be reached, or the head does not leave its walls
         state.step_size = state.sigma_end
-    elif implicit.lay_out(
-        p,
-        parts,
-        parts.implicit,
-        terms.ramp,
-        terms.wear,
-        (terms.sliding, terms.running_in),
-        terms.slip,
-        terms.stick,
-        terms.support,
-        state,
-        w,
-        span,
-        penetrating,
-    ) or taylor.lay_out(
-        p, parts, terms.slip, terms.ramp, terms.fraction, terms.stick, parts.implicit, state, w, span, penetrating
+    elif implicit.lay_out(p, parts, implicit.own(parts), state, w, span, penetrating) or taylor.lay_out(
+        p, parts, taylor.own(parts), state, w, span, penetrating
     ):
         _end_at_event(p, state, w, span, penetrating, law_terms(terms), terms.stick)
         implicit.note_step(parts.implicit, state, w, state.step_size, state.event_pair >= 0)

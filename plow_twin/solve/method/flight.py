@@ -72,10 +72,16 @@ def _reach(p, w, time, leverage) -> float:
     return place
 
 
+@kernel(inline="source")
+def own(parts):
+    """Return 1 where the scene may fly freely, else None."""
+    return parts.terms.flight
+
+
 @kernel()
-def lay_out(p, parts, flight, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out a step of free flight, where it is longer than one of a series."""
-    if flight is None:
+    if own is None:
         return False
     size = 0.0 if penetrating else _safe_time(p, parts.harmonics, state, w, span)
     state.in_flight = 1 if size > 0.0 else 0

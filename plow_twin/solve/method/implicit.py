@@ -535,9 +535,22 @@ def _write_ramp(p, h, w, implicit) -> float:
     return largest * p.inverse_mass * h
 
 
+@kernel(inline="source")
+def own(parts):
+    """Return nodes and space of implicit steps and the terms that they distinguish."""
+    terms = parts.terms
+    rubbing = terms.wear, terms.sliding, terms.running_in
+    return parts.implicit, terms.ramp, rubbing, terms.slip, terms.stick, terms.support
+
+
 @kernel()
-def lay_out(p, parts, implicit, ramp, wear, rub_terms, slip, stick, support, state, w, span, penetrating) -> bool:
-    """Lay out an implicit step, where damping is what bounds explicit ones; `w.decay[0]` keeps its rate of decay."""
+def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
+    """Lay out an implicit step, where damping bounds explicit ones; `w.decay[0]` keeps its rate of decay."""
+    return _lay_out(p, parts, *own, state, w, span, penetrating)
+
+
+@kernel()
+def _lay_out(p, parts, implicit, ramp, rubbing, slip, stick, support, state, w, span, penetrating) -> bool:
     if implicit is None:
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
@@ -547,7 +560,7 @@ def lay_out(p, parts, implicit, ramp, wear, rub_terms, slip, stick, support, sta
     w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
         return False
-    size = _collocate(p, parts, support, state, w, span, w.decay[0], implicit, ramp, wear, *rub_terms, stick)
+    size = _collocate(p, parts, support, state, w, span, w.decay[0], implicit, ramp, *rubbing, stick)
     state.sigma_end, state.order = size, STAGES
     state.ends_at_stop = 1 if size == span else 0
     return size > 0.0

@@ -66,10 +66,16 @@ def _still_as_before(p, acts, harmonics, state, w) -> bool:
     return push <= 1e-12 * p.threshold[0] * p.weight / p.radius
 
 
+@kernel(inline="source")
+def own(parts):
+    """Return 1 where rest can be recognised, else None."""
+    return parts.terms.rest
+
+
 @kernel()
-def lay_out(p, parts, rest, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out a step of rest where the head is at rest and its load constant."""
-    if rest is None:
+    if own is None:
         return False
     steady = penetrating and w.wrench[1, 0] == 0.0 and w.wrench[1, 1] == 0.0 and w.wrench[1, 2] == 0.0
     state.at_rest = 1 if steady and _settle(p, acting(parts), parts.harmonics, state, w) else 0

@@ -19,9 +19,21 @@ from plow_twin.solve.method.step_size import (
 _TOUCH_REACH = 2.5
 
 
+@kernel(inline="source")
+def own(parts):
+    """Return the terms that bound a step, and the nodes of implicit steps."""
+    terms = parts.terms
+    return terms.slip, terms.ramp, terms.fraction, terms.stick, parts.implicit
+
+
 @kernel()
-def lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, penetrating) -> bool:
+def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out a step by Taylor series; False where it is not finite."""
+    return _lay_out(p, parts, *own, state, w, span, penetrating)
+
+
+@kernel()
+def _lay_out(p, parts, slip, ramp, fraction, stick, implicit, state, w, span, penetrating) -> bool:
     terms = parts.terms
     limit, whole = _choose_map(p, parts, terms.fraction, stick, state, w, span, penetrating)
     _expand_load(p, parts.harmonics, terms.second, state, w)

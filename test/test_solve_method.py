@@ -1,0 +1,120 @@
+"""The contract of a method (`solve.method.protocol`), kept by each of them on the states that it takes and refuses."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import preset, wall_and_point
+from test_solve_flight import swaying
+from test_solve_rest import fallen
+
+from plow_twin import Contact, Initial, Scene, simulate
+from plow_twin.kernel.compiler import kernel
+from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
+from plow_twin.solve.method import flight, implicit, rest, taylor
+from plow_twin.solve.method.protocol import Method
+from plow_twin.solve.modes import weigh_pairs
+from plow_twin.solve.state import new_work
+from plow_twin.solve.step import METHODS
+
+#: Fields of the state that every method may write, and those of one method alone.
+OUTPUT = {"alpha", "beta", "sigma_end", "order", "ends_at_stop", "evaluations"}
+DECAY = {"implicit_size", "decay_times", "refused"}
+OWN = {
+    flight: {"in_flight"},
+    rest: {"at_rest", "y"},
+    implicit: {*DECAY, *(f"{name}_before" for name in DECAY), "implicit_steps"},
+    taylor: set(),
+}
+SPAN, TOLERANCE = 0.5, 1e-6
+
+
+@kernel(inline="source")
+def _weighed(p, parts, state, w):
+    """Prepare a step as `lay_out_step` does; return whether any pair is inside its wall."""
+    terms = parts.terms
+    state.alpha, state.beta = 1.0, 0.0
+    return weigh_pairs(p, state, w, terms.viscous, terms.fraction, terms.ramp, terms.stick)
+
+
+@kernel(entry=True)
+def _ask_flight(p, parts, state, w, span) -> bool:
+    return flight.lay_out(p, parts, flight.own(parts), state, w, span, _weighed(p, parts, state, w))
+
+
+@kernel(entry=True)
+def _ask_rest(p, parts, state, w, span) -> bool:
+    return rest.lay_out(p, parts, rest.own(parts), state, w, span, _weighed(p, parts, state, w))
+
+
+@kernel(entry=True)
+def _ask_implicit(p, parts, state, w, span) -> bool:
+    return implicit.lay_out(p, parts, implicit.own(parts), state, w, span, _weighed(p, parts, state, w))
+
+
+@kernel(entry=True)
+def _ask_taylor(p, parts, state, w, span) -> bool:
+    return taylor.lay_out(p, parts, taylor.own(parts), state, w, span, _weighed(p, parts, state, w))
+
+
+ASK: dict[Any, Callable[..., bool]] = {
+    flight: _ask_flight, rest: _ask_rest, implicit: _ask_implicit, taylor: _ask_taylor
+}  # fmt: skip
+
+
+def after(scene: Scene, seconds: float) -> Scene:
+    """Return the scene with the state that its motion has after some seconds."""
+    run = simulate(scene, seconds, seconds, TOLERANCE)
+    return replace(scene, initial=Initial(tuple(run.q[-1]), tuple(run.v[-1])))
+
+
+def sliding() -> Scene:
+    """A head that sinks slowly into a damper a hundred times stronger than its spring."""
+    contact = Contact("kelvin_voigt", 1e7, damping=1e9)
+    return wall_and_point(contact, speed=0.0, gravity=9.81, gap=0.0, pairs=("top_left_top", "top_right_top"))
+
+
+SCENES: dict[str, Callable[[], Scene]] = {
+    "free": swaying,
+    "at rest": lambda: after(fallen(), 30.0),
+    "overdamped": lambda: after(sliding(), 10.0),
+    "moving": lambda: preset("paper"),
+}
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: method.__name__.rpartition(".")[2])
+def test_a_method_has_the_signatures_of_the_contract(method: Any) -> None:
+    for name in ("own", "lay_out"):
+        found = inspect.signature(getattr(method, name).py_func)
+        expected = inspect.signature(getattr(Method, name))
+        assert list(found.parameters) == list(expected.parameters)[1:]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_method_lays_out_a_step_or_leaves_the_state_to_the_next_one(name: str) -> None:
+    compiled: CompiledScene = compile_scene(SCENES[name](), TOLERANCE)
+    takes = set()
+    for method in METHODS:
+        state, w = compiled.initial_state(), new_work()
+        # overdamped contact has lasted long enough for its fast part to be gone
+        state.decay_times = 1e3
+        w.wrench[0] = compiled.params.constant
+        before = state.copy()
+        taken = ASK[method](compiled.params, compiled.parts, state, w, SPAN)
+        changed = {field for field in state.dtype.names if not np.array_equal(state[field], before[field])}
+        assert changed <= OUTPUT | OWN[method]
+        if "y" in changed:
+            assert taken and np.abs(state.y - before.y).max() < 1e-3 * compiled.params.position_tolerance
+        if taken:
+            takes.add(method)
+            assert state.sigma_end > 0.0 and 1 <= state.order <= compiled.params.order
+            reached = state.alpha * state.sigma_end + 0.5 * state.beta * state.sigma_end**2
+            assert reached <= SPAN * (1.0 + 1e-12) and (state.ends_at_stop == 1) == (reached == pytest.approx(SPAN))
+    assert takes == {
+        "free": {flight, taylor}, "at rest": {rest, taylor}, "overdamped": {implicit, taylor}, "moving": {taylor}
+    }[name]  # fmt: skip
