@@ -80,7 +80,7 @@ setup(
         "console_scripts": [
             "plow-twin = plow_twin.cli:main",
             "twin = plow_twin.ros.main:main",
-            "excitation_publisher = plow_twin.ros.excitation_publisher:main",
+            "excitation_publisher = plow_twin.demo.excitation_publisher:main",
         ]
     },
 )

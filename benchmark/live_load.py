@@ -237,7 +237,7 @@ def estimating(seconds: float, repeats: int) -> None:
 def _one_estimating(on: bool, seconds: float) -> dict[str, float]:
     given = {"estimate": "true", "estimate_forces": "256"} if on else {}
     command = _twin("on_sample", "", given=given)
-    publisher = [sys.executable, "-m", "plow_twin.ros.excitation_publisher", "--sensor", "3", "--seconds",
+    publisher = [sys.executable, "-m", "plow_twin.demo.excitation_publisher", "--sensor", "3", "--seconds",
                  str(seconds + FORMED_S + 10.0), "--ros-args", "-r", "__ns:=/live_load"]  # fmt: skip
     with running(command) as (probe, process_id):
         sender = subprocess.Popen(publisher, env=environment(), stdout=subprocess.DEVNULL)

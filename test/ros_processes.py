@@ -218,7 +218,7 @@ class Bench:
     def publisher(self, *arguments: str) -> Process:
         """Start the excitation publisher."""
         given = [*arguments, "--ros-args", "-r", f"__ns:={self.namespace}"]
-        self._publishers.append(Process("plow_twin.ros.excitation_publisher", given, self.folder / "publisher.log"))
+        self._publishers.append(Process("plow_twin.demo.excitation_publisher", given, self.folder / "publisher.log"))
         return self._publishers[-1]
 
     def close(self) -> None:

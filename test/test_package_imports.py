@@ -34,8 +34,9 @@ SUBPACKAGES = {
     "view": CORE | {"scene_file", "stream", "estimate", "record"},
     "study": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},
     "live": CORE | {"scene_file", "stream", "estimate", "record"},
-    "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "live"},
-    "cli": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros"},
+    "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "live"},
+    "demo": CORE | {"scene_file", "stream", "record", "view", "live", "ros"},
+    "cli": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "demo"},
     "__init__": CORE | {"scene_file", "record"},
     "__main__": {"cli"},
 }
@@ -77,7 +78,8 @@ LIBRARIES = {
         "rainflow",
     },
     "live": {"scipy", "yaml", "paho"},
-    "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", "rich", *MESSAGES},
+    "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", *MESSAGES},
+    "demo": {"rclpy", "rich", *MESSAGES},
     "cli": {"click", "rich"},
 }
 

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from ros_processes import ROOT
 
+from plow_twin.demo.demo import program
+from plow_twin.demo.excitation_publisher import plan
+from plow_twin.demo.run_summary import summarise
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.start import range_of_motion
 from plow_twin.model.loads import compile_loads
 from plow_twin.record.reader import FileStatus, RunReader
-from plow_twin.ros.demo import program
-from plow_twin.ros.excitation_publisher import plan
-from plow_twin.ros.run_summary import summarise
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 
@@ -33,8 +33,8 @@ def _demo(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="needs setpriv")
 def test_the_processes_of_the_demo_end_with_it_however_it_ends(tmp_path: Path) -> None:
     text = (
-        "import os, pathlib, plow_twin.ros.demo\n"
-        f"child = plow_twin.ros.demo.Child(['http.server', '0'], pathlib.Path({str(tmp_path / 'log')!r}))\n"
+        "import os, pathlib, plow_twin.demo.demo\n"
+        f"child = plow_twin.demo.demo.Child(['http.server', '0'], pathlib.Path({str(tmp_path / 'log')!r}))\n"
         "print(child._process.pid, flush=True)\n"
         "os.kill(os.getpid(), 9)"
     )

@@ -193,10 +193,10 @@ def test_all_bad_parameters_are_named_at_once(tmp_path: Path) -> None:
     assert "Traceback" not in said
 
 
-@pytest.mark.parametrize("program", ["main", "excitation_publisher"])
+@pytest.mark.parametrize("program", ["ros.main", "demo.excitation_publisher"])
 def test_arguments_that_ros_cannot_read_are_said_without_a_traceback(tmp_path: Path, program: str) -> None:
     path = tmp_path / "missing.yaml"
-    process = Process(f"plow_twin.ros.{program}", ["--ros-args", "--params-file", str(path)], tmp_path / "log")
+    process = Process(f"plow_twin.{program}", ["--ros-args", "--params-file", str(path)], tmp_path / "log")
     assert process.wait() == 2
     said = process.output()
     process.close()

@@ -31,6 +31,6 @@ from plow_twin.cli.console import POSITIVE, quiet_option
 @quiet_option
 def demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
     """Run the twin on the paper's load: a publisher process and a node with its recorder."""
-    from plow_twin.ros.demo import run_demo
+    from plow_twin.demo.demo import run_demo
 
     return run_demo(speed, seconds, out, quiet)

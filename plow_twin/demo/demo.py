@@ -21,10 +21,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from plow_twin.demo.run_summary import SENSES, RunSummary, corner_letters, summarise
 from plow_twin.errors import PlowTwinError
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, corner_of
 from plow_twin.model.scene import Mark, Provenance, Wear
-from plow_twin.ros.run_summary import SENSES, RunSummary, corner_letters, summarise
 from plow_twin.scene_file import dump_scene, load_scene
 
 DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
@@ -134,7 +134,7 @@ def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool
         # the last sample is followed by the stop, not by the hold policy
         *("-p", "excitation_timeout:=60.0", "-p", f"use_sim_time:={str(speed == 'fast').lower()}"),
     ]
-    publisher = ["plow_twin.ros.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
+    publisher = ["plow_twin.demo.excitation_publisher", "--speed", speed, "--seconds", repr(seconds)]
     estimating = seconds >= _ESTIMATED_S
     if estimating:
         node += [

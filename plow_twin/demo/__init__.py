@@ -1,0 +1,1 @@
+"""The demo: a publisher of excitation, the node and its recorder as processes, and a summary of the recording."""
