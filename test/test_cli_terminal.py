@@ -21,14 +21,14 @@ from plow_twin.cli import estimate as estimate_verb
 from plow_twin.cli import info as info_verb
 from plow_twin.cli import replay as replay_verb
 from plow_twin.cli import simulate as simulate_verb
-from plow_twin.cli import study_paper as paper_verb
 from plow_twin.cli.app import run
 from plow_twin.cli.console import progress
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Pose
-from plow_twin.study.paper.rows import Row, Verdict
+from plow_twin_paper import command as paper_verb
+from plow_twin_paper.rows import Row, Verdict
 
 WIDTH = 80
 

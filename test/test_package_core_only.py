@@ -84,6 +84,7 @@ def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel
     assert (facts["mcap"], facts["rclpy"]) == ("not installed", "not installed")
     said = run(programs / "plow-twin", "demo", cwd=tmp_path, code=1)
     assert "pip install 'plow_twin[ros]'" in said
+    assert "pip install ./studies/paper" in run(programs / "plow-twin", "study", "paper", cwd=tmp_path, code=1)
     (tmp_path / "run.mcap").write_bytes(mcap_bytes.beginning())
     assert "pip install 'plow_twin[record]'" in run(programs / "plow-twin", "replay", "run.mcap", cwd=tmp_path, code=1)
     assert "pip install 'plow_twin[view]'" in run(programs / "plow-twin", "view", "run.mcap", cwd=tmp_path, code=1)

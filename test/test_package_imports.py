@@ -84,6 +84,11 @@ LIBRARIES = {
 }
 
 
+#: The study of the paper stands on the library; nothing of the library but the verb's place knows of it.
+PAPER_STUDY = PACKAGE.parent / "studies" / "paper" / "plow_twin_paper"
+PAPER_MAY_IMPORT = CORE | {"build", "scene_file", "stream", "record", "view", "study", "cli"}
+
+
 def _modules() -> list[Path]:
     return sorted(PACKAGE.rglob("*.py"))
 
@@ -110,6 +115,13 @@ def test_imports_point_one_way(path: Path) -> None:
     libraries = {name.split(".")[0] for name in _imports(path)} - {"plow_twin", "numpy"} - sys.stdlib_module_names
     allowed = LIBRARIES.get(subpackage, set())
     assert libraries <= allowed, f"{subpackage} must not import {sorted(libraries - allowed)}"
+
+
+def test_the_study_of_the_paper_imports_the_library_and_is_imported_by_none_of_it() -> None:
+    for path in sorted(PAPER_STUDY.glob("*.py")):
+        used = {name.split(".")[1] for name in _imports(path) if name.startswith("plow_twin.")}
+        assert used <= PAPER_MAY_IMPORT, path
+    assert not [path for path in _modules() if any(name.startswith("plow_twin_paper") for name in _imports(path))]
 
 
 def _module_name(path: Path) -> str:

@@ -22,15 +22,15 @@ from plow_twin.cli.app import run
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.replay import replay
 from plow_twin.scene_file import dump_scene
-from plow_twin.study.paper import runs as paper_runs
-from plow_twin.study.paper import sets as paper_sets
-from plow_twin.study.paper.contradictions import contradictions
-from plow_twin.study.paper.rows import FITTED, Row, Verdict
-from plow_twin.study.paper.rows_trends import rises, rises_then_falls, rows
-from plow_twin.study.paper.runs import Sweep
-from plow_twin.study.paper.sets import Hold
-from plow_twin.study.paper.study import PaperStudy, compare
-from plow_twin.study.paper.values import FORCES
+from plow_twin_paper import runs as paper_runs
+from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.contradictions import contradictions
+from plow_twin_paper.rows import FITTED, Row, Verdict
+from plow_twin_paper.rows_trends import rises, rises_then_falls, rows
+from plow_twin_paper.runs import Sweep
+from plow_twin_paper.sets import Hold
+from plow_twin_paper.study import PaperStudy, compare
+from plow_twin_paper.values import FORCES
 
 FIGURES = [f"paper_fig{number:02}" for number in (6, 7, 8, 9, 10, 11, 13, 14, 15)] + ["paper_rotation"]
 

@@ -13,8 +13,10 @@ WIDTH, ROW, GAP, LEFT = 920, 54, 14, 20
 COLUMN = 470
 #: From the top down; a subpackage imports only from rows below it.
 SUBPACKAGES = (
-    (("ros", "the node"), ("cli", "plow-twin")),
-    (("study", "paper, calibration, sweep"), ("live", "runtime, bridges")),
+    (("cli", "plow-twin"),),
+    (("demo", "publisher, summary"), ("study", "calibration, sweep, analysis")),
+    (("ros", "the node"),),
+    (("live", "runtime, bridges"),),
     (("record", "MCAP, replay"), ("view", "rerun")),
     (("stream", "intake, session, outputs"), ("estimate", "from measurements")),
     (("run", "simulate, Twin, TwinBatch, ensemble"),),

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
 import click
 
 from plow_twin.cli.study_calibrate import calibrate
-from plow_twin.cli.study_paper import paper
 from plow_twin.cli.study_sweep import sweep
+from plow_twin.errors import PlowTwinError
+
+#: Where a clone of the repository holds the study of the paper.
+CLONE: Final = Path(__file__).resolve().parents[2] / "studies" / "paper"
 
 
 @click.group(
@@ -17,7 +25,35 @@ def study() -> None:
     """Ask questions that take many runs: sweeps, calibration, the paper."""
 
 
-# each verb lives in a module of its own, plow_twin/cli/study_<verb>.py, and is added here
-_VERBS: tuple[click.Command, ...] = (sweep, calibrate, paper)
+def paper_command() -> click.Command:
+    """Return the verb `paper` of the package `plow_twin_paper`: installed, or beside this package in a clone.
+
+    Where neither is there, its place is taken by a verb that says how to get it.
+    """
+    if CLONE.is_dir() and str(CLONE) not in sys.path:
+        sys.path.append(str(CLONE))
+    try:
+        found: click.Command = import_module("plow_twin_paper.command").paper
+    except ModuleNotFoundError as error:
+        if error.name != "plow_twin_paper":
+            raise
+        return _absent_paper()
+    return found
+
+
+def _absent_paper() -> click.Command:
+    @click.command("paper", short_help="Not installed.", context_settings={"ignore_unknown_options": True})
+    @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+    def paper(arguments: tuple[str, ...]) -> int:
+        """Compute the paper's figures and numbers again: not installed, see `studies/paper` of the repository."""
+        raise PlowTwinError(
+            "study paper: plow_twin_paper is not installed; run it from a clone, or there: pip install ./studies/paper"
+        )
+
+    return paper
+
+
+# a verb of this package lives in a module of its own, plow_twin/cli/study_<verb>.py
+_VERBS: tuple[click.Command, ...] = (sweep, calibrate, paper_command())
 for _verb in _VERBS:
     study.add_command(_verb)

@@ -21,8 +21,8 @@ def require(*modules: str) -> None:
         import_module(module)
 
 
-def write_html(path: Path, template: str, context: Mapping[str, Any]) -> None:
-    """Fill the package's template `templates/<template>` and write it; `image` in it embeds a PNG file.
+def write_html(path: Path, template: str, context: Mapping[str, Any], package: str = "plow_twin.study") -> None:
+    """Fill `templates/<template>` of a package and write the page; the filter `image` embeds a PNG file.
 
     Raises
     ------
@@ -32,7 +32,7 @@ def write_html(path: Path, template: str, context: Mapping[str, Any]) -> None:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
-        loader=PackageLoader("plow_twin.study"),
+        loader=PackageLoader(package),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -15,8 +15,8 @@ from rich.text import Text
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, output_console, progress, quiet_option, say_error
 
 if TYPE_CHECKING:
-    from plow_twin.study.paper.rows import Row
-    from plow_twin.study.paper.study import PaperStudy
+    from plow_twin_paper.rows import Row
+    from plow_twin_paper.study import PaperStudy
 
 _STYLES = {"yes": "blue", "no": "dark_orange", "not computed": "dim"}
 
@@ -49,8 +49,8 @@ def paper(out: Path, t_end: float, workers: int | None, scene: str, recording: b
     JSON and CSV, the plots, and the run as MCAP recording and .rrd.
     """
     from plow_twin.scene_file import load_scene
-    from plow_twin.study.paper.runs import LONGEST_S, SHORTEST_S
-    from plow_twin.study.paper.study import study_paper
+    from plow_twin_paper.runs import LONGEST_S, SHORTEST_S
+    from plow_twin_paper.study import study_paper
 
     if not SHORTEST_S <= t_end <= LONGEST_S:
         message = f"got {t_end:g} s, expected {SHORTEST_S:.4f} s (two periods of the load) to {LONGEST_S:g} s"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, STOPS_COUNTER_CLOCKWISE
 from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
-from plow_twin.study.paper.values import SHORTEST_HOLD_S, Sense
+from plow_twin_paper.values import SHORTEST_HOLD_S, Sense
 
 #: Mode of a pair that carries force; 0 is apart, 2 in contact with its force clipped at zero.
 _CARRIES = 1

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from plow_twin.study.paper.rotation import Rotation
-from plow_twin.study.paper.rows_motion import force_table
-from plow_twin.study.paper.rows_trends import longest_faces
-from plow_twin.study.paper.runs import FaceRun, PaperRuns, Sweep
-from plow_twin.study.paper.style import CORNER_STYLE, DARK, FACE_STYLE, sheet
-from plow_twin.study.paper.values import CORNERS, FACE_MARKS, FACES, FIXED_M, GRID_M, PERIOD_S, SENSE_NAMES
+from plow_twin_paper.rotation import Rotation
+from plow_twin_paper.rows_motion import force_table
+from plow_twin_paper.rows_trends import longest_faces
+from plow_twin_paper.runs import FaceRun, PaperRuns, Sweep
+from plow_twin_paper.style import CORNER_STYLE, DARK, FACE_STYLE, sheet
+from plow_twin_paper.values import CORNERS, FACE_MARKS, FACES, FIXED_M, GRID_M, PERIOD_S, SENSE_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

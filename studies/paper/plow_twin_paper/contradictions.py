@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 
-from plow_twin.study.paper import sets as paper_sets
-from plow_twin.study.paper.rows import braces
-from plow_twin.study.paper.rows_sets import shown_time
-from plow_twin.study.paper.runs import PaperRuns
-from plow_twin.study.paper.values import FACE_T_END_S, MOMENTS, OMEGA_RAD_S, SENSE_NAMES
+from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.rows import braces
+from plow_twin_paper.rows_sets import shown_time
+from plow_twin_paper.runs import PaperRuns
+from plow_twin_paper.values import FACE_T_END_S, MOMENTS, OMEGA_RAD_S, SENSE_NAMES
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.study.paper import sets as paper_sets
-from plow_twin.study.paper.rows import ASSUMED, CHECK, FITTED, Row, Verdict
-from plow_twin.study.paper.runs import FaceRun, PaperRuns, Sweep, face_of_pair
-from plow_twin.study.paper.values import (
+from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.rows import ASSUMED, CHECK, FITTED, Row, Verdict
+from plow_twin_paper.runs import FaceRun, PaperRuns, Sweep, face_of_pair
+from plow_twin_paper.values import (
     CORNERS,
     FACE_GRID_M,
     FACE_MARKS,

@@ -10,10 +10,10 @@ import numpy as np
 
 from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
-from plow_twin.study.paper import sets as paper_sets
-from plow_twin.study.paper.rows import CHECK, FITTED, Row, Verdict, braces
-from plow_twin.study.paper.sets import Hold
-from plow_twin.study.paper.values import (
+from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.rows import CHECK, FITTED, Row, Verdict, braces
+from plow_twin_paper.sets import Hold
+from plow_twin_paper.values import (
     MOMENTS,
     OMEGA_RAD_S,
     PERIOD_S,

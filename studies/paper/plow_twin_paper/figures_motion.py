@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from plow_twin.study.paper import sets as paper_sets
-from plow_twin.study.paper.rows import braces
-from plow_twin.study.paper.rows_motion import force_table
-from plow_twin.study.paper.rows_sets import shown_time
-from plow_twin.study.paper.runs import PaperRuns
-from plow_twin.study.paper.style import CORNER_STYLE, DARK, LIGHT, SENSE_COLOR, sheet
-from plow_twin.study.paper.values import CORNERS, FORCES, MOMENTS, PERIOD_S, SENSE_NAMES, Sense
+from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.rows import braces
+from plow_twin_paper.rows_motion import force_table
+from plow_twin_paper.rows_sets import shown_time
+from plow_twin_paper.runs import PaperRuns
+from plow_twin_paper.style import CORNER_STYLE, DARK, LIGHT, SENSE_COLOR, sheet
+from plow_twin_paper.values import CORNERS, FORCES, MOMENTS, PERIOD_S, SENSE_NAMES, Sense
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from plow_twin.model.scene import Mark
-from plow_twin.study.paper import rows_motion, rows_sets, rows_trends
-from plow_twin.study.paper.rows import UNKNOWN, Row
-from plow_twin.study.paper.runs import PaperRuns
+from plow_twin_paper import rows_motion, rows_sets, rows_trends
+from plow_twin_paper.rows import UNKNOWN, Row
+from plow_twin_paper.runs import PaperRuns
 
 
 def all_rows(runs: PaperRuns) -> list[Row]:

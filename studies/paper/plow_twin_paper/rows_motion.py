@@ -9,9 +9,9 @@ import numpy as np
 
 from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result
-from plow_twin.study.paper import sets as paper_sets
-from plow_twin.study.paper.rows import CHECK, FITTED, Row, Verdict
-from plow_twin.study.paper.values import (
+from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.rows import CHECK, FITTED, Row, Verdict
+from plow_twin_paper.values import (
     CORNERS,
     FORCE_TOLERANCE,
     FORCES,

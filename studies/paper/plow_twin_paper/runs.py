@@ -15,9 +15,9 @@ from plow_twin.model.scene import Clearance, Harmonic, Scene
 from plow_twin.run.ensemble import simulate_many
 from plow_twin.run.simulate import Result, output_times, simulate
 from plow_twin.solve.state import Status
-from plow_twin.study.paper.rotation import Rotation, rotation_scenes
-from plow_twin.study.paper.sets import letters_of_pairs
-from plow_twin.study.paper.values import (
+from plow_twin_paper.rotation import Rotation, rotation_scenes
+from plow_twin_paper.sets import letters_of_pairs
+from plow_twin_paper.values import (
     CASE_M,
     CORNERS,
     FACE_GRID_M,

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plow_twin.study.paper.runs import PaperRuns
-from plow_twin.study.paper.values import CORNERS
+from plow_twin_paper.runs import PaperRuns
+from plow_twin_paper.values import CORNERS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,7 +28,7 @@ class Picture:
 
 def draw_all(runs: PaperRuns, folder: Path, on_progress: Callable[[float], object]) -> list[Picture]:
     """Draw every figure into a folder as PNG and return them in the order of the paper."""
-    from plow_twin.study.paper.style import save
+    from plow_twin_paper.style import save
 
     found = []
     plans = _plans(runs)
@@ -41,8 +41,8 @@ def draw_all(runs: PaperRuns, folder: Path, on_progress: Callable[[float], objec
 
 
 def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figure]]]:
-    from plow_twin.study.paper import figures_motion as motion
-    from plow_twin.study.paper import figures_trends as trends
+    from plow_twin_paper import figures_motion as motion
+    from plow_twin_paper import figures_trends as trends
 
     scene = runs.scene.clearance
     case = f"{1e3 * scene.horizontal_m:g} mm horizontal, {1e3 * scene.vertical_m:g} mm vertical clearance"
@@ -106,8 +106,8 @@ def _falls(runs: PaperRuns) -> str:
 
 def draw_rotation(runs: PaperRuns, folder: Path) -> Picture | None:
     """Draw the comparison of the head's rotation; None when gravity has no arm."""
-    from plow_twin.study.paper.figures_trends import rotation_figure
-    from plow_twin.study.paper.style import save
+    from plow_twin_paper.figures_trends import rotation_figure
+    from plow_twin_paper.style import save
 
     if runs.rotation is None:
         return None

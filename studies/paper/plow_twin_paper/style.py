@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from plow_twin.record.durable import whole_file
-from plow_twin.study.paper.values import Sense
+from plow_twin_paper.values import Sense
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

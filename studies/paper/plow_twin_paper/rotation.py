@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from plow_twin.model.scene import Scene
 from plow_twin.run.simulate import Result, simulate
-from plow_twin.study.paper import sets as paper_sets
-from plow_twin.study.paper.values import CORNERS, SENSE_NAMES
+from plow_twin_paper import sets as paper_sets
+from plow_twin_paper.values import CORNERS, SENSE_NAMES
 
 #: Poses are said to have parted at that distance [m].
 PARTED_M = 1e-3

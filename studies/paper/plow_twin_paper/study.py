@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from plow_twin.model.scene import Mark, Scene
-from plow_twin.study.paper.comparison import all_rows, one_run_rows
-from plow_twin.study.paper.contradictions import Contradiction, contradictions
-from plow_twin.study.paper.figures import Picture, draw_all, draw_rotation
-from plow_twin.study.paper.recording import Recording, record
-from plow_twin.study.paper.rotation import RotationRow, rotation_rows
-from plow_twin.study.paper.rows import FITTED, Row, Verdict
-from plow_twin.study.paper.runs import PaperRuns, run_all
 from plow_twin.study.report import require
+from plow_twin_paper.comparison import all_rows, one_run_rows
+from plow_twin_paper.contradictions import Contradiction, contradictions
+from plow_twin_paper.figures import Picture, draw_all, draw_rotation
+from plow_twin_paper.recording import Recording, record
+from plow_twin_paper.rotation import RotationRow, rotation_rows
+from plow_twin_paper.rows import FITTED, Row, Verdict
+from plow_twin_paper.runs import PaperRuns, run_all
 
 OnProgress = Callable[[float], object]
 #: Form of the head's rotation in words, by its place in `Rotation.scenes`.
@@ -155,7 +155,7 @@ def _write(study: PaperStudy, out: Path) -> None:
     rows = [row_as_plain(row) for row in study.rows]
     write_csv(out / "table.csv", rows)
     write_json(out / "table.json", as_plain(study))
-    write_html(out / "report.html", "paper.html.j2", _context(study))
+    write_html(out / "report.html", "paper.html.j2", _context(study), "plow_twin_paper")
 
 
 def as_plain(study: PaperStudy) -> dict[str, Any]:
