@@ -1,4 +1,4 @@
-"""The alarms of a run: from its parameters, as a message, and computed again from its journal and publications."""
+"""The alarms of a run: made from its parameters, written as messages, and computed again by a replay."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Difference = tuple[int, int, str, str, str, str]
 
 
 def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
-    """Return the alarms that the node's parameters ask for, none of them raised."""
+    """Return the alarms that the node's parameters set, each at its lowest level."""
     thresholds = {name: Thresholds(*parameters.get(f"alarm_{name}", ())) for name in _NAMES}
     residual = parameters.get("alarm_residual", ())
     if any(residual):
@@ -37,7 +37,7 @@ def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
 
 
 def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticStatus:
-    """Return the message that says how the alarms are."""
+    """Return the message with the level of each alarm."""
     each = alarms.alarms.items()
     there = [name for name, alarm in each if alarm.level or alarm.latched]
     values = tuple(
@@ -55,8 +55,7 @@ def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticSta
 class AlarmCheck:
     """Compute the alarms of a run again, and compare each message of them with the one recorded.
 
-    They follow from what was published since the run's beginning: where a publication is missing nothing more can be
-    said of them.
+    Alarms depend on every publication since the start of the run: after a missing one they cannot be compared.
     """
 
     def __init__(self, header: RunHeader, possible: bool) -> None:
@@ -64,30 +63,30 @@ class AlarmCheck:
         self._alarms = alarms_of(header.parameters)
         self._computed: deque[tuple[int, int, DiagnosticStatus]] = deque()
         self._recorded: deque[OutputRecord] = deque()
-        #: whether all that they follow from has been there
+        #: whether no publication is missing so far
         self.possible = possible
-        #: messages of the recording that were compared, and that could not be
+        #: recorded messages that were compared, and those that could not be compared
         self.compared = self.not_compared = 0
 
     def give_up(self) -> None:
-        """Take note that something is missing."""
+        """Stop comparing: a publication or an entry is missing."""
         self.possible = False
         self.not_compared += len(self._recorded)
         self._recorded.clear()
         self._computed.clear()
 
     def publication(self, sequence: int, step: int, publication: Publication) -> None:
-        """Take in what was published after entry number `sequence`, which was advance number `step`."""
+        """Update the alarms with the publication after entry `sequence`, the advance number `step`."""
         if self.possible and publication.finite and self._alarms.take(publication):
             self._say(sequence, step)
 
     def pose(self, sequence: int, step: int, pose: Pose) -> None:
-        """Take in a measured pose of the journal."""
+        """Update the alarms with a measured pose of the journal."""
         if self.possible and self._alarms.take_pose(pose.stamp_ns, pose.pose):
             self._say(sequence, step)
 
     def parameter(self, sequence: int, step: int, parameter: Parameter) -> None:
-        """Take in an acknowledgement, if it is one."""
+        """Update the alarms if the parameter is an acknowledgement."""
         if self.possible and parameter.name == ACKNOWLEDGED:
             self._alarms.acknowledge()
             self._say(sequence, step)
@@ -99,7 +98,7 @@ class AlarmCheck:
         publications: Publications,
         poses: Sequence[tuple[int, int, Pose]],
     ) -> None:
-        """Take in publications and, each with its number and step, the poses between them."""
+        """Update the alarms with publications and the poses between them, each with its number and step."""
         if not self.possible:
             return
         if not self._alarms.follows_poses:
@@ -115,14 +114,14 @@ class AlarmCheck:
             self.pose(*pose)
 
     def recorded(self, record: OutputRecord) -> None:
-        """Take in a message of the recording."""
+        """Queue a recorded message for comparison."""
         if self.possible:
             self._recorded.append(record)
         else:
             self.not_compared += 1
 
     def differences(self) -> Iterator[Difference]:
-        """Yield how messages differ; one without its counterpart waits: what is missing may be said to be so later."""
+        """Yield the differences of messages; a message without its counterpart waits: a loss may be noted later."""
         while self._recorded and self._computed:
             record, (sequence, step, computed) = self._recorded.popleft(), self._computed.popleft()
             self.compared += 1
@@ -135,7 +134,7 @@ class AlarmCheck:
             yield step, record.publish_time_ns, ALARMS, *difference
 
     def left_over(self, step: int) -> Iterator[Difference]:
-        """Yield what has no counterpart, at the end of a whole recording; `step` is the last one."""
+        """Yield the messages without a counterpart at the end of a whole recording; `step` is the last advance."""
         for record in self._recorded:
             self.compared += 1
             yield step, record.publish_time_ns, ALARMS, "message", "a message", "none"

@@ -1,4 +1,4 @@
-"""Any messages as their bytes, in a file that every reader of MCAP opens: what is recorded beside a run."""
+"""A recording of arbitrary topics beside a run: messages as bytes in an MCAP file."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class Topic:
 
 
 class BagWriter:
-    """Write messages to a new folder; `lost` counts by topic what had no room on the disk.
+    """Write messages to a new folder; `lost` counts by topic the messages for which the disk had no room.
 
-    A killed process loses what came since the last `flush`. `on_trouble` is told at once when the disk takes no more,
-    and when it does again.
+    A killed process loses the messages since the last `flush`. `on_trouble` receives one text when the disk is full and
+    one when it has room again.
 
     Raises
     ------
@@ -70,14 +70,14 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Hand all that was written to the operating system; without room on the disk it is lost and counted."""
+        """Hand the messages to the operating system; those for which the disk has no room are lost and counted."""
         waiting, self._waiting = self._waiting, Counter()
         try:
             short = shortage(self.folder, _MIN_FREE_BYTES) if waiting else None
             if short is not None:
                 raise OSError(short)
             self._file.chunk(self._chunk)
-        except OSError as error:  # it goes on when there is room again
+        except OSError as error:  # the next flush tries again
             self._chunk.clear()
             self.lost.update(waiting)
             self.error = f"{self.path}: {error.strerror or error}"
@@ -110,14 +110,14 @@ class BagWriter:
 
 
 def beside_folders(run: Path) -> Sequence[Path]:
-    """Return the folders in a run's folder with what was recorded beside it."""
+    """Return the folders of other topics in a run's folder."""
     return sorted(path for path in run.glob(f"{BESIDE}*") if path.is_dir() and any(path.glob("*.mcap")))
 
 
 def readable_beside(run: Path, lost: Counter[str]) -> list[Path]:
-    """Return of `beside_folders` those of which something can be read.
+    """Return those of `beside_folders` that can be read, and the losses.
 
-    The files of the others count as `lost`, and by topic what the recorders had no room for.
+    Losses are the files of the other folders, and by topic the messages that their recorders lost.
     """
     found = []
     for folder in beside_folders(run):

@@ -1,6 +1,6 @@
 """Plain messages to CDR bytes and back, through the type store of rosbags: no ROS installation is needed.
 
-The bytes are canonical: padding is zero and equal messages give equal bytes, so that replay compares bytes.
+The bytes are canonical, with padding of zeros: equal messages have equal bytes, and replay compares bytes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def typestore() -> Typestore:
 
 @cache
 def schema_text(message_type: str) -> str:
-    """Return the `ros2msg` schema of a message type, with those that it uses."""
+    """Return the `ros2msg` schema of a message type, with the types that it uses."""
     text, _ = typestore().generate_msgdef(message_type, ros_version=2)
     return text
 
@@ -54,7 +54,7 @@ def type_hash(message_type: str) -> str:
 
 
 def warm_up() -> None:
-    """Do the work of first use (0.1 s) before time matters: schemas, hashes, and the code that encodes."""
+    """Make schemas, hashes and the encoders, which takes 0.1 s, before time matters."""
     for message_type in MESSAGE_TYPES:
         schema_text(message_type)
         type_hash(message_type)
@@ -75,7 +75,7 @@ def decode(data: bytes, message_type: str) -> Message:
     Raises
     ------
     RecordingError
-        The type is none of `MESSAGE_TYPES`, or the bytes do not hold one.
+        The type is unknown, or the bytes hold no message of it.
     """
     kind = MESSAGE_TYPES.get(message_type)
     if kind is None:
@@ -180,7 +180,7 @@ def _decode_integers(wire: Any) -> Integers:
 
 
 def _decode_short_text(data: bytes) -> Text:
-    """Return a string without the general decoder: the journal holds many."""
+    """Return a string without the general decoder: the journal has many."""
     (length,) = struct.unpack_from("<I", data, 4) if len(data) >= _TEXT_AT else (0,)
     if data[:2] != b"\x00\x01" or not 0 < length <= len(data) - _TEXT_AT:
         raise RecordingError(f"{Text.TYPE}: {len(data)} bytes that do not hold one")
@@ -191,7 +191,7 @@ def _decode_short_text(data: bytes) -> Text:
 
 
 def _encode_short_text(message: Text) -> bytes:
-    """Return a string's bytes without the general encoder: a live journal has some each second."""
+    """Return the bytes of a string without the general encoder: a live journal has some each second."""
     text = message.data.encode()
     return b"\x00\x01\x00\x00" + struct.pack("<I", len(text) + 1) + text + b"\x00"
 

@@ -1,6 +1,6 @@
-"""MCAP from front to back, a chunk at a time, its messages as arrays of places: no object is made for a message.
+"""MCAP from front to back, a chunk at a time; messages are arrays of places, without an object for each.
 
-No index is needed: a file without its end is read as far as it goes, a chunk that is damaged is left out and counted.
+No index is needed: a file without its end is read as far as it goes, damaged chunks are left out and counted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ try:  # twenty times as fast as the standard library's
 except ImportError:
     from zlib import crc32 as crc32
 
-#: A metadata record where a repair has left out a chunk that could not be read: it counts as one.
+#: A metadata record in the place of an unreadable chunk that a repair left out; it counts as a damaged chunk.
 DAMAGE_RECORD: Final = "plow_twin_damage"
 MAGIC: Final = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _METADATA = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x0C
@@ -35,22 +35,22 @@ _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: A head and the number that an index record begins with [B].
 _INDEX_HEAD: Final = _HEAD.size + 2
-#: Channels that have a bit each.
+#: Channels with a bit of their own.
 _CHANNEL_BITS: Final = 63
 #: Heads of records looked up at once.
 _AHEAD: Final = 64
-#: The system's, to be called from compiled code: a recording has more heads than chunks that are opened.
+#: pread for compiled code: a recording has more heads than chunks that are opened.
 _pread: Final[Any] = types.ExternalFunction("pread", types.intp(types.int32, types.uintp, types.uintp, types.int64))
 _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 #: Bytes of a message record before its data: opcode, length, channel, sequence, log time, publish time.
 MESSAGE_HEAD: Final = 31
 _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
-#: Messages ahead whose heads are fetched: a multiple of the three of a publication.
+#: Messages ahead whose heads are prefetched: a multiple of the three of a publication.
 _FETCHED: Final = 12
-#: Chunks below that size [B] are looked through together.
+#: Chunks below that size [B] are scanned together.
 _SMALL: Final = 2**18
-#: And where the large ones between them are left unopened.
+#: The same where the large chunks between them are not opened.
 _SMALL_ALONE: Final = 2**20
 
 
@@ -101,17 +101,17 @@ class ChunkReader:
     """Iterate over the chunks of one MCAP file.
 
     `channels` grows while the file is read. Once the iteration has ended, `finished` says whether the file has its end
-    and `damaged` how many chunks could not be read; `metadata` receives each metadata record when it is met.
+    and `damaged` counts the chunks that could not be read. `on_metadata` receives each metadata record.
 
     Parameters
     ----------
     path
         The file.
     wanted
-        Asked, where a chunk's index can be read, with the channel numbers in it: False leaves the chunk unopened.
+        Called with the channel numbers of a chunk, where its index can be read: False leaves the chunk unopened.
     more
-        Asked at the end of a file that has no end yet, with the stream and the size known: True when it has grown. All
-        that was read is yielded before, and then no messages.
+        Called with the stream and the known size at the end of a file that is being written: True when it has grown.
+        Before the call all messages are yielded, then an empty batch.
     """
 
     path: Path
@@ -121,12 +121,12 @@ class ChunkReader:
     channels: dict[int, Channel] = field(default_factory=dict)
     finished: bool = False
     damaged: int = 0
-    #: of these, what a repair has left out
+    #: damaged chunks that a repair has left out
     left_out: int = 0
     position: int = 0
-    #: what `wanted` has said of chunks, by the bits of their channels
+    #: answers of `wanted`, by the bits of the channels
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
-    #: messages that a chunk has room for at first
+    #: rows of the first table of messages
     _room: int = field(default=256, init=False)
     _others: Indexes = field(default_factory=lambda: np.empty(256, np.int64), init=False)
 
@@ -144,7 +144,7 @@ class ChunkReader:
                 begin = place + _HEAD_SIZE
                 if length > RECORD_LIMIT and opcode != _ATTACHMENT:
                     break
-                behind = len(MAGIC) if opcode == _FOOTER else 0  # a writer may have come as far as between the two
+                behind = len(MAGIC) if opcode == _FOOTER else 0  # a writer may be between the record and the magic
                 if begin + length + behind > size:
                     if self.more is None:
                         break
@@ -174,7 +174,9 @@ class ChunkReader:
                 elif opcode in (_SCHEMA, _CHANNEL):
                     self._declare(opcode, os.pread(descriptor, length, begin), schemas)
                 elif opcode == _METADATA:
-                    yield from self._scan(waiting.taken(), schemas)  # a note of damage stands between the messages
+                    yield from self._scan(
+                        waiting.taken(), schemas
+                    )  # a note of damage has its place between the messages
                     self._metadata(os.pread(descriptor, length, begin))
                 elif opcode == _FOOTER:
                     self.finished = os.pread(descriptor, len(MAGIC), place) == MAGIC
@@ -182,7 +184,7 @@ class ChunkReader:
             yield from self._scan(waiting.taken(), schemas)
 
     def _is_wanted(self, channels: int) -> bool:
-        """Ask for a chunk by the channels in its index, a bit each; without one the chunk is wanted."""
+        """Return whether a chunk is wanted, by the bits of its channels; without an index it is."""
         if self.wanted is None or channels <= 0:
             return True
         if channels not in self._answers:
@@ -193,7 +195,7 @@ class ChunkReader:
         return self._answers[channels]
 
     def _open(self, record: bytes) -> Bytes | None:
-        """Return what a chunk holds, or None when it is damaged."""
+        """Return the content of a chunk, or None for a damaged one."""
         try:
             _, _, size, crc, letters = _CHUNK_HEAD.unpack_from(record)
             place = _CHUNK_HEAD.size + letters
@@ -203,14 +205,14 @@ class ChunkReader:
             if len(data) != length or size > RECORD_LIMIT:
                 return None
             content = decompress(compression, data, size)
-        except Exception:  # each decompressor has errors of its own; all mean that the chunk is damaged
+        except Exception:  # each decompressor has its own errors; all mean damage
             return None
         if len(content) != size or (crc and crc32(content) != crc):
             return None
         return np.frombuffer(content, np.uint8)
 
     def _scan(self, contents: list[Bytes], schemas: dict[int, tuple[str, bytes]]) -> Iterator[Messages]:
-        """Yield the messages of some chunks, together where they are whole."""
+        """Yield the messages of some chunks, together unless one is damaged."""
         if not contents:
             return
         content = contents[0] if len(contents) == 1 else np.concatenate(contents)
@@ -247,7 +249,7 @@ class ChunkReader:
                 self.channels[channel.id] = Channel(
                     channel.topic, name, channel.message_encoding, text, channel.metadata
                 )
-        except Exception:  # damage: what it would have named is passed over
+        except Exception:  # damage: its messages are passed over
             self.damaged += 1
 
     def _metadata(self, record: bytes) -> None:
@@ -264,7 +266,7 @@ class ChunkReader:
         self.on_metadata(metadata.name, dict(metadata.metadata))
 
     def _note_damage(self, schemas: dict[int, tuple[str, bytes]]) -> None:
-        """Count a damaged chunk, and take from the index at the end the channels that it may have declared."""
+        """Count a damaged chunk, and read the channels that it may have declared from the index at the end."""
         from mcap.reader import make_reader
 
         self.damaged += 1
@@ -285,7 +287,7 @@ class ChunkReader:
 
 
 class _Waiting:
-    """Chunks, and messages that stand in none, which are looked through together: each look costs as much."""
+    """Contents of chunks, and messages outside chunks, which are scanned together: each scan has a fixed cost."""
 
     def __init__(self) -> None:
         self._contents: list[Bytes] = []
@@ -293,7 +295,7 @@ class _Waiting:
         self.size = 0
 
     def add(self, content: Bytes) -> None:
-        """Add what a chunk holds."""
+        """Add the content of a chunk."""
         self._join()
         self._contents.append(content)
         self.size += len(content)
@@ -304,7 +306,7 @@ class _Waiting:
         self.size += len(record)
 
     def taken(self) -> list[Bytes]:
-        """Return everything in the file's order, and keep nothing."""
+        """Return everything in the order of the file, and drop it."""
         self._join()
         contents, self._contents, self.size = self._contents, [], 0
         return contents
@@ -316,17 +318,17 @@ class _Waiting:
 
 
 def is_begun(path: Path) -> bool:
-    """Tell whether more of an MCAP file is there than its name: a process may be killed before it writes a byte."""
+    """Return whether an MCAP file has its first bytes: a process may be killed before it writes any."""
     try:
         with path.open("rb") as stream:
             head = stream.read(len(MAGIC))
     except OSError:
-        return True  # whoever opens it says why it cannot be read
+        return True  # the reader reports why it cannot be read
     return len(head) == len(MAGIC) or not MAGIC.startswith(head)
 
 
 def is_mcap(path: Path) -> bool:
-    """Tell whether a file begins as MCAP does, as far as it goes; one that cannot be opened is left to its reader."""
+    """Return whether a file begins as MCAP does; a file that cannot be opened is left to its reader."""
     try:
         with path.open("rb") as stream:
             return MAGIC.startswith(stream.read(len(MAGIC)))
@@ -335,7 +337,7 @@ def is_mcap(path: Path) -> bool:
 
 
 def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield name and content of the metadata records of a file, wherever they stand; no chunk is opened."""
+    """Yield name and content of the metadata records of a file; no chunk is opened."""
     from mcap.reader import make_reader
 
     found: list[tuple[str, dict[str, str]]] = []
@@ -348,7 +350,7 @@ def metadata_records(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
-    """Return the metadata records of a file without an index: from one record's head to the next."""
+    """Return the metadata records of a file without an index, by the heads of its records."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Metadata
 
@@ -367,22 +369,22 @@ def _metadata_by_heads(descriptor: int) -> list[tuple[str, dict[str, str]]]:
 
 
 class _Heads:
-    """The heads of a file's records one after the other, looked up many at a time."""
+    """The heads of the records of a file, read many at a time."""
 
     def __init__(self, descriptor: int, size: int) -> None:
         self._descriptor, self._size = descriptor, size
         self._table = np.empty((_AHEAD, 5), np.int64)
         self._rows: list[tuple[int, int, int, int, int]] = []
         self._next = 0
-        self._index = [0, 0]  # end of the newest record with its index, and the channels in it
+        self._index = [0, 0]  # end of the newest record and of its index, and its channels
 
     def at(self, place: int) -> tuple[int, int]:
-        """Return opcode and length of the record at a place; zeros for none."""
+        """Return opcode and length of the record at a place; zeros at the end."""
         if self._next >= len(self._rows) or self._rows[self._next][0] != place:
             count = look_ahead(self._descriptor, self._size, place, self._table)
             self._rows, self._next = self._table[:count].tolist(), 0
             if not self._rows:
-                os.pread(self._descriptor, 1, place)  # whoever has no more bytes for a reason says it here
+                os.pread(self._descriptor, 1, place)  # raises the error of a file that cannot be read
                 return 0, 0
         _, opcode, length, *self._index = self._rows[self._next]
         self._next += 1
@@ -391,7 +393,7 @@ class _Heads:
     def index(self) -> tuple[int, int]:
         """Return the channels, a bit each, in the index records behind the newest chunk, and where these end.
 
-        -1: a channel has no bit.
+        -1: a channel is beyond the bits.
         """
         end, channels = self._index
         return channels, end
@@ -401,8 +403,8 @@ class _Heads:
 def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
     """Fill rows with place, opcode, length, end and channels of the records from `place` on; return how many.
 
-    The index records behind a chunk have no rows: they count to its end, and their channels, a bit each, are the row's
-    (-1: there is one beyond the bits).
+    The index records behind a chunk have no rows of their own: the row of the chunk has their end and their channels, a
+    bit each (-1: a channel is beyond the bits).
     """
     head, count = np.zeros(_INDEX_HEAD, np.uint8), 0
     while True:
@@ -431,8 +433,8 @@ def look_ahead(descriptor, size, place, table):  # type: ignore[no-untyped-def]
 def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, bool]:
     """Fill the columns of `table` with the messages of a chunk and `others` with the places of schemas and channels.
 
-    Returns the number of each, and whether the records end where the chunk ends; one more message than there is room
-    for where they are too many.
+    Returns the number of each, and whether the records end with the chunk. The number of messages is one more than the
+    rows when the table is too small.
     """
     place, count, other = 0, 0, 0
     size, room = content.size, table.shape[1]
@@ -448,7 +450,7 @@ def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, boo
             table[0, count], table[1, count] = head & 0xFFFF, head >> 16 & 0xFFFFFFFF
             table[2, count], table[3, count] = word(content, start + 6), word(content, start + 14)
             table[4, count], table[5, count] = start + _MESSAGE_FIELDS, length - _MESSAGE_FIELDS
-            if count >= _FETCHED:  # messages repeat their lengths: the head of one to come
+            if count >= _FETCHED:  # messages repeat their lengths: the head of a later one
                 head_at = 2 * place - (table[4, count - _FETCHED] - MESSAGE_HEAD)
                 fetch(content, head_at)
                 fetch(content, head_at + MESSAGE_HEAD - 1)
@@ -467,7 +469,7 @@ def open_mcap(path: Path) -> IO[bytes]:
     Raises
     ------
     RecordingError
-        It cannot be read or is none.
+        It cannot be read or is no MCAP file.
     """
     try:
         stream = path.open("rb")

@@ -1,4 +1,4 @@
-"""The compressions of MCAP chunks: zstd, and LZ4 as fast as its library allows."""
+"""Decompression of MCAP chunks: zstd and LZ4."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.record.template import Bytes
 
-#: A longer record, or a chunk that says it holds more, is damage [B].
+#: Largest record and largest content of a chunk [B]; beyond it a length is damage.
 RECORD_LIMIT: Final = 256 * 1024 * 1024
 _of_thread: Final = threading.local()
-#: An LZ4 frame: its first bytes, what its second byte says, and the length before each block.
+#: An LZ4 frame: its head, the flags in it, and the length before each block.
 _LZ4_HEAD: Final = struct.Struct("<IBB")
 _LZ4_MAGIC: Final = 0x184D2204
 _LZ4_INDEPENDENT, _LZ4_SIZE = 0x60, 0x08
@@ -60,10 +60,10 @@ def _lz4_block() -> Callable[[int, int, int, int], int] | None:
 
 
 def independent_blocks(data: memoryview, size: int) -> Bytes | None:
-    """Return the `size` bytes of an LZ4 frame as the recorder writes it; None: the library has to look at it.
+    """Return the `size` bytes of an LZ4 frame as the recorder writes it; None for another frame.
 
-    Its blocks refer to nothing before them and have no checksums, the chunk having one. The library decompresses into
-    memory of its own and copies that, which takes a third of the time more.
+    Its blocks are independent and without checksums: the chunk has one. The library decompresses into its own memory
+    and copies that, which takes a third longer.
     """
     block = _lz4_block()
     if block is None or len(data) < _LZ4_HEAD.size or len(data) > RECORD_LIMIT:
@@ -79,7 +79,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
         place += 4
         if length == 0:
             return content if done == size else None
-        if length > len(data) - place:  # cut off, or not compressed: its highest bit is set
+        if length > len(data) - place:  # cut off, or an uncompressed block, whose highest bit is set
             return None
         count = block(source + place, target + done, length, size - done)
         if count < 0:
@@ -89,7 +89,7 @@ def independent_blocks(data: memoryview, size: int) -> Bytes | None:
 
 
 def _zstd() -> Any:
-    """Return this thread's decompressor: its tables take as long to make as a small chunk to decompress."""
+    """Return the decompressor of this thread: making its tables takes as long as decompressing a small chunk."""
     import zstandard
 
     if not hasattr(_of_thread, "zstd"):

@@ -1,7 +1,7 @@
-"""What is in a recording, what is missing, and its repair: a part that was cut off or damaged gets its end again.
+"""Examination and repair of a recording: a part that was cut off or damaged gets its end and index again.
 
-A repair copies every message that can be read into a new file and keeps the old one under another name. Nothing is
-invented: what was lost stays lost and is counted.
+A repair copies every readable message into a new file and keeps the old one under another name. Lost messages stay
+lost and are counted.
 """
 
 from __future__ import annotations
@@ -42,29 +42,29 @@ _HASH: Final = "topic_type_hash"
 
 @dataclass
 class PartReport:
-    """One file: how it ended and what of it could not be read."""
+    """One file: how it ended and how much of it could not be read."""
 
     path: Path
     bytes: int
     finished: bool
     damaged_chunks: int
     messages: dict[str, int]
-    #: bytes behind the end, with which others take the file for none
+    #: bytes behind the end of the file: other readers refuse the file for them
     trailing_bytes: int = 0
-    #: chunks that a repair before has left out
+    #: chunks that an earlier repair left out
     left_out: int = 0
-    #: whether it begins as an MCAP file does
+    #: whether the file begins as an MCAP file does
     mcap: bool = True
 
     @property
     def healthy(self) -> bool:
-        """Whether it has its end, nothing behind that, and no damage."""
+        """Whether the file has its end, no bytes behind it and no damage."""
         return self.mcap and self.finished and not self.damaged_chunks and not self.trailing_bytes
 
 
 @dataclass
 class RunReport:
-    """A recording: its parts, its journal, and what is missing."""
+    """A recording: its parts, its journal and its losses."""
 
     path: Path
     parts: list[PartReport] = field(default_factory=list)
@@ -73,7 +73,7 @@ class RunReport:
     layout_version: str = ""
     entries: Counter[str] = field(default_factory=Counter)
     gaps: int = 0
-    #: entries that stand there more than once
+    #: entries that the files hold more than once
     repeated: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -110,12 +110,12 @@ class RunReport:
 
 
 def examine(path: Path) -> RunReport:
-    """Read a recording from front to back and say what is in it and what is missing.
+    """Read a recording from front to back and report its content and its losses.
 
     Raises
     ------
     RecordingError
-        There is no recording of ours, or its journal cannot be understood.
+        There is no recording of plow_twin, or its journal cannot be decoded.
     """
     reader = RunReader(path)
     report = RunReport(path)
@@ -225,7 +225,7 @@ def _part_problems(part: PartReport) -> list[str]:
 
 
 def _metadata_problems(reader: RunReader) -> list[str]:
-    """Return what is wrong with `metadata.yaml`, by which other programs find the parts."""
+    """Return the problems of `metadata.yaml`, by which other programs find the parts."""
     folder = reader.path.parent
     if not (folder / "metadata.yaml").is_file():
         return ["metadata.yaml is missing"]
@@ -244,14 +244,14 @@ def repair(path: Path) -> list[Path]:
     Returns
     -------
     list of Path
-        The parts that were rewritten, those of what was recorded beside the run too; the old ones stay beside them as
-        `<name>.damaged` (`<name>.damaged_2`, ...), those that hold nothing too, those that repeat another part as
-        `<name>.repeated`, those of another run as `<name>.foreign`.
+        The files that were rewritten or put aside, those of other topics beside the run included. A cut, damaged or
+        empty part stays as `<name>.damaged` (`<name>.damaged_2`, ...), a part that repeats another one as
+        `<name>.repeated`, a part of another run as `<name>.foreign`.
 
     Raises
     ------
     RecordingError, OSError
-        There is no recording of ours, it is still being written, or there is no room.
+        There is no recording of plow_twin, it is still being written, or the disk is full.
     """
     reader = RunReader(path)
     folder = reader.path.parent
@@ -282,7 +282,7 @@ def repair(path: Path) -> list[Path]:
 
 
 def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
-    """Rewrite parts that were cut off or damaged, put those aside that hold nothing, and return both."""
+    """Rewrite parts that were cut off or damaged, put empty parts aside, and return both."""
     mended = []
     for part in parts:
         if not (is_begun(part) and is_mcap(part)):
@@ -296,7 +296,7 @@ def _mend(parts: Sequence[Path], last: Path) -> list[Path]:
 
 
 def _put_aside(file: Path, ending: str) -> None:
-    """Give a file another name, that of no other."""
+    """Rename a file to a name that is free."""
     target, number = file.with_name(f"{file.name}.{ending}"), 2
     while target.exists():
         target, number = file.with_name(f"{file.name}.{ending}_{number}"), number + 1
@@ -304,7 +304,7 @@ def _put_aside(file: Path, ending: str) -> None:
 
 
 def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) -> None:
-    """Write `metadata.yaml` for those parts that can be read."""
+    """Write `metadata.yaml` for the readable parts."""
     facts = [_facts(part) for part in parts if part.exists() and is_begun(part) and is_mcap(part)]
     custom = {f"{LOST}{topic}": str(count) for topic, count in told_lost(folder).items()}
     if repaired:
@@ -314,9 +314,9 @@ def _list_parts(folder: Path, parts: Sequence[Path], repaired: Sequence[str]) ->
 
 
 def _rewrite(part: Path, *, last: bool) -> None:
-    """Copy what can be read into a new file in the place of the old one, with a note where something is left out.
+    """Copy the readable messages into a new file in the place of the old one, with a note at each gap.
 
-    The end of the last part is where a recorder was stopped, which leaves no gap.
+    The end of the last part is the end of the recording and no gap.
     """
     target = part.with_name(f"{part.name}.partial")
     target.unlink(missing_ok=True)
@@ -326,7 +326,7 @@ def _rewrite(part: Path, *, last: bool) -> None:
     def on_metadata(name: str, record: dict[str, str]) -> None:
         if name == LOSS_RECORD:
             loss.update(record)
-        elif name != DAMAGE_RECORD:  # it counts as damage
+        elif name != DAMAGE_RECORD:  # noted anew below
             file.metadata(name, record)
 
     reader = ChunkReader(part, on_metadata)

@@ -1,4 +1,4 @@
-"""What a disk does not take: its errors name the file, what is there is whole, and it is waited for after a write."""
+"""Files that are whole after any failure, errors of the disk that name the file, and waiting for the disk."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Give errors of a disk, which is full at a write long after a file was opened, the name of the file or folder."""
+    """Add the name of the file or folder to errors of writes to it, such as that of a full disk."""
     try:
         yield
     except OSError as error:
@@ -22,22 +22,22 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
-    """Give a stream whose content becomes the file `path` in one step, once all of it is written.
+    """Open a stream whose content becomes the file `path` in one step at the end.
 
-    Until then, after an error and after a kill, the file is the one before, or none. With `sync` that holds for a loss
-    of power too. What is no regular file, a pipe or a device, is written to as it is.
+    Until then, and after an error or a kill, the file stays as it was. With `sync` that holds after a loss of power
+    too. A pipe or a device is written to directly.
 
     Raises
     ------
     OSError
-        The disk does not take it; the error has the name of the file.
+        The file cannot be written; the error has its name.
     """
     try:
         if path.exists() and not path.is_file():
             with path.open("wb") as stream:
                 yield stream
             return
-        place = path.resolve()  # a link goes on to point there
+        place = path.resolve()  # a link keeps pointing there
         beside = place.with_name(f".{place.name}.{os.getpid()}")
         try:
             with beside.open("wb") as stream:
@@ -52,7 +52,7 @@ def whole_file(path: Path, *, sync: bool = False) -> Iterator[BinaryIO]:
         if sync:
             sync_path(place.parent)
     except OSError as error:
-        if error.errno is None:  # of a library, with a text of its own
+        if error.errno is None:  # an error of a library with its own text
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
 
@@ -64,7 +64,7 @@ def write_whole(path: Path, content: bytes, *, sync: bool = False) -> None:
 
 
 def sync_path(*paths: Path) -> None:
-    """Wait until the disk has what a file holds, or what a folder lists: a new file is lost without its folder.
+    """Wait until the disk has files, or the entries of folders: a new file is lost without its folder.
 
     Raises
     ------

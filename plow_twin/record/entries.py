@@ -1,4 +1,4 @@
-"""Records of a recording: journal entries and messages that were sent, one by one and in batches of arrays."""
+"""Records of a recording, journal entries and outputs: one by one and in batches of arrays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _HALF, _WHOLE = 2**31, 2**32
 
 @dataclass(frozen=True, slots=True)
 class EntryRecord:
-    """A journal entry, or the recorder's note, at its place in the common order."""
+    """A journal entry, or a note of the recorder, with its sequence number."""
 
     sequence: int
     log_time_ns: int
@@ -52,8 +52,8 @@ Record = EntryRecord | OutputRecord
 class Entries:
     """Journal entries in order of use, shape (n,) each, by kind: `sample` is True for samples.
 
-    Digests stand at the indexes `digest_at` (m,), as numbers `digest` (m,), their stamps in `stamp_ns`; all else is in
-    `rest` by index. Sequence numbers are counted on beyond 2^32.
+    Digests have the indexes `digest_at` (m,) and the values `digest` (m,), their stamps are in `stamp_ns`; all other
+    entries are in `rest` by index. Sequence numbers do not wrap at 2^32.
     """
 
     sequence: Indexes
@@ -89,7 +89,7 @@ class Entries:
 
     @cached_property
     def others(self) -> Mapping[int, Entry | Dropped]:
-        """All entries that are no samples, by index."""
+        """All entries but samples, by index."""
         stamps = self.stamp_ns[self.digest_at].tolist()
         found: dict[int, Entry | Dropped] = {
             index: Digest(stamp_ns, f"{digest:016x}")
@@ -98,7 +98,7 @@ class Entries:
         return found | dict(self.rest)
 
     def record(self, index: int) -> EntryRecord:
-        """Return one entry with its place."""
+        """Return an entry with its sequence number."""
         entry: Entry | Dropped
         if self.sample[index]:
             fx, fy, moment = self.wrench[index].tolist()
@@ -109,7 +109,7 @@ class Entries:
 
     @classmethod
     def joined(cls, parts: list[Entries]) -> Entries:
-        """Return the entries of some parts, at least one, one after the other."""
+        """Return the entries of one or more parts, joined."""
         if len(parts) == 1:
             return parts[0]
         begins = np.cumsum([0, *map(len, parts)]).tolist()
@@ -135,7 +135,7 @@ NO_ENTRIES: Final = Entries(_NONE, _NONE, np.zeros(0, bool), _NONE, np.zeros((0,
 
 @dataclass(frozen=True)
 class Outputs:
-    """Messages that were sent, of one chunk; `sequence` is counted on beyond 2^32, `topics` names the channels."""
+    """Outputs of one chunk; `sequence` does not wrap at 2^32, `topics` has topic and type of each channel."""
 
     messages: Messages
     sequence: Indexes
@@ -146,14 +146,14 @@ class Outputs:
 
     @cached_property
     def newest(self) -> int:
-        """The highest number; there is at least one message."""
+        """The highest sequence number; there is at least one message."""
         return int(self.sequence.max())
 
     def __getitem__(self, chosen: slice) -> Outputs:
         return Outputs(self.messages[chosen], self.sequence[chosen], self.topics)
 
     def record(self, index: int) -> OutputRecord:
-        """Return one message with its place."""
+        """Return a message with its sequence number."""
         messages = self.messages
         topic, message_type = self.topics[int(messages.channel[index])]
         return OutputRecord(
@@ -168,9 +168,9 @@ class Outputs:
 
 @dataclass(frozen=True)
 class Batch:
-    """Entries, and all messages that were sent after one of them and before the next batch.
+    """Entries, and all outputs sent after one of them and before the next batch.
 
-    `damaged` : chunks could not be read since the batch before; what they held may be missing anywhere in this one.
+    `damaged` : chunks could not be read since the batch before; their records may be missing anywhere in this one.
     """
 
     entries: Entries
@@ -178,7 +178,7 @@ class Batch:
     damaged: bool = False
 
     def parted(self, places: Sequence[int]) -> Iterator[Batch]:
-        """Yield the batch in pieces: the entries before each of these places, which rise, and the rest."""
+        """Yield the batch in pieces that end before each of these entries, whose indexes rise, and the rest."""
         outputs, begin = self.outputs, 0
         for place in places:
             now, outputs = parted_at(outputs, int(self.entries.sequence[place]))
@@ -188,13 +188,13 @@ class Batch:
 
 
 class Holes:
-    """Where entries of a journal are not there, by their numbers, from batch to batch."""
+    """Finds missing entries of a journal by sequence numbers, batch after batch."""
 
     def __init__(self) -> None:
         self._next: int | None = None  # number of the next entry
 
     def take(self, entries: Entries) -> dict[int, int]:
-        """Return the places before which entries are missing, in order, and how many."""
+        """Return how many entries are missing before an index, for each index with a gap, in order."""
         if not len(entries):
             return {}
         reached = np.maximum.accumulate(entries.sequence) + 1
@@ -216,11 +216,11 @@ def parted_at(outputs: Sequence[Outputs], end: int) -> tuple[list[Outputs], list
 
 
 def in_order(batch: Batch) -> Iterator[Record]:
-    """Yield each entry and then the messages that were sent after it."""
+    """Yield each entry, followed by the outputs sent after it."""
     sequences = [part.sequence for part in batch.outputs]
     owners = np.concatenate([np.full(len(part), number) for number, part in enumerate(sequences)] or [np.zeros(0, int)])
     places = np.concatenate([np.arange(len(part)) for part in sequences] or [np.zeros(0, int)])
-    # messages before an entry of a higher number; the running maximum keeps odd files in their own order
+    # outputs stand before an entry of a higher number; the running maximum keeps unordered files in their order
     bounds = np.maximum.accumulate(batch.entries.sequence) if len(batch.entries) else batch.entries.sequence
     slots = np.searchsorted(bounds, np.concatenate(sequences or [np.zeros(0, np.int64)]), side="right")
     order = np.argsort(slots, kind="stable")
@@ -236,6 +236,6 @@ def in_order(batch: Batch) -> Iterator[Record]:
 
 @compiled
 def unwrap(sequence: Indexes, base: int, out: Indexes) -> None:
-    """Write the numbers counted on beyond 2^32 that are nearest to `base`."""
+    """Write the unwrapped numbers, those nearest to `base`."""
     for n in range(sequence.size):
         out[n] = base + ((sequence[n] - base + _HALF) & (_WHOLE - 1)) - _HALF

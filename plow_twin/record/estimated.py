@@ -1,4 +1,4 @@
-"""The estimates of a live node, made again from its journal, and what a run has left."""
+"""The estimates of a live node, formed again from its journal, and the scene at the end of a run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from plow_twin.stream.session import wear_in
 class LiveEstimate:
     """An estimate as the node journalled it, with its window as the journal gives it.
 
-    `window` is None where the journal does not hold all of it: parts were removed, or something was lost.
+    `window` is None where the journal lacks a part of it: files were removed, or entries were lost.
     """
 
     entry: Estimated
@@ -73,7 +73,7 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
 
 
 def left_by(reader: RunReader) -> tuple[Scene, Estimated | None]:
-    """Return the scene as a run left it, worn pads and changed numbers, and the newest estimate of these pads."""
+    """Return the scene at the end of a run, with its wear and changed numbers, and the newest estimate of its pads."""
     scene, newest = reader.header.scene(reader.path), None
     depth, changes = None, dict[str, float]()
     for batch in reader.batches(outputs=False):
@@ -100,7 +100,7 @@ def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
 
 
 def _whole(window: Window | None, entry: Estimated) -> Window | None:
-    """Return the window if it is the one that the node had."""
+    """Return the window if its counts are those that the node journalled."""
     if window is None:
         return None
     same = (window.start_ns, window.samples, window.poses) == (entry.start_ns, entry.samples, entry.poses)

@@ -1,6 +1,6 @@
-"""A recording that is still being written: whether its writer lives, how to wait for more of it.
+"""A recording that is still being written: whether its writer lives, and waiting for more of it.
 
-A writer holds a lock on its file, which the operating system gives back when the process ends, however it ends.
+A writer holds a lock on its file, which the operating system releases however the process ends.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import time
 from collections.abc import Callable
 from typing import IO, Final
 
-#: A waiting reader looks that often [s].
+#: Interval at which a waiting reader looks again [s].
 POLL_S: Final = 0.1
 
 
 def claim(descriptor: int) -> None:
-    """Mark a file as being written until it is closed; where the file system has no locks, nothing is marked."""
+    """Lock a file that is being written until it is closed; a file system without locks is left as it is."""
     import fcntl
 
     try:
@@ -25,7 +25,7 @@ def claim(descriptor: int) -> None:
 
 
 def is_claimed(descriptor: int) -> bool:
-    """Tell whether somebody writes to a file."""
+    """Return whether a process writes to a file."""
     import fcntl
 
     try:
@@ -37,23 +37,23 @@ def is_claimed(descriptor: int) -> bool:
 
 
 class Tail:
-    """How a reader goes on at the end of what has been written.
+    """Waiting of a reader at the end of a file that grows.
 
     Parameters
     ----------
     stop
-        Asked while it waits: True ends the reading.
+        Asked while the reader waits: True ends the reading.
     """
 
     def __init__(self, stop: Callable[[], bool] = lambda: False) -> None:
         self._stop = stop
-        #: whether reading was ended by `stop`
+        #: whether `stop` has ended the reading
         self.stopped = False
 
     def more(self, stream: IO[bytes], size: int) -> bool:
-        """Wait until a file is longer than `size` [B]; False when it will not be."""
+        """Wait until a file is longer than `size` [B]; False when its writer has ended."""
         while True:
-            alive = is_claimed(stream.fileno())  # before the size: what a writer leaves behind is read
+            alive = is_claimed(stream.fileno())  # asked before the size: the last bytes of a writer that ends are read
             if os.fstat(stream.fileno()).st_size > size:
                 return True
             self.stopped = self._stop()

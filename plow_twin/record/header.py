@@ -1,4 +1,4 @@
-"""What stands at the head of a recording: all that replay needs besides the journal."""
+"""The header of a recording: scene and settings, which replay needs beside the journal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin.stream.journal import ParameterValue
 HEADER_RECORD: Final = "plow_twin"
 #: Name of the MCAP metadata record, written at close, that holds the loss counters.
 LOSS_RECORD: Final = "plow_twin_loss"
-#: Key in it of the reason why recording ended before the run; all other keys are topics.
+#: Its key for the reason why recording ended before the run; all other keys are topics.
 STOPPED_EARLY_KEY: Final = "stopped_early"
 #: Version of the layout that `docs/recording.md` describes.
 LAYOUT_VERSION: Final = 4
@@ -27,10 +27,10 @@ LAYOUT_VERSION: Final = 4
 class RunHeader:
     """Scene and settings of a run.
 
-    `scene_yaml` is self-contained. `topics` maps the outputs' base names to the names they were sent under. `clock`
-    says what the receive times are: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
-    `record_outputs` says which outputs are there: `all`, `decimated` or `none`; `part` counts the files of a run. They
-    all have its `run_id`, which the writer makes at random.
+    `scene_yaml` is self-contained. `topics` maps base names of outputs to the names they were sent under. `clock` is
+    the clock of the receive times: `system` or `ros` (under `/clock`). `origin_ns` is the first stamp if it was known.
+    `record_outputs` says which outputs are recorded: `all`, `decimated` or `none`. `part` counts the files of a run,
+    which share the random `run_id`.
     """
 
     scene_yaml: str
@@ -84,7 +84,7 @@ class RunHeader:
             raise RecordingError(str(error)) from error
 
     def to_record(self) -> dict[str, str]:
-        """Return the MCAP metadata record: texts stay as they are, all else is JSON."""
+        """Return the MCAP metadata record: texts as they are, other values as JSON."""
         record = {"layout_version": str(LAYOUT_VERSION)}
         for spec in fields(self):
             value = getattr(self, spec.name)
@@ -94,12 +94,12 @@ class RunHeader:
 
     @classmethod
     def from_record(cls, record: Mapping[str, str], source: str) -> RunHeader:
-        """Read the MCAP metadata record; unknown keys are passed over.
+        """Read the MCAP metadata record; unknown keys are ignored.
 
         Raises
         ------
         RecordingError
-            A key is missing or does not hold what it should; the message names `source`.
+            A key is missing or has a wrong value; the message names `source`.
         """
         layout = record.get("layout_version", "")
         if layout != str(LAYOUT_VERSION):

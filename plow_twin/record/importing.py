@@ -1,4 +1,4 @@
-"""A load from anybody's recording through the twin: the same intake and late-data policy as live, a journal as live."""
+"""The load of any recording through a twin, with the intake, the treatment of late samples and the journal of a run."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from plow_twin.stream.steps import Steps
 
 @dataclass
 class Feed:
-    """Messages in order of arrival to a walker: what is no sample is passed on, what is one is judged.
+    """Pass messages in order of arrival to a walker, samples of the load after they are judged.
 
-    `measured` receives role, stamp [ns] and numbers of everything that is neither load nor speed.
+    `measured` receives role, stamp [ns] and numbers of all other roles than load and speed.
     """
 
     walkers: list[Walker]
     roles: dict[str, Role]
     measured: Callable[[str, int, dict[str, float]], object]
     intake: Intake = field(default_factory=Intake)
-    #: messages that could not be used, by what was wrong first; those of the load are in the intake too
+    #: messages that were not used, by reason; the intake counts those of the load too
     unfit: Counter[str] = field(default_factory=Counter)
     _stamps: list[int] = field(default_factory=list)
     _wrench: list[tuple[float, float, float]] = field(default_factory=list)
@@ -40,7 +40,7 @@ class Feed:
         self._steps = Steps(self.intake)
 
     def run(self, messages: Iterable[Arrived]) -> None:
-        """Take in all messages.
+        """Process all messages.
 
         Raises
         ------
@@ -70,7 +70,7 @@ class Feed:
             walker.close()
 
     def _hole(self) -> None:
-        """Begin a new stretch: the load is not drawn over what is not there."""
+        """Begin a new stretch: no load is interpolated over missing messages."""
         self._steps.end()
         self.flush()
         if self._reached_ns is not None:
@@ -84,7 +84,7 @@ class Feed:
                 self.flush()
                 for walker in self.walkers:
                     walker.speed_m_s = speed
-                    # at once: a speed of the future would have to wait for its time
+                    # at once: it acts from its stamp on
                     walker.apply(Travel(self._reached_ns or 0, speed), max(0, log_time_ns))
         elif name == "excitation":
             wrench = (values["fx"], values["fy"], values["m"])
@@ -111,7 +111,7 @@ class Feed:
             self.flush()
 
     def flush(self) -> None:
-        """Advance by what waits."""
+        """Advance by the samples that wait."""
         if not self._stamps:
             return
         stamps, wrench = np.array(self._stamps, np.int64), np.array(self._wrench)

@@ -42,7 +42,7 @@ from plow_twin.stream.journal import (
 
 @dataclass(frozen=True)
 class Dropped:
-    """The recorder's own note: `count` messages on `topic` before this place did not reach the file."""
+    """A note of the recorder: `count` messages on `topic` before this place did not reach the file."""
 
     topic: str
     count: int
@@ -73,13 +73,13 @@ _DIGEST_HEAD: Final = np.frombuffer(struct.pack("<BBHIII4x", 0, 1, 0, 0, 0, 2), 
 _DIGEST_SIZE: Final = len(_DIGEST_HEAD) + 16
 _MASK: Final = 2**64 - 1
 _SIGN: Final = 2**63
-#: Fields that a line may lack.
+#: Optional fields.
 _OPTIONAL: Final = frozenset({"deviation"})
 _NAMES: Final = {kind: name for name, kind in _KINDS.items()}
 
 
 def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
-    """Return the message that stands for an entry."""
+    """Return an entry as a message."""
     if isinstance(entry, Sample):
         fx, fy, m = entry.wrench
         return WrenchStamped(entry.stamp_ns, frame_id, (fx, fy, 0.0), (0.0, 0.0, m))
@@ -91,7 +91,7 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
     if isinstance(entry, Snapshot | Restore):
         values["data"] = base64.b64encode(entry.data).decode()
     elif isinstance(entry, Unused):
-        # JSON has no number that is not finite
+        # JSON has no infinity and no NaN
         values["values"] = [
             [number if math.isfinite(number) else repr(number) for number in row] for row in entry.values
         ]
@@ -99,12 +99,12 @@ def to_message(entry: Entry | Dropped, frame_id: str) -> Message:
 
 
 def from_message(message: Message, source: str = "journal") -> Entry | Dropped:
-    """Return the entry that a message stands for.
+    """Return the entry in a message.
 
     Raises
     ------
     RecordingError
-        The message is no entry; `source` names it in the error.
+        The message holds no entry; `source` names it in the error.
     """
     if isinstance(message, WrenchStamped):
         wrench = (message.force[0], message.force[1], message.torque[2])
@@ -148,7 +148,7 @@ def _from_json(text: str, source: str) -> Entry | Dropped:
 
 
 def _exactly(*kinds: type) -> Callable[[Any], Any]:
-    """Return a reader that takes only these types, so that 1, 1.0 and True stay apart."""
+    """Return a reader that accepts only these types, so that 1, 1.0 and True stay apart."""
 
     def read(value: Any) -> Any:
         if type(value) not in kinds:
@@ -173,7 +173,7 @@ def _ints(value: Any) -> tuple[int, ...]:
 
 
 def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
-    """Return rows of numbers; one that is not finite stands there as a text."""
+    """Return rows of numbers; infinity and NaN are texts."""
     read = _exactly(float, str)
     rows = tuple(tuple(float(read(item)) for item in row) for row in value)
     return rows

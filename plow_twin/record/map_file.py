@@ -1,4 +1,4 @@
-"""The file of a mapping: roles of topics, units, and how a live twin makes the load from the drive's signals."""
+"""Mapping files: their schema, the roles of topics, units, and the model of the load from the drive's signals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "forces": PAIR_NAMES,
     "drive": ("power", "chain_force", "speed", "depth", "position"),
 }
-#: Key of a mapping beside the roles: how a live twin makes the load from the drive's signals.
+#: Key of a mapping beside the roles: the model of the load from the drive's signals.
 LOAD_MODEL: Final = "load_model"
 #: Units in SI, by what they measure.
 UNITS: Final[dict[str, dict[str, float]]] = {
@@ -62,7 +62,7 @@ _MOST_OFFSET_S: Final = 1e9
 
 
 class MapError(InputError, RecordingError):
-    """A mapping cannot be used, alone or with the recording it is for."""
+    """A mapping cannot be used, or does not fit the recording."""
 
 
 def read_map_file(path: Path) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def read_map_file(path: Path) -> dict[str, Any]:
 
 
 def _for_each(role: Any, entry: Any) -> Any:
-    """Return a role without empty keys, its numbers, units and limits for all given to each name."""
+    """Return a role without empty keys; a number, unit or limit for all names is given to each."""
     if role not in ROLES or not isinstance(entry, dict):
         return entry
     kinds: dict[str, tuple[type, ...]] = {

@@ -1,4 +1,4 @@
-"""Which topic of a recording is what: its fields, factors, offsets and stamps, from a YAML file or by what is there."""
+"""Roles of the topics of a recording: fields, factors, offsets and stamps, from a YAML file or from names and types."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
 
-#: How a reason begins under which messages are counted that a role cannot use.
+#: Begin of the reasons under which messages are counted that do not fit their role.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
 _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
@@ -41,7 +41,7 @@ _FIELDS: Final[dict[tuple[str, str], dict[str, str]]] = {
     ("forces", "sensor_msgs/msg/JointState"): {name: f"effort[{name}]" for name in PAIR_NAMES},
     ("gaps", "sensor_msgs/msg/JointState"): {name: f"position[{name}]" for name in PAIR_NAMES},
 }
-#: Topics by which a role is recognised without a mapping.
+#: Names of topics by which a role is found without a mapping.
 _NAMES: Final = {
     "excitation": ("excitation", "load", "wrench"),
     "head_pose": ("head_pose", "pose"),
@@ -53,14 +53,13 @@ _NAMES: Final = {
 
 @dataclass(frozen=True)
 class Role:
-    """One line of a mapping.
+    """The role of a topic.
 
-    The numbers are `scale` times the field plus `offset`, in a unit that `factor` takes to SI; `limits` are the
-    smallest and largest that are used, in SI. `stamp` is `header`, `log`, or for CSV and JSON where the time stands (a
-    number in `stamp_unit`, or a text after ISO 8601); `clock_offset_ns` is added to it. `sequence` is where the
-    sender's own number of the message stands; empty: it has none.
-    A field is a path of names; `[3]` or `[name]` picks from an array, the name being looked up in the message's `name`.
-    A path that leads to a quaternion gives the angle about z.
+    A number is (`scale` times the field plus `offset`) times `factor`, in SI; numbers outside `limits` are not used.
+    `stamp` is `header`, `log`, or for CSV and JSON the path of the time (a number in `stamp_unit`, or a text in ISO
+    8601), to which `clock_offset_ns` is added. `sequence` is the path of the sender's number of the message, or empty.
+    A field is a path of names; `[3]` or `[name]` is an item of an array, the name being looked up in the message's
+    `name`. A path to a quaternion gives the angle about z.
     """
 
     topic: str
@@ -74,11 +73,11 @@ class Role:
     stamp_unit: str = "s"
     clock_offset_ns: int = 0
     sequence: str = ""
-    #: whether somebody has stated `stamp_unit`
+    #: whether the mapping or an option states `stamp_unit`
     stamp_unit_is_stated: bool = False
 
     def read(self, arrived: Arrived) -> tuple[int, dict[str, float]] | None:
-        """Return stamp [ns] and numbers (NaN where the field is empty), or None when the message does not fit."""
+        """Return stamp [ns] and numbers (NaN for an empty field), or None for a message that does not fit."""
         values = {}
         for name, path in self.fields.items():
             value = _follow(arrived.content, path)
@@ -90,30 +89,30 @@ class Role:
         return None if stamp_ns is None else (stamp_ns, values)
 
     def stamp_ns(self, arrived: Arrived) -> int | None:
-        """Return the stamp of a message [ns], or None when it has none."""
+        """Return the stamp of a message [ns], or None without one."""
         stamp_ns = self._sent_ns(arrived)
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
     def why_unfit(self, arrived: Arrived) -> str:
-        """Return why `read` cannot use a message: the topic, and the field or the stamp that is no number."""
+        """Return why a message does not fit: the topic, and the field or stamp that is no number."""
         for name, path in self.fields.items():
             if _follow(arrived.content, path) is None:
                 return f"{self.topic} has no number at {path!r} for {name}"
         return f"{self.topic} has no time at {self.stamp!r}"
 
     def plausible(self, values: Mapping[str, float]) -> bool:
-        """Tell whether no number is outside its limits; one that is not there is none."""
+        """Return whether all numbers are within their limits; a missing number is."""
         return not any(
             values[name] < low or values[name] > high for name, (low, high) in self.limits.items() if name in values
         )
 
     def empty(self, arrived: Arrived) -> bool:
-        """Tell whether a message says nothing in this role: its fields are there and hold nothing."""
+        """Return whether all fields of this role are empty."""
         content = arrived.content
         return isinstance(content, Mapping) and all(_at(content, path) in (None, "") for path in self.fields.values())
 
     def number(self, arrived: Arrived) -> int | None:
-        """Return the sender's own number of the message, or None when there is none."""
+        """Return the sender's number of the message, or None without one."""
         value = _follow(arrived.content, self.sequence)
         return int(value) if value is not None and math.isfinite(value) and value == int(value) >= 0 else None
 
@@ -126,15 +125,15 @@ class Role:
             if self.stamp == "header":
                 name = next((name for name in TIMES if name in content), None)
                 return received_ns if name is None else time_ns(content[name], self.stamp_unit)
-            # a time that is asked for by name and is not there is none: that of receipt would be invented
+            # a missing time is not replaced by that of receipt
             return time_ns(_at(content, self.stamp), self.stamp_unit)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
-        # a type without a header has only its receive time
+        # types without a header have only their receive time
         return received_ns if stamp is None else int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def _at(content: Mapping[str, Any], path: str) -> Any | None:
-    """Return what stands at a path of keys and indexes, or None."""
+    """Return the value at a path of keys and indexes, or None."""
     if path in content:
         return content[path]
     value: Any = content
@@ -149,7 +148,7 @@ def _at(content: Mapping[str, Any], path: str) -> Any | None:
 
 
 def _plain_number(value: Any) -> float | None:
-    """Return a number as a sender wrote it, NaN for an empty cell, or None for anything else."""
+    """Return a number of CSV or JSON, NaN for an empty cell, or None for any other value."""
     if isinstance(value, str):
         if not value.strip():
             return math.nan
@@ -164,7 +163,7 @@ def _plain_number(value: Any) -> float | None:
 
 
 def _follow(content: Any, path: str) -> float | None:
-    """Return the number at a path, or None when there is none."""
+    """Return the number at a path, or None without one."""
     if isinstance(content, Mapping):
         return _plain_number(_at(content, path))
     value = content
@@ -189,9 +188,9 @@ def _follow(content: Any, path: str) -> float | None:
 def readings(
     messages: Iterable[Arrived], roles: Mapping[str, Role]
 ) -> Iterator[tuple[str, Arrived, tuple[int, dict[str, float]] | None]]:
-    """Yield for each message the roles that it has, and what it says in each as `Role.read`.
+    """Yield each message with each of its roles, read by `Role.read`.
 
-    Where several roles share a topic, a message says nothing in those whose fields are empty.
+    Where several roles share a topic, those whose fields are all empty are left out.
     """
     by_topic: dict[str, list[tuple[str, Role]]] = {}
     for name, role in roles.items():
@@ -204,7 +203,7 @@ def readings(
 
 
 def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
-    """Return what reads the stamp of a message as its role does; of several the first that finds one."""
+    """Return a function that reads the stamp of a message by its roles; the first role with a stamp decides."""
     by_topic: dict[str, list[Role]] = {}
     for role in roles:
         by_topic.setdefault(role.topic, []).append(role)
@@ -217,7 +216,7 @@ def stamps_by(roles: Iterable[Role]) -> StampOf[Arrived]:
 
 
 def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
-    """Return the messages of a recording that have a role; files of their own are put in order by the roles' stamps."""
+    """Return the messages of a recording that have a role; separate files are put in order by their stamps."""
     topics = {role.topic for role in roles.values()}
     return source.messages(topics.__contains__, stamps_by(roles.values()))
 
@@ -225,9 +224,9 @@ def messages_of(source: Source, roles: Mapping[str, Role]) -> Iterator[Arrived]:
 def roles_by_source(
     sources: Sequence[Source], path: Path | None, left_out: str = ""
 ) -> Iterator[tuple[Source, dict[str, Role]]]:
-    """Yield several recordings of one run, each with the roles whose topics it has, as `read_map` of all together.
+    """Yield the recordings of one run, each with the roles of its topics, as `read_map` of all topics together.
 
-    Topics that begin with `left_out` are none of them.
+    Topics that begin with `left_out` have no role.
     """
     tables = [
         {topic: kind for topic, kind in source.topics().items() if not left_out or not topic.startswith(left_out)}
@@ -239,9 +238,9 @@ def roles_by_source(
 
 
 def read_map(path: Path | None, topics: Mapping[str, TopicType] | None) -> dict[str, Role]:
-    """Return the roles of a recording's topics: as the YAML file says, else as names and types tell.
+    """Return the roles of topics: from the YAML file, or without one by names and types.
 
-    `topics` are types by topic; None when they are not known beforehand: JSON on any topic that the file names.
+    `topics` are types by topic; None if they are unknown: then each topic that the file names has JSON.
 
     Raises
     ------
@@ -373,7 +372,7 @@ def _default_fields(role: str, kind: TopicType) -> dict[str, str]:
 
 
 def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
-    """Return the topic that a role is to be read from: by its name, else when it alone has a fitting type."""
+    """Return the role of a topic found by its name, or as the only one of a fitting type."""
     fitting = {}
     for topic, kind in topics.items():
         fields = _default_fields(role, kind)
@@ -381,7 +380,7 @@ def _guess(role: str, topics: Mapping[str, TopicType]) -> Role | None:
         if enough and "/journal/" not in topic:
             fitting[topic] = fields
     ending = [topic for name in _NAMES[role] for topic in fitting if topic.rpartition("/")[2] == name]
-    # forces and gaps look like many others: only by name
+    # forces and gaps by name alone: many topics have their type
     lonely = list(fitting) if len(fitting) == 1 and role in ("excitation", "head_pose", "travel") else []
     lonely = [topic for topic in lonely if topic.rpartition("/")[2] not in ("head_state", "contact_forces")]
     for topic in (*ending, *lonely):

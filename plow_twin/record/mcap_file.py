@@ -1,7 +1,7 @@
-"""One MCAP file as it is written: messages are laid into chunks as bytes, many at a time, by compiled code.
+"""Writer of one MCAP file: compiled code lays messages into chunks as bytes, many at a time.
 
-The compiled code and the compressors hold no interpreter lock. Every write is a whole record, so that a killed process
-leaves a file that can be read up to its last chunk.
+The compiled code and the compressors hold no interpreter lock. Each write is a whole record: the file of a
+killed process can be read up to its last chunk.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _INDEX_ENTRY: Final = np.dtype([("time", "<u8"), ("offset", "<u8")])
 
 
 class ChunkBuilder:
-    """The messages of one chunk that is being filled."""
+    """The messages of a chunk that is being filled."""
 
     def __init__(self, compression: str) -> None:
         self.compression = compression
@@ -53,7 +53,7 @@ class ChunkBuilder:
         length: Indexes,
         data: bytes,
     ) -> None:
-        """Add messages, (n,) each, whose data have these lengths and stand one behind the other."""
+        """Add messages; arrays have shape (n,), the data of the messages follow each other in `data`."""
         sizes = MESSAGE_HEAD + length
         ends = np.cumsum(sizes)
         starts = self.reserve(int(ends[-1]) if len(ends) else 0) + ends - sizes
@@ -71,7 +71,7 @@ class ChunkBuilder:
         stamp_ns: Indexes,
         values: Any,
     ) -> None:
-        """Fill in many messages of one template, at places within what `reserve` has returned."""
+        """Write many messages of one template at places that `reserve` has returned."""
         channels, length = np.full(len(starts), channel), np.full(len(starts), len(template))
         heads(self._buffer, starts, channels, sequence, log_time_ns, np.maximum(stamp_ns, 0), length)
         fill(self._buffer, starts + MESSAGE_HEAD, template.data, template.places, stamp_ns, values)
@@ -88,7 +88,7 @@ class ChunkBuilder:
         return place
 
     def clear(self) -> None:
-        """Forget what has been laid in."""
+        """Drop all messages."""
         self.size, self._channels, self._times, self._offsets = 0, [], [], []
 
     def _note(self, channel: Indexes, time_ns: Indexes, offset: Indexes) -> None:
@@ -113,7 +113,7 @@ class ChunkBuilder:
 
 @compiled
 def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  # type: ignore[no-untyped-def]
-    """Write opcode, length, channel, sequence and times of messages whose data have these lengths."""
+    """Write the heads of messages: opcode, length, channel, sequence and times."""
     for n in range(starts.size):
         start, size = starts[n], length[n] + 22
         set_word(buffer, start, 5 | size << 8)
@@ -124,7 +124,7 @@ def heads(buffer, starts, channel, sequence, log_time, publish_time, length):  #
 
 @compiled
 def spread(buffer, starts, length, data):  # type: ignore[no-untyped-def]
-    """Copy messages, which stand one behind the other in `data`, to where each begins."""
+    """Copy messages, which follow each other in `data`, to their places."""
     place = 0
     for n in range(starts.size):
         start, end = starts[n], place + length[n]
@@ -133,7 +133,7 @@ def spread(buffer, starts, length, data):  # type: ignore[no-untyped-def]
 
 
 class ByteFile(Protocol):
-    """Where a recording's bytes go: a file, or memory."""
+    """Destination of a recording's bytes: a file or memory."""
 
     def write(self, data: bytes) -> None:
         """Write all of it."""
@@ -157,8 +157,8 @@ class ByteFile(Protocol):
 class McapFile:
     """An MCAP file that is being written.
 
-    Every method may raise `OSError` (disk full). What `chunk` had begun to write is taken back then, and its messages
-    are lost; after any other method only `close` may be called.
+    Every method may raise `OSError` (disk full). A failed `chunk` is taken back and its messages are lost; after any
+    other failed method only `close` may be called.
     """
 
     def __init__(self, out: ByteFile, library: str) -> None:
@@ -168,7 +168,7 @@ class McapFile:
         self._schemas: dict[str, Any] = {}
         self._channels: dict[int, Any] = {}
         self._undeclared: list[Any] = []
-        # as it will be written: a live run has some thousand chunks an hour, and objects take ten times the memory
+        # as bytes: a live run has some thousand chunks an hour, and objects take ten times the memory
         self._chunk_index = bytearray()
         self._chunk_count = 0
         self._metadata: list[Any] = []
@@ -318,7 +318,7 @@ class McapFile:
         self._file.write(MAGIC)
 
     def sync(self) -> None:
-        """Have the operating system put what was written on the disk."""
+        """Wait until the disk has all bytes."""
         self._file.sync()
 
     def is_linked(self) -> bool:
@@ -331,12 +331,12 @@ class McapFile:
 
 
 def _record_bytes(record: Any) -> bytes:
-    """Return a record as it stands in a file."""
+    """Return a record as bytes."""
     return _records_bytes([record])
 
 
 def _records_bytes(records: Iterable[Any]) -> bytes:
-    """Return records as they stand in a file, one behind the other."""
+    """Return records as bytes, one after the other."""
     from mcap.data_stream import RecordBuilder
 
     builder = RecordBuilder()
@@ -351,7 +351,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
     if compression == "lz4":
         import lz4.frame
 
-        # blocks that do not refer to each other are read a third sooner, for 1 % of the size
+        # independent blocks: decompressed in two thirds of the time, 1 % larger
         data = lz4.frame.compress(content, block_linked=False)
     else:
         import zstandard
@@ -361,7 +361,7 @@ def _compress(compression: str, content: Bytes) -> bytes:
 
 
 class UnbufferedFile:
-    """A file that holds nothing back, so that nothing is left to fail a second time when the disk is full."""
+    """A file without a buffer: on a full disk no bytes are left that could fail a second time."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -406,7 +406,7 @@ class UnbufferedFile:
             return False
 
     def close(self) -> None:
-        """Close it; once is enough."""
+        """Close it; more calls do nothing."""
         if self._open:
             self._open = False
             os.close(self._descriptor)

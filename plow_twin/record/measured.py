@@ -1,7 +1,7 @@
-"""What was measured, for the estimate: from a folder, from a run of ours, or from any recording by a mapping.
+"""Measured loads and motions for the estimate: from a folder, from a run, or from any recording by a mapping.
 
 A folder holds scene.yaml, load.csv (t, fx, fy, m), pose.csv (t, x, y, theta) and, where gaps were measured, gaps.csv (t
-and columns named after pairs); with it pose.csv may be missing. contact_forces.csv, if there is one, is like gaps.csv.
+and columns named after pairs), beside which pose.csv may be missing. contact_forces.csv is optional and like gaps.csv.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _POSE_COLUMNS: Final = ("t", "x", "y", "theta")
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What a folder holds.
+    """Measurements of one run.
 
     load : (n, 4) t [s], Fx, Fy [N], M [N m] believed; poses : (k, 4) t [s], x, y [m], theta [rad], NaN where a cell is
     empty; unreadable : rows that are not numbers, and whatever else `lost` says, which could not be read or used of a
@@ -86,17 +86,17 @@ def read_measured(folder: Path, scene: Path | None = None) -> Measured:
         poses, bad_poses = _read(folder / POSE_FILE, _POSE_COLUMNS)
     model = load_scene(scene_path(str(scene)) if scene else folder / SCENE_FILE)
     if len(load) and load[0, 0] >= EPOCH_S:
-        # as in a recording: times of today's date count from the first sample of the load
+        # as in a recording: dates count from the first sample of the load
         for table in (poses, gaps, forces, load):
             table[:, 0] -= load[0, 0]
     return Measured(model, load, poses, bad_load + bad_poses + bad_gaps + bad_forces, gaps=gaps, forces=forces)
 
 
 def read_recording(path: Path, scene: Path | None = None, mapping: Path | None = None) -> Measured:
-    """Read a run of ours by its journal, or another recording (MCAP, rosbag2's sqlite3, csv) by the mapping.
+    """Read a run by its journal, or another recording (MCAP, rosbag2's sqlite3, csv) by the mapping.
 
-    The measured pose of a run of ours lies in its journal where the node estimated, else in another recording beside
-    it, or in its folder `beside`. Times count from the first sample of the load.
+    The measured pose of a run lies in its journal if the node estimated, else in another recording that is given too,
+    or in its folder `beside`. Times count from the first sample of the load.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def read_recording(path: Path, scene: Path | None = None, mapping: Path | None =
             unread = Counter[str]()
             places = [folder, *readable_beside(folder, unread)]
             rows, _, lost, why = _collect(places, mapping, ("head_pose", "forces"), own.header.node)
-            lost.pop("missing_parts", 0)  # counted by the run itself
+            lost.pop("missing_parts", 0)  # the run has counted it
             lost.update(unread)
         lost.update(own.lost, damaged_chunks=own.damaged_chunks, **own.lost_parts)
     poses = rows["head_pose"]
@@ -187,10 +187,10 @@ def _journal(reader: RunReader) -> tuple[Array, list[int], Array, Array, Array, 
 
 
 def _longest(rows: Array, begins: list[int]) -> Array:
-    """Return the longest stretch of a load.
+    """Return the longest stretch of a load without missing samples.
 
-    A stretch begins at those of the rows `begins` before which samples are missing for longer than some would take:
-    unlike in a silence, it is known that something acted there.
+    A stretch begins at a row of `begins` before which many samples are missing: unlike in a silence, a load acted
+    there.
     """
     if len(rows) < 2:
         return rows
@@ -204,9 +204,9 @@ def _longest(rows: Array, begins: list[int]) -> Array:
 def _collect(
     places: list[Path], mapping: Path | None, wanted: tuple[str, ...], node: str
 ) -> tuple[dict[str, Array], list[int], Counter[str], str]:
-    """Return the rows of each wanted role, stamps in ns, and what could not be read or used.
+    """Return the rows of each wanted role, stamps in ns, the rows after gaps, the losses and a reason.
 
-    Second the rows of the load before which some are missing, last why nothing fits.
+    The rows after gaps are those of the load; the reason says why no message fits.
     """
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
     lost, begins = Counter[str](), list[int]()

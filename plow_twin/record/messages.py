@@ -1,7 +1,7 @@
-"""What the node sends and journals, as plain immutable values without ROS.
+"""Messages of the node and of its journal, as plain immutable values without ROS.
 
-Each class stands for one ROS 2 message type (`TYPE`); the live node fills real messages from them, the recorder encodes
-them and replay compares them, so that all three speak of the same numbers. Stamps are integer nanoseconds.
+Each class is one ROS 2 message type (`TYPE`). The live node fills ROS messages from them, the recorder encodes them and
+replay compares them. Stamps are integer nanoseconds.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 Float64s = NDArray[np.float64]
 
-#: Arrays that a message leaves empty.
+#: An empty array of a message.
 EMPTY: Final[Float64s] = np.zeros(0)
 _ZERO36: Final[Float64s] = np.zeros(36)
 
@@ -23,7 +23,7 @@ _ZERO36: Final[Float64s] = np.zeros(36)
 class JointState:
     """Named numbers: `position`, `velocity` and `effort` each have the length of `name` or are empty.
 
-    The arrays belong to the message from then on: the sender must not write to them again.
+    The arrays belong to the message: the sender must not change them.
     """
 
     TYPE: ClassVar = "sensor_msgs/msg/JointState"
@@ -40,7 +40,7 @@ class JointState:
 class Odometry:
     """Pose in `frame_id`, twist in `child_frame_id`; `orientation` is the quaternion (x, y, z, w).
 
-    Covariances are row-major 6 x 6 over (x, y, z, rotation about x, y, z); all zero means that none is known.
+    Covariances are row-major 6 x 6 over (x, y, z, rotation about x, y, z); all zeros: unknown.
     """
 
     TYPE: ClassVar = "nav_msgs/msg/Odometry"
@@ -58,7 +58,7 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticStatus:
-    """Health in words: `level` 0 OK, 1 WARN, 2 ERROR, 3 STALE, and key/value pairs."""
+    """A state: `level` 0 OK, 1 WARN, 2 ERROR, 3 STALE, a message, and key/value pairs."""
 
     TYPE: ClassVar = "diagnostic_msgs/msg/DiagnosticStatus"
 

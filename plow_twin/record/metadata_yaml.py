@@ -16,13 +16,13 @@ from plow_twin.stream.topics import TOPICS
 
 METADATA_VERSION: Final = 9
 _INFINITE: Final = {"sec": 9223372036, "nsec": 854775807}
-#: Before the topic, a key under `custom_data` whose value counts what the recorder has lost.
+#: Begin of the keys under `custom_data` that count lost messages; the topic follows.
 LOST: Final = "plow_twin_lost "
 
 
 @dataclass
 class TopicCount:
-    """One topic of a recording and how many messages it has; QoS and hash of one that the node does not send."""
+    """A topic of a recording and its number of messages; QoS and hash of topics that the node does not send."""
 
     topic: str
     message_type: str
@@ -32,7 +32,7 @@ class TopicCount:
 
 
 def qos_profile(base_name: str) -> dict[str, Any]:
-    """Return the QoS that the node offers on a topic; a usual one where it sends none of that base name."""
+    """Return the QoS that the node offers on a topic by its base name; reliable, depth 10 for other topics."""
     for topic in TOPICS:
         if topic.name == base_name:
             return offered(True, topic.latched, topic.depth)
@@ -72,7 +72,7 @@ def dump_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
 
 @dataclass(frozen=True)
 class PartFacts:
-    """One file of a recording: first and last receive time [ns], and what it holds."""
+    """A file of a recording: first and last receive time [ns], and its topics."""
 
     name: str
     start_ns: int
@@ -158,7 +158,7 @@ def _parsed(read: tuple[Any, list[Problem]]) -> Any:
 
 
 def told_lost(folder: Path) -> dict[str, int]:
-    """Return by topic what `metadata.yaml` says that its recorder has lost; nothing where it cannot be read."""
+    """Return the losses by topic in `metadata.yaml`; empty where it cannot be read."""
     try:
         custom = _information(folder)["custom_data"] or {}
         return {key.removeprefix(LOST): int(count) for key, count in custom.items() if key.startswith(LOST)}
@@ -167,12 +167,12 @@ def told_lost(folder: Path) -> dict[str, int]:
 
 
 def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
-    """Return the files that `metadata.yaml` names and that are not there, or in `without`; none without it."""
+    """Return the files that `metadata.yaml` names and that are missing or in `without`."""
     try:
         listed = listed_parts(folder)
     except RecordingError:
         return []
-    # old versions write the folder's name before that of the file
+    # old versions of rosbag2 write the name of the folder before that of the file
     return [
         name
         for name in listed
@@ -181,7 +181,7 @@ def missing_files(folder: Path, without: Collection[str] = ()) -> list[str]:
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, Any], *, sync: bool = False) -> None:
-    """Write `metadata.yaml` in one step, so that no reader meets half of it; with `sync` wait for the disk."""
+    """Write `metadata.yaml` in one step; with `sync` wait for the disk."""
     partial = folder / "metadata.yaml.partial"
     partial.write_text(dump_yaml(metadata), encoding="utf-8")
     if sync:

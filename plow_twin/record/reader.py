@@ -1,7 +1,7 @@
 """Reading a recording from front to back: complete, cut off by a kill, or with damaged chunks; one part or many.
 
 Only some chunks are in memory at a time, and no index is needed: a file without its end is read as far as it goes.
-The journal and what was sent may stand in chunks of their own: they are put in order by their sequence numbers.
+Journal and outputs, which stand in chunks of their own, are put in order by their sequence numbers.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from plow_twin.stream.journal import Entry, Loss, Sample
 
 #: Journal entries that may wait for the messages sent after them [entries]: bounds the memory.
 _PENDING: Final = 65_536
-#: A batch is made when so many entries, or the sixteenth part of so many chunks, have come: their cost is shared.
+#: Least entries of a batch; outputs of a sixteenth as many chunks make a batch too.
 _LEAST: Final = 8192
-#: The same without messages that were sent, which take most of the memory.
+#: Least entries of a batch without outputs, which take most of the memory.
 _LEAST_ALONE: Final = 32_768
-#: Size of a recording of all outputs at 1 kHz for each second [B].
+#: Size of a second of a recording of all outputs at 1 kHz [B].
 _BYTES_PER_S: Final = 400_000
 #: Fx, Fy, M among the numbers of a sample.
 _WRENCH: Final = np.array([0, 1, 5])
@@ -57,21 +57,21 @@ class FileStatus(Enum):
 class RunReader:
     """Iterate over the records of a recording, a folder or an `.mcap` file.
 
-    `status`, `damaged_chunks`, `lost`, `stop_reason` (why it stopped early, if it did) and `counts` (records by topic)
-    hold once the iteration has ended; `position` is the share of the files that has been read, 0..1. `path` is the
-    first file, `parts` are all but those `repeated`: files that hold a part once more, with the file that is read for
-    it, and those `foreign`: of another run, by what differs in their headers from most. A part that is no MCAP file
-    counts as a damaged chunk. `missing_parts` counts parts of a folder that are named by `metadata.yaml`, or by those
-    around them, and not there; `lost_parts` has both counts, where there are any. Parts that are removed while others
-    are read are passed over like those that were not there before.
+    `status`, `damaged_chunks`, `lost`, `stop_reason` (of a recording that stopped early) and `counts` (records by
+    topic) are known once the iteration has ended; `position` is the share of the files that has been read, 0..1.
 
-    With a `tail` a recording is followed while it is written: parts that come are read as well, and a batch of nothing
-    follows each time that all there is has been read.
+    `path` is the first file. `parts` are the files that are read; `repeated` maps files that repeat a part to the file
+    that is read instead; `foreign` maps files of another run to the keys of their headers that differ from most. A part
+    that is no MCAP file counts as a damaged chunk. `missing_parts` counts parts that `metadata.yaml` names, or the
+    numbers around them imply, and that the folder lacks. Parts that are removed while others are read are passed over.
+
+    With a `tail` a recording is followed while it is written: new parts are read as well, and an empty batch follows
+    whenever all has been read.
 
     Raises
     ------
     RecordingError
-        There is no such file, or it is not a recording of plow_twin.
+        There is no such file, or it is no recording of plow_twin.
     """
 
     path: Path
@@ -90,7 +90,7 @@ class RunReader:
         self._place = Path(self.path)
         self._headers: dict[Path, RunHeader] = {}
         self._counted: Counter[str] = Counter()
-        self._noted: dict[int, Loss | Dropped] = {}  # by their places: an entry may stand in two chunks
+        self._noted: dict[int, Loss | Dropped] = {}  # by sequence number: an entry may stand in two chunks
         self._look_for_parts()
         self.path = self.parts[0]
         for part in self.parts:
@@ -100,7 +100,7 @@ class RunReader:
         raise ForeignRecordingError(f"{self.path}: metadata {HEADER_RECORD!r} is missing: not a recording of plow_twin")
 
     def _look_for_parts(self) -> None:
-        """Find the files there are, in the order of the parts by their headers; by their names without one."""
+        """Find the files and order them by the part numbers in their headers, or in their names without a header."""
         files = run_parts(self._place)
         for file in files:
             if file not in self._headers and (len(files) == 1 or (is_begun(file) and is_mcap(file))):
@@ -121,7 +121,7 @@ class RunReader:
                 self.repeated[file] = read[self._headers[file].part]
 
     def _of_other_runs(self) -> dict[Path, tuple[str, ...]]:
-        """Return the files whose headers are not those of the run, with what differs: the parts of a run have one."""
+        """Return the files whose headers differ from those of most, with the keys that differ."""
         records = {file: header.to_record() for file, header in self._headers.items()}
         for record in records.values():
             del record["part"]
@@ -137,7 +137,7 @@ class RunReader:
 
     @property
     def missing_parts(self) -> int:
-        """Number of parts of a folder that are named by `metadata.yaml`, or by those around them, and not there."""
+        """Number of parts that `metadata.yaml` names, or the numbers around them imply, and that the folder lacks."""
         if not self._place.is_dir():
             return 0
         there = {self.number(file) for file in self.parts}
@@ -149,7 +149,7 @@ class RunReader:
 
     @property
     def lost(self) -> dict[str, int]:
-        """What is not in the recording, by topic, as its recorder counted on closing, or noted until it was killed."""
+        """Losses by topic: as the recorder counted on closing, or noted until it was killed."""
         noted: Counter[str] = Counter()
         for entry in self._noted.values():
             noted[entry.topic if isinstance(entry, Dropped) else "journal"] += entry.count
@@ -157,17 +157,19 @@ class RunReader:
 
     @property
     def lost_parts(self) -> dict[str, int]:
-        """Parts that are not there and parts of another run, under their names in `lost`; not those that are 0."""
-        missing = self.missing_parts if self.tail is None else 0  # a tail may outlive the oldest ones
+        """Counts of missing parts and parts of another run, by their names in `lost`; zeros are left out."""
+        missing = (
+            self.missing_parts if self.tail is None else 0
+        )  # the recorder may remove the oldest parts while they are followed
         found = {"missing_parts": missing, "foreign_parts": len(self.foreign)}
         return {name: count for name, count in found.items() if count}
 
     def number(self, file: Path) -> int:
-        """Return the number of a part, by its header where that can be read."""
+        """Return the number of a part by its header, or by its name without a header."""
         return self._headers[file].part if file in self._headers else part_number(file)[0]
 
     def _place_of(self, file: Path) -> tuple[int, bool, str]:
-        """Return where a file stands among the parts; of two of the same number the one that is named so is first."""
+        """Return the sort key of a file: its number; of two with the same number the one named after it is first."""
         named = part_number(file)[0]
         number = self.number(file)
         return number, named != number, file.name
@@ -177,7 +179,7 @@ class RunReader:
             yield from in_order(batch)
 
     def batches(self, *, outputs: bool = True) -> Iterator[Batch]:
-        """Yield the records in order, many at a time; without `outputs` the journal alone, as fast as can be."""
+        """Yield the records in order, many at a time; without `outputs` only the journal is read."""
         self.status, self.damaged_chunks, self.position, self.stop_reason = FileStatus.UNREAD, 0, 0.0, None
         self.counts.clear()
         self._counted.clear()
@@ -193,7 +195,7 @@ class RunReader:
         size, before = self.size(), 0
         finished, cut = True, False
         for part in self._parts_to_read():
-            self.damaged_chunks += cut  # what the part before lacks may be missing in what comes now
+            self.damaged_chunks += cut  # the end that the part before lacks may be missing here
             cut = False
             if self.tail is None and len(self.parts) > 1 and not is_begun(part):
                 finished, cut = False, True
@@ -229,19 +231,19 @@ class RunReader:
             self.status = FileStatus.COMPLETE if self.stop_reason is None else FileStatus.STOPPED_EARLY
 
     def _parts_to_read(self) -> Iterator[Path]:
-        """Yield the parts in order; with a tail also those that are begun meanwhile."""
+        """Yield the parts in order; with a tail also those that begin meanwhile."""
         done: list[Path] = []
         while left := [part for part in self.parts if part not in done]:
             done.append(left[0])
             if left[0].exists():
                 yield left[0]
-            elif len(self.parts) > 1:  # a recorder removes the oldest ones
+            elif len(self.parts) > 1:  # the recorder has removed it
                 self.parts.remove(left[0])
             if self.tail is not None and not self.tail.stopped:
                 self._look_for_parts()
 
     def size(self) -> int:
-        """Return the size of the parts that are there [B]."""
+        """Return the size of the parts on the disk [B]."""
         found = 0
         for part in self.parts:
             with suppress(FileNotFoundError):  # removed meanwhile
@@ -249,7 +251,7 @@ class RunReader:
         return found
 
     def duration_s(self) -> float:
-        """Return the span of the receive times [s] by the index of the parts; a guess by their size without one."""
+        """Return the span of the receive times [s] by the index of the parts, or a guess by their size."""
         from mcap.reader import make_reader
 
         first, last = [], []
@@ -273,11 +275,11 @@ class RunReader:
             counted = Counter({topic: int(count) for topic, count in record.items()})
         except ValueError as error:
             raise RecordingError(f"{self.path}: metadata {LOSS_RECORD!r}: {error}, expected counts") from error
-        self._counted = counted  # counted over the whole run: the newest part knows all
+        self._counted = counted  # counted over the whole run: the newest part has all
 
 
 class _Merger:
-    """Put journal and messages, which stand in any chunks, into one order."""
+    """Puts journal and outputs into one order."""
 
     def __init__(self, reader: RunReader, outputs: bool) -> None:
         self._run = reader
@@ -288,7 +290,7 @@ class _Merger:
         self._template = sample_template(header.frame_id)
         self._places = self._template.places[_WRENCH]
         self._entries = [NO_ENTRIES]
-        self._count = 0  # of these
+        self._count = 0  # entries in them
         self._outputs: list[Outputs] = []
         self._base = 0
         self._part = reader.path
@@ -302,16 +304,16 @@ class _Merger:
         self._topics = {}
 
     def end(self) -> None:
-        """Note that the part has been read."""
+        """End the part."""
         self._chunks = None
 
     def is_journal(self, part: Path, numbers: set[int]) -> bool:
-        """Tell whether one of these channels is the journal's."""
+        """Return whether one of these channels is the journal's."""
         assert self._chunks is not None
         return any(self._chunks.channels[number].topic in self._journal for number in numbers)
 
     def add(self, messages: Messages) -> Iterator[Batch]:
-        """Take in a chunk and yield what is complete with it."""
+        """Add a chunk and yield the batches that it completes."""
         assert self._chunks is not None
         counts = np.bincount(messages.channel)
         there = counts.nonzero()[0]
@@ -328,7 +330,7 @@ class _Merger:
             elif channel.message_type in MESSAGE_TYPES:
                 sent.append(number)
                 named = channel.topic, channel.message_type
-                if self._topics.get(number) != named:  # made anew: parts share what is told of their channels
+                if self._topics.get(number) != named:  # a new dictionary: outputs of earlier parts keep theirs
                     self._topics = {**self._topics, number: named}
         if journal:
             chosen = messages if len(journal) == len(there) else _of(messages, journal)
@@ -345,7 +347,7 @@ class _Merger:
         yield from self._take(newest)
 
     def finish(self) -> Iterator[Batch]:
-        """Yield what is left."""
+        """Yield the rest."""
         newest = max((part.newest for part in self._outputs), default=-1)
         yield from self._take(self._newest(newest) + 1)
 
@@ -422,12 +424,12 @@ def sample_template(frame_id: str) -> Template:
 
 
 def read_header(path: Path) -> RunHeader | None:
-    """Return the header of a file of ours, or None when it has none.
+    """Return the header of a recording of plow_twin, or None without one.
 
     Raises
     ------
     RecordingError
-        The file is no MCAP file, or its header cannot be understood.
+        The file is no MCAP file, or its header cannot be read.
     """
     found: list[RunHeader] = []
 
@@ -437,7 +439,7 @@ def read_header(path: Path) -> RunHeader | None:
 
     for _ in ChunkReader(path, on_metadata):
         break
-    if not found:  # ours stands before the first chunk; a program that has written the file anew may put it last
+    if not found:  # other programs that rewrite a file put it last
         for name, record in metadata_records(path):
             on_metadata(name, record)
     return found[0] if found else None
@@ -449,7 +451,7 @@ def run_parts(path: Path) -> list[Path]:
     Raises
     ------
     RecordingError
-        There are none.
+        There is no file.
     """
     if path.is_dir():
         files = sorted(path.glob("*.mcap"), key=part_number)
@@ -467,13 +469,13 @@ def mcap_path(path: Path) -> Path:
 
 
 def part_number(path: Path) -> tuple[int, str]:
-    """Return by what the parts of a recording are put in order: the number at the end of the name, and the name."""
+    """Return the sort key of a part: the number at the end of its name (-1 without one), and the name."""
     digits = re.search(r"(\d+)$", path.stem)
     return (int(digits[1]) if digits else -1, path.name)
 
 
 def own_run(path: Path, tail: Tail | None = None) -> RunReader | None:
-    """Return the reader of a run of ours, or None for another recording."""
+    """Return the reader of a run of plow_twin, or None for another recording."""
     if path.is_dir() and not any(path.glob("*.mcap")):
         return None
     try:

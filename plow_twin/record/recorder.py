@@ -1,9 +1,8 @@
-"""The recorder of a live node: takes entries and publications without ever waiting, writes them in a thread of its own.
+"""The recorder of a live node: queues entries and publications without waiting and writes them in its own thread.
 
-The caller's cost is a clock reading and an append. The thread looks at the queue some times a second, lays what was
-sent into its chunk as it is, or many messages in one compiled call, and compresses it without the interpreter lock.
-When it falls behind, what does not fit in the queue is dropped, counted by topic, and noted in the file where it is
-missing.
+The caller's cost is a clock reading and an append. The thread empties the queue some times a second, lays messages into
+chunks, many in one compiled call, and compresses the chunks without the interpreter lock. When it falls behind, items
+that do not fit in the queue are dropped, counted by topic, and noted at their place in the file.
 """
 
 from __future__ import annotations
@@ -37,21 +36,22 @@ if TYPE_CHECKING:
 
 #: Key of the journal in the loss counters.
 JOURNAL: Final = "journal"
-#: The thread looks at the queue that often [s].
+#: Interval at which the thread empties the queue [s].
 _POLL_S: Final = 0.05
-#: Errors of a disk that is full: it may have room again.
+#: Errors of a full disk, which may have room again.
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-#: So many items are put together in one go, some 0.2 ms of Python; then the thread sleeps, so that a caller that waits
-#: for the interpreter gets it. Releasing it without sleep does not do: the thread would take it back at once.
+#: Items that are written in one go, some 0.2 ms of Python. Then the thread sleeps, so that a caller gets the
+#: interpreter: without the sleep the thread would get it back at once.
 _BURST: Final = 128
 
 
 @dataclass(frozen=True)
 class RecorderCounters:
-    """How a recorder is doing. `lost` counts by topic what did not reach the file; its journal is under `journal`.
+    """State of a recorder. `lost` counts by topic the messages that did not reach the file, journal entries as
+    `journal`.
 
-    `error` says why it has stopped, and is None again when it goes on; or why a ring was not written, from then on.
-    `marks` counts the rings that were written, `marks_lost` those that could not be.
+    `error` says why recording has stopped (None once it goes on), or why the last ring was not written. `marks` counts
+    the rings that were written, `marks_lost` those that failed.
     """
 
     written: int
@@ -65,7 +65,7 @@ class RecorderCounters:
 
 @dataclass(frozen=True)
 class LossReport:
-    """How a recording ended: what was lost by topic, whether the file was closed, and the error that stopped it."""
+    """End of a recording: losses by topic, whether the file was closed, and the error that stopped it."""
 
     lost: Mapping[str, int]
     closed: bool
@@ -73,7 +73,7 @@ class LossReport:
 
     @property
     def complete(self) -> bool:
-        """Nothing was lost and the file has its index."""
+        """Whether nothing was lost and the file has its index."""
         return self.closed and not self.lost and self.error is None
 
 
@@ -85,24 +85,23 @@ class Recorder:
     path
         Folder to make, e.g. `runs/monday`; the file is `runs/monday/monday_0.mcap`.
     header
-        What replay needs besides the journal.
+        Scene and settings, which replay needs beside the journal.
     queue_size
-        Items waiting for the thread; the last quarter is kept for the journal.
+        Items that may wait for the thread; the last quarter is kept for the journal.
     flush_period_s
-        A killed process loses at most what came in that time [s], of the messages sent in twice that time.
+        A killed process loses at most the entries of that time [s] and the messages of twice that time.
     chunk_size
         Bytes [B] in one compressed chunk.
     min_free_bytes
-        Recording stops when the disk has less free space [B], and goes on when it has it again.
+        Recording stops while the disk has less free space [B].
     part_bytes, part_s
-        A part of the recording is ended when it has that size [B] or spans that time [s]; 0: never.
+        Size [B] and time [s] at which the recording goes on in a new part; 0: never.
     keep_bytes
-        The oldest parts are removed when the ended ones are larger together [B]; 0: all are kept.
+        The oldest parts are removed while all ended ones are larger together [B]; 0: all are kept.
     ring_s
-        Nothing is written but the last so many seconds, kept in memory, at each `mark` [s]; 0: everything is written.
+        Time kept in memory, which is written at each `mark` [s]; 0: everything is written.
     sync
-        Whether each flush waits for the disk (`fdatasync`), and so does all that makes a part or a ring findable: for a
-        loss of power.
+        Whether each flush, new part and ring waits for the disk (`fdatasync`), against a loss of power.
     now_ns
         Receive times [ns], read in the caller's thread.
     on_error
@@ -111,7 +110,7 @@ class Recorder:
     Raises
     ------
     RecordingError
-        The folder holds something already or cannot be made.
+        The folder is not empty or cannot be made.
     """
 
     def __init__(
@@ -144,11 +143,11 @@ class Recorder:
             part_bytes, part_s, keep_bytes = 0, ring_s / PARTS, 0
         self._writer = self._ring or RunWriter(self._folder, header, chunk_size, min_free_bytes, sync=sync)
         self.path = self._writer.path
-        self._mark: Path | None = None  # where the ring is to be written
+        self._mark: Path | None = None  # folder that the ring is written to next
         self._marks = self._marks_lost = 0
         self._mark_error: str | None = None
         self._publication_topics = {name: header.topic(name) for name in PUBLICATION_TOPICS}
-        # of a publication without and with its slow part
+        # topics of a publication without and with its slow part
         each = tuple(topic for name, topic in self._publication_topics.items() if name not in SLOW_TOPICS)
         self._topics_of = each, tuple(self._publication_topics.values())
         self._limits = (part_bytes, part_s, keep_bytes)
@@ -159,7 +158,7 @@ class Recorder:
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
         self._on_error = on_error
-        self._lock = threading.Lock()  # held for microseconds; the thread never writes while it holds it
+        self._lock = threading.Lock()  # held for microseconds, never while the thread writes
         self._sequence = -1
         self._journal_gap = 0
         self._snapshot_due = False
@@ -168,7 +167,7 @@ class Recorder:
         self._unflushed: Counter[str] = Counter()  # written, but not yet safe
         self._written = 0
         self._error: str | None = None
-        self._paused: str | None = None  # why nothing is taken in just now
+        self._paused: str | None = None  # why items are refused just now
         self._closed = False
         self._accepting = True
         self._stopping = threading.Event()
@@ -178,14 +177,14 @@ class Recorder:
 
     @property
     def snapshot_wanted(self) -> bool:
-        """Something was lost and there is room again, or a part ends: journal a `Snapshot` now to go on from."""
+        """Whether the caller should journal a `Snapshot` now: after a loss, or at the end of a part."""
         if not (self._snapshot_due or self._split_due):
             return False
         return self._accepting and not self._paused and len(self._queue) < self._queue_size // 2
 
     @property
     def counters(self) -> RecorderCounters:
-        """Counters as of now."""
+        """The present counters."""
         with self._lock:
             lost = dict(self._lost)
             error = self._error or self._mark_error
@@ -193,10 +192,9 @@ class Recorder:
         return RecorderCounters(self._written, len(self._queue), self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
-        """Have the ring written, once the next `Snapshot` is journalled or the recorder closed.
+        """Write the ring, once the next `Snapshot` is journalled or the recorder is closed.
 
-        Returns the folder that it goes to, or None: without a ring everything is written anyway. Marks before it has
-        been written are one.
+        Returns its folder, or None for a recorder without a ring. Further calls before it is written change nothing.
         """
         from plow_twin.record.writer import free_folder
 
@@ -208,9 +206,9 @@ class Recorder:
             return self._mark
 
     def journal(self, entry: Entry) -> bool:
-        """Take a journal entry; False when it was lost.
+        """Queue a journal entry; False when it was lost.
 
-        After a loss all entries but a `Snapshot` are refused: without the state they would be of no use to replay.
+        After a loss only a `Snapshot` is accepted: replay needs the state to go on.
         """
         now = self._now_ns()
         with self._lock:
@@ -224,7 +222,7 @@ class Recorder:
                 if self._journal_gap:
                     self._push_entry(now, Loss(self._journal_gap))
                     self._journal_gap = 0
-                if snapshot:  # what was lost is told before it: all that follows can be compared
+                if snapshot:  # the loss stands before it: all that follows can be compared
                     self._push_notes(now)
                 self._push_entry(now, entry)
                 self._snapshot_due = self._snapshot_due and not snapshot
@@ -232,13 +230,13 @@ class Recorder:
                 return True
             self._snapshot_due = True
             if not (self._journal_gap and snapshot):
-                self._sequence += 1  # a lost entry leaves its number free: messages sent meanwhile point to it
+                self._sequence += 1  # a lost entry keeps its number: messages sent meanwhile refer to it
                 self._journal_gap += 1
                 self._lost[JOURNAL] += 1
             return False
 
     def output(self, topic: str, stamp_ns: int, message: Message) -> bool:
-        """Take a message that was sent on the resolved name `topic` for time `stamp_ns`; False when it was lost."""
+        """Queue a message that was sent on `topic` (resolved name) for time `stamp_ns`; False when it was lost."""
         now = self._now_ns()
         with self._lock:
             if self._room(2, self._queue_size * 3 // 4):
@@ -253,9 +251,10 @@ class Recorder:
             return False
 
     def publication(self, publication: Publication, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
-        """Take all messages of a publication that was sent; False when they were lost.
+        """Queue all messages of a publication that was sent; False when they were lost.
 
-        `sent` has their bytes by base name of the topic, as `PublicationBytes` writes them; without them they are made.
+        `sent` has their bytes by base name of the topic, as `PublicationBytes` writes them; by default the thread makes
+        them.
         """
         now = self._now_ns()
         topics = self._topics_of[publication.slow is not None]
@@ -285,7 +284,7 @@ class Recorder:
         self._output_gaps.clear()
 
     def close(self, timeout_s: float = 5.0) -> LossReport:
-        """Write what is queued, close the file and say what was lost; waits at most `timeout_s` [s].
+        """Write the queued items, close the file and return the losses; waits at most `timeout_s` [s].
 
         A second call only returns the report.
         """
@@ -333,11 +332,11 @@ class Recorder:
                 self._give_up(reason)
             if self._mark is not None:
                 self._split()
-            with self._lock:  # callers go on counting what they lose
+            with self._lock:  # callers go on counting their losses
                 lost = dict(self._lost)
             self._writer.close(lost, reason or self._paused)
             self._closed = True
-        except Exception as error:  # whatever it is: the twin goes on without its recorder
+        except Exception as error:  # any error: the twin goes on without its recorder
             self._give_up(str(error), self._unflushed)
             self._writer.abandon()
 
@@ -353,7 +352,7 @@ class Recorder:
                 time.sleep(1e-6)
 
     def _write(self, items: list[_EntryItem | _OutputItem | _PublicationItem]) -> None:
-        """Write items in order, alike ones that follow each other at once; journal and outputs have orders apart."""
+        """Write items in order, runs of one kind at once; journal and outputs each keep their order."""
         samples: list[_EntryItem] = []
         publications: list[_PublicationItem] = []
         for item in items:
@@ -370,7 +369,7 @@ class Recorder:
             else:
                 publications = self._write_publications(publications)
                 item.write(self._writer)
-        # samples first: their chunk must not be closed behind that of messages sent after them
+        # samples first: their chunk must come before that of the messages sent after them
         self._write_samples(samples)
         self._write_publications(publications)
 
@@ -397,7 +396,7 @@ class Recorder:
         return full or (part_s > 0.0 and time.monotonic() - self._part_since >= part_s)
 
     def _split(self) -> None:
-        """Go on in a new part; the snapshot that is written next makes it self-contained."""
+        """Go on in a new part; the snapshot that comes next makes it self-contained."""
         with self._lock:
             lost = dict(self._lost)
         self._writer.split(lost, self._limits[2])
@@ -406,7 +405,7 @@ class Recorder:
             try:
                 self._dump(self._ring, self._mark, lost)
                 self._marks += 1
-            except (OSError, RecordingError) as error:  # the ring goes on
+            except (OSError, RecordingError) as error:  # the ring stays in memory
                 self._marks_lost += 1
                 self._mark_error = f"{self._mark}: the last {self._ring_s:g} s not written: {error}"
                 if self._on_error is not None:
@@ -418,14 +417,14 @@ class Recorder:
 
         try:
             ring.dump(folder, lost)
-        except TakenError:  # another process was quicker
+        except TakenError:  # another process has made that folder
             in_free_folder(self._folder, lambda other: ring.dump(other, lost))
 
     def _flush(self) -> str | None:
         self._writer.flush()
         self._unflushed.clear()
         reason = self._writer.reason_to_stop()
-        if reason is not None:  # its folder may be gone too: there is no disk to ask
+        if reason is not None:  # the folder may be gone too, and with it the disk to ask
             return reason
         if self._part_is_full():
             self._split_due = True
@@ -438,7 +437,7 @@ class Recorder:
         return None
 
     def _pause(self, reason: str) -> None:
-        """Take nothing in until the disk has room again; what is queued or not yet safe is lost."""
+        """Refuse items until the disk has room again; those that are queued or not yet safe are lost."""
         with self._lock:
             first = not self._paused
             self._paused = reason
@@ -456,7 +455,7 @@ class Recorder:
             self._on_error(error)
 
     def _give_up(self, reason: str, unsafe: Mapping[str, int] = MappingProxyType({})) -> None:
-        """Stop taking in, count as lost what is queued and what is `unsafe`, by topic, and say so once."""
+        """Refuse items from now on, count the queued and the `unsafe` ones as lost, and report the reason once."""
         first = self._error is None
         with self._lock:
             self._accepting, self._paused = False, None
@@ -474,7 +473,7 @@ def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np
     return np.array(sequence, np.int64), np.array(log_time_ns, np.int64)
 
 
-# tuples: made four thousand times a second, in a quarter of the time of a frozen class
+# tuples are made in a quarter of the time of a frozen class, four thousand times a second
 class _EntryItem(NamedTuple):
     """A journal entry on its way to the file."""
 
@@ -510,7 +509,7 @@ class _OutputItem(NamedTuple):
 
 
 class _PublicationItem(NamedTuple):
-    """A publication, all of whose messages are on their way to the file; `keys`: what is lost with it."""
+    """A publication on its way to the file with all its messages; `keys` are the topics that are lost with it."""
 
     sequence: int
     log_time_ns: int

@@ -1,4 +1,4 @@
-"""What a replay found."""
+"""The result of a replay."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from plow_twin.record.reader import FileStatus
 
 @dataclass(frozen=True)
 class Divergence:
-    """A difference: at advance number `step` (from 0), on `topic`, in `field`, recorded against computed."""
+    """A difference between recording and replay at advance number `step` (from 0), on `topic`, in `field`."""
 
     step: int
     stamp_ns: int
@@ -29,11 +29,11 @@ class Divergence:
 
 @dataclass
 class ReplayReport:
-    """What a replay found. `compared` and `not_compared` count messages by base name of their topic.
+    """The result of a replay. `compared` and `not_compared` count messages by base name of their topic.
 
-    `inputs` counts what came, by input, used and not used. `repeated` counts entries that stand there more than once;
-    `repeated_parts` names files that hold a part once more, which are not read, each with the file that is;
-    `foreign_parts` those of another run, which are not read either, each with what differs in its header.
+    `inputs` counts messages by input and outcome. `repeated` counts entries that the files hold more than once.
+    `repeated_parts` names files that repeat a part, each with the file that is read instead; `foreign_parts` files of
+    another run, each with the keys of its header that differ. Neither are read.
     """
 
     path: Path
@@ -66,15 +66,15 @@ class ReplayReport:
 
     @property
     def loss(self) -> bool:
-        """Something of the run is missing in the file, or nothing in it could be compared."""
+        """Whether a part of the run is missing in the file, or nothing in it could be compared."""
         return bool(self.lost) or self.status is not FileStatus.COMPLETE or self.nothing
 
     @property
     def nothing(self) -> bool:
-        """Nothing in the file could be compared."""
+        """Whether nothing in the file could be compared."""
         return self.messages_compared + self.digests_compared == 0
 
     @property
     def exit_code(self) -> int:
-        """0: the same, bit for bit; 1: diverged; 3: the same as far as the file goes, with loss."""
+        """0: equal bit for bit; 1: diverged; 3: equal as far as the file goes, with loss."""
         return 1 if self.first_divergence is not None else 3 if self.loss else 0

@@ -1,4 +1,4 @@
-"""The newest seconds of a run, kept in memory as whole parts of a recording and written to a folder when asked."""
+"""The newest seconds of a run, kept in memory as parts of a recording and written to a folder on request."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from plow_twin.record.mcap_file import ByteFile
 from plow_twin.record.metadata_yaml import PartFacts, bag_metadata, write_metadata
 from plow_twin.record.writer import RunWriter, make_folder
 
-#: The ring is dropped in such shares.
+#: Number of parts of a full ring; the oldest is dropped as a whole.
 PARTS: Final = 8
 
 
 class RingWriter(RunWriter):
-    """A recording in memory of which the oldest parts are dropped.
+    """A recording in memory that drops its oldest parts.
 
     Parameters
     ----------
     folder
-        Names the recording; nothing is made there.
+        Name of the recording; the folder is not made.
     ring_s
-        Time that is kept at least, once it has passed [s]; up to an eighth more.
+        Least time that is kept [s]; up to an eighth more.
     sync_dumps
         Whether `dump` waits for the disk.
     """
@@ -43,7 +43,7 @@ class RingWriter(RunWriter):
         sync_dumps: bool = False,
     ) -> None:
         self._ring_s, self._sync_dumps = ring_s, sync_dumps
-        self._kept: list[tuple[float, PartFacts, bytes]] = []  # when each began, and what it holds
+        self._kept: list[tuple[float, PartFacts, bytes]] = []  # start and content of each part
         self._begun = time.monotonic()
         super().__init__(folder, header, chunk_size, min_free_bytes)
         self.path = folder
@@ -56,7 +56,7 @@ class RingWriter(RunWriter):
 
     @property
     def bytes_written(self) -> int:
-        """Size of what is kept [B]."""
+        """Size of the parts in memory [B]."""
         return sum(len(content) for _, _, content in self._kept) + self.part_bytes
 
     def shortage(self) -> str | None:
@@ -64,7 +64,7 @@ class RingWriter(RunWriter):
         return None
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
-        """Go on in a new part, and drop what is older than the ring is long."""
+        """Go on in a new part and drop the parts that are older than the ring is long."""
         old = self._part
         super().split(loss, 0)
         assert isinstance(old.file.out, MemoryFile)
@@ -74,17 +74,17 @@ class RingWriter(RunWriter):
             self._kept.pop(0)
 
     def dump(self, folder: Path, loss: Mapping[str, int]) -> None:
-        """Write all parts that have ended to a new folder, and forget them.
+        """Write all parts that have ended to a new folder and drop them.
 
         Raises
         ------
         TakenError
             Another recording is there.
         OSError, RecordingError
-            It could not be written; the ring is as it was.
+            It cannot be written; the ring stays as it is.
         """
         make_folder(folder)
-        with ExitStack() as undone:  # half a ring is none
+        with ExitStack() as undone:  # remove an incomplete ring
             undone.callback(_remove, folder)
             self._dump(folder, loss, undone)
             undone.pop_all()
@@ -93,7 +93,7 @@ class RingWriter(RunWriter):
         self._kept = []
 
     def _dump(self, folder: Path, loss: Mapping[str, int], undone: ExitStack) -> None:
-        """Write to a folder; what is to be removed, should that fail, is noted."""
+        """Write to a folder, and list the files to remove if that fails."""
         shortage = self._shortage(folder)
         if shortage is not None:
             raise RecordingError(shortage)
@@ -115,18 +115,18 @@ class RingWriter(RunWriter):
         write_metadata(folder, bag_metadata(facts, lost), sync=self._sync_dumps)
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
-        """Let go what is kept."""
+        """Free the memory."""
         self._kept = []
 
 
 def _remove(folder: Path) -> None:
-    """Remove a folder, unless something is in it."""
+    """Remove a folder if it is empty."""
     with suppress(OSError):
         folder.rmdir()
 
 
 class MemoryFile:
-    """A file that is never written to a disk."""
+    """A file in memory."""
 
     def __init__(self) -> None:
         self.content = bytearray()

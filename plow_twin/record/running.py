@@ -1,4 +1,4 @@
-"""Which recording is being written now."""
+"""Finding the recording that is being written now."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
     Raises
     ------
     RecordingError
-        There is none at all.
+        There is no recording.
     """
     found = running_run(path, wait_s, stop)
     if found is None and not path.exists():
@@ -29,7 +29,7 @@ def find_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False
 def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: False) -> Path | None:
     """Return the recording at `path`, or the one beside it (`<path>_2`, ...), that is being written.
 
-    None when there is none within `wait_s` [s] or before `stop` is true.
+    None when no recording is written within `wait_s` [s], or before `stop` is true.
     """
     deadline = time.monotonic() + wait_s
     while True:
@@ -40,7 +40,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
                     claimed = is_claimed(stream.fileno())
                 if claimed and read_header(parts[0]) is not None:
                     return candidate
-            except (RecordingError, OSError):  # not begun yet, or just removed
+            except (RecordingError, OSError):  # not begun yet, or removed just now
                 continue
         if stop() or time.monotonic() >= deadline:
             return None
@@ -48,7 +48,7 @@ def running_run(path: Path, wait_s: float, stop: Callable[[], bool] = lambda: Fa
 
 
 def _candidates(path: Path) -> list[Path]:
-    """Return `path` and the folders that a recorder makes when it is taken, the newest first."""
+    """Return `path` and the folders `<path>_2`, ... that a recorder makes when it exists, the newest first."""
     numbered: list[tuple[int, Path]] = [(1, path)]
     if path.parent.is_dir():
         for other in path.parent.glob(f"{path.name}_*"):

@@ -1,7 +1,7 @@
-"""Anybody's recording as a stream of messages: MCAP and rosbag2's sqlite3, files or folders of parts, and CSV.
+"""Any recording as a stream of messages: MCAP and rosbag2's sqlite3, files or folders of parts, and CSV.
 
-Messages come in the order in which they were written. What cannot be read is counted, not raised: a file is read as far
-as it goes. Only some chunks are in memory at a time.
+Messages come in the order in which they were written. Unreadable messages are counted and passed over: a file is read
+as far as it goes. Only some chunks are in memory at a time.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ _ROWS: Final = 1000
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
-#: What a damaged file makes of sqlite3: its own errors, texts of them that are no UTF-8, cells of impossible length.
+#: Errors of sqlite3 with a damaged file: its own, messages that are not UTF-8, cells of impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """What stands in for a type where messages are lines: the names of their columns, or keys of the first one."""
+    """The type of a topic whose messages are lines: the names of their columns, or the keys of the first line."""
 
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the names as a reader may tell them apart, whatever is in them; numbers are hardly names."""
+        """Return the names in a form to read; names that are numbers hint at a missing header row."""
         names = ", ".join(ascii(name) if "," in name or not name.isprintable() else name for name in self.names)
         numbers = bool(self.names) and all(NUMBER.fullmatch(name.strip()) for name in self.names)
         return f"columns {names}" + (" (no header row?)" if numbers else "")
@@ -56,27 +56,27 @@ class Arrived:
     """A message: topic, when it was received [ns], and its fields by path (`wrench.force.x`)."""
 
     topic: str
-    #: `NO_TIME`: not known
+    #: `NO_TIME` where it is unknown
     log_time_ns: int
     content: Any
-    #: a broker had kept it from before anybody listened
+    #: whether the broker had kept it from before the subscription
     retained: bool = False
-    #: messages before it are not there: a part is missing, or damaged
+    #: whether messages before it are missing: a part is absent or damaged
     after_hole: bool = False
 
 
 @dataclass
 class Losses:
-    """What of a recording could not be used, by reason, and the topics whose type is unknown."""
+    """Messages of a recording that were not used, by reason, and the topics of unknown type."""
 
     counts: Counter[str] = field(default_factory=Counter)
     unknown_types: dict[str, str] = field(default_factory=dict)
 
 
 class Source(Protocol):
-    """A recording: `wanted` is asked for each topic whether its messages shall be decoded.
+    """A recording; only messages of topics for which `wanted` is true are decoded.
 
-    Where topics are files of their own, their messages are put in order by `stamp_ns`.
+    Messages of topics in files of their own are put in order by `stamp_ns`.
     """
 
     losses: Losses
@@ -94,7 +94,7 @@ def open_source(path: Path) -> Source:
     Raises
     ------
     RecordingError
-        There is none that can be read.
+        There is no recording that can be read.
     """
     if path.is_dir():
         missing = [Path(name) for name in missing_files(path)]
@@ -125,13 +125,13 @@ def open_source(path: Path) -> Source:
 
 
 def packed(path: Path) -> str:
-    """Return what to say about files that rosbag2 has compressed as a whole, if there are any."""
+    """Return a hint at files that rosbag2 has compressed as a whole; empty without one."""
     files = sorted(path.glob("*.zstd")) if path.is_dir() else [path] if path.suffix == ".zstd" else []
     return f" ({files[0].name} is compressed as a whole: unpack it with zstd -d)" if files else ""
 
 
 def _decompressed(data: bytes) -> bytes:
-    """Return a message of a bag whose messages are compressed one by one; nothing where it is damaged."""
+    """Return a message of a bag whose messages are compressed one by one; no bytes for a damaged one."""
     import zstandard
 
     try:
@@ -143,7 +143,7 @@ def _decompressed(data: bytes) -> bytes:
 
 
 class Decoder:
-    """CDR to messages: the types of ROS 2 Jazzy, and those whose schema the recording brings."""
+    """Decoder of CDR: the types of ROS 2 Jazzy, and those whose schema stands in the recording."""
 
     def __init__(self, losses: Losses) -> None:
         from rosbags.typesys import Stores, get_typestore
@@ -152,7 +152,7 @@ class Decoder:
         self._store = get_typestore(Stores.ROS2_JAZZY)
 
     def knows(self, topic: str, message_type: str, schema: str = "") -> bool:
-        """Tell whether a type can be decoded; one that cannot is noted."""
+        """Return whether a type can be decoded; other types are noted as unknown."""
         from rosbags.typesys import get_types_from_msg
 
         if message_type not in self._store.types and schema:
@@ -167,14 +167,14 @@ class Decoder:
         return False
 
     def reads(self, channel: Channel) -> bool:
-        """Tell whether a channel of MCAP can be decoded; one that cannot is noted, with its encoding."""
+        """Return whether an MCAP channel can be decoded; others are noted as unknown with their encoding."""
         if channel.encoding != "cdr":
             self._losses.unknown_types[channel.topic] = f"{channel.message_type} encoded as {channel.encoding}"
             return False
         return self.knows(channel.topic, channel.message_type, channel.schema.decode(errors="replace"))
 
     def decode(self, data: bytes, message_type: str) -> Any | None:
-        """Return a message, or None (counted) when the bytes do not hold one."""
+        """Return a message, or None for bytes that cannot be decoded, which are counted."""
         if data.startswith(_ZSTD_MAGIC):
             data = _decompressed(data)
         for end in (len(data), len(data) - 8):  # rclpy adds 8 stray bytes behind a last empty float64[]
@@ -187,7 +187,7 @@ class Decoder:
 
 
 def _behind_holes(parts: Sequence[Path], missing: Sequence[Path]) -> set[Path]:
-    """Return the parts before which some are missing."""
+    """Return the parts before which others are missing."""
     order = sorted((*parts, *missing), key=part_number)
     return {part for before, part in pairwise(order) if before in missing}
 
@@ -250,7 +250,7 @@ class McapSource:
 
 
 class SqliteSource:
-    """Files of rosbag2's sqlite3 storage, of a recording without the files `missing`; a damaged one is left out."""
+    """Files of rosbag2's sqlite3 storage, of a recording without the files `missing`; damaged ones are left out."""
 
     def __init__(self, parts: list[Path], missing: Sequence[Path] = ()) -> None:
         self.parts = sorted(parts, key=part_number)
@@ -260,14 +260,14 @@ class SqliteSource:
         self._behind_holes = _behind_holes(parts, missing)
 
     def _open(self, path: Path) -> sqlite3.Connection:
-        log = path.with_name(path.name + "-wal")  # of a recorder that was killed: what it wrote last
+        log = path.with_name(path.name + "-wal")  # the last messages of a killed recorder
         kept = log.is_file() and log.stat().st_size > 0
         place = quote(path.resolve().as_posix())
         connection = sqlite3.connect(f"file:{place}?mode=ro" + ("" if kept else "&immutable=1"), uri=True)
         if kept:
             try:
                 connection.execute("SELECT 1 FROM sqlite_master")
-            except sqlite3.OperationalError:  # its place takes no file to share the log by
+            except sqlite3.OperationalError:  # a read-only place: the log cannot be shared
                 connection.close()
                 connection = sqlite3.connect(f"file:{place}?mode=ro&immutable=1", uri=True)
                 self._unread.add(path)
@@ -281,7 +281,7 @@ class SqliteSource:
         Raises
         ------
         RecordingError
-            None of the files can be read.
+            No file can be read.
         """
         found: dict[str, str] = {}
         for part in self.parts:
@@ -388,7 +388,7 @@ class CsvSource:
 
 
 def read_table(path: Path) -> tuple[Columns, list[list[str]]]:
-    """Return the columns of a CSV file and its rows, as `CsvSource` takes them; lines that begin with `#` are none.
+    """Return the columns of a CSV file and its rows, as `CsvSource` reads them; lines that begin with `#` are left out.
 
     Raises
     ------
@@ -425,5 +425,5 @@ def _log_time_ns(arrived: Arrived) -> int | None:
 
 
 def _row_time_ns(cell: str) -> int:
-    """Return the time of a row for its place among those of other files: a number too large for s counts finer."""
+    """Return the time of a row, by which files are merged: a number too large for s is in a smaller unit."""
     return next((found for unit in STAMP_UNITS if (found := time_ns(cell, unit)) is not None), NO_TIME)

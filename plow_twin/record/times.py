@@ -6,30 +6,29 @@ import re
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-#: Columns and keys that hold the time where the mapping names none.
+#: Columns and keys that hold the time unless the mapping names others.
 TIMES: Final = ("t", "time")
 #: Units of a time, in ns.
 STAMP_UNITS: Final = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-#: Of a message that has no time [ns].
+#: Time of a message without one [ns].
 NO_TIME: Final = -1
 NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", re.IGNORECASE)
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
-#: Times below this are no times of the epoch, but count from some start [s]: they are moved away from 0, which stands
-#: for a missing stamp.
+#: Times below this [s] count from some start and are moved away from 0, which stands for a missing stamp.
 EPOCH_S: Final = 1e9
 _ORIGIN_NS: Final = 1_000_000_000
-#: Years of the epoch's other end: 9999-12-31 stands for no date in many a database.
+#: Dates beyond this are placeholders: many databases write 9999-12-31 for no date.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
 
 def time_ns(value: Any, unit: str = "s") -> int | None:
-    """Return the stamp [ns] that a number, or a text after ISO 8601 (UTC unless it says otherwise), stands for.
+    """Return the stamp [ns] of a number or of a text in ISO 8601 (UTC unless it says otherwise).
 
-    None when it stands for none.
+    None for any other value.
     """
     if isinstance(value, str):
         value = value.strip()
-        # a number first: 20260102 would be a date too
+        # a number first: 20260102 is a date too
         if value.isascii() and value.isdigit() and len(value) < 20:
             value = int(value)
         elif NUMBER.fullmatch(value):
@@ -39,7 +38,7 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e19:
         return None
     scale = STAMP_UNITS[unit]
-    # integers keep their nanoseconds; a float of today's date holds some 0.2 us
+    # integers keep their nanoseconds; a float resolves today's date to 0.2 us
     stamp_ns = _within(value * scale if isinstance(value, int) else round(value * scale))
     return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
 

@@ -1,4 +1,4 @@
-"""What came on the inputs of a run, by its journal: how much was used, and how much was not, why and from whom."""
+"""Messages at the inputs of a run, by its journal: those used, and those not used with reason and sender."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose, Sample, Trav
 
 @dataclass
 class InputCounts:
-    """Messages by input and by what became of them: `used`, or a reason of `Unused`.
+    """Counts of messages by input and outcome: `used`, or a reason of `Unused`.
 
-    What the followed publisher of `source` has sent is the sum of its counts, but for `not_followed`.
+    The sum of the counts of `source` without `not_followed` is the number that its publisher has sent.
     """
 
     source: str
@@ -54,14 +54,14 @@ class InputCounts:
 
 
 def unused_messages(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield each message that the journal of a run says was not used: input, sender, reason, stamp, values.
+    """Yield each message that a run did not use, by its journal: input, sender, reason, stamp, values.
 
-    Those of one line of the journal of which only the count is known come last, with a `count` and no stamp.
+    Messages of which the journal has only the number come last, as one row with a `count` and no stamp.
 
     Raises
     ------
     RecordingError
-        There is no recording of ours, or its journal cannot be understood.
+        There is no recording of plow_twin, or its journal cannot be decoded.
     """
     for batch in RunReader(path).batches(outputs=False):
         for _, entry in sorted(batch.entries.others.items()):

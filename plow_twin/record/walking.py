@@ -1,6 +1,6 @@
-"""Many samples at a time through a session: of a run's journal, or of a load from anybody's recording.
+"""Many samples at a time through a session: from the journal of a run, or from the load of any recording.
 
-Nothing is held for want of samples: time is that of the stamps, a load runs straight from one to the next.
+Time is that of the stamps, and the load is linear from one sample to the next: no load is held.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 #: Samples advanced together.
 BATCH: Final = 4096
-#: Entries that a walk of a journal acts on; across all others late samples are put in their places.
+#: Entries that change the walk of a journal; late samples are sorted in across all others.
 _ACTING: Final = (Travel, Reset, Loss, Restore, Snapshot, SetModel, SetWear)
 #: Failed advances in a row after which the model is reset.
 _FAILURE_LIMIT: Final = 10
@@ -34,7 +34,7 @@ _FAILURE_LIMIT: Final = 10
 
 @dataclass(frozen=True)
 class Walked:
-    """Some advances: stamps (n,) [ns], wrench (n, 3), the rows of the model, and what would be published after each."""
+    """Some advances: stamps (n,) [ns], wrench (n, 3), the rows of the model, and the publication after each."""
 
     stamp_ns: NDArray[np.int64]
     wrench: NDArray[np.float64]
@@ -42,21 +42,21 @@ class Walked:
     publications: Publications
     #: signed speed along the face [m/s]
     speed_m_s: float
-    #: with the changes of the model so far
+    #: scene with all changes of the model so far
     scene: Scene
 
 
 class Walker:
-    """Advance a session by many samples at a time, write its journal and outputs, and hand the rows on.
+    """Advance a session by many samples at a time, write its journal and outputs, and pass the rows on.
 
     Parameters
     ----------
     session
-        The session; nobody else may apply entries.
+        The session, which only the walker changes.
     on_walked
         Receives the rows of each batch.
     writer
-        Where journal and outputs are written, or None.
+        Writer of journal and outputs, or None.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Walker:
         self._sequence = -1
         self._advances = 0
         self._log_time_ns = 0
-        #: advances that the solver could not make
+        #: failed advances
         self.failures = 0
         #: called after each reset of the motion
         self.on_reset: Callable[[], object] = lambda: None
@@ -76,7 +76,7 @@ class Walker:
         self._opening: Snapshot | None = session.snapshot()
 
     def _open(self, log_time_ns: int) -> None:
-        """Begin the journal with the state at the start, received with what comes first."""
+        """Begin the journal with the state at the start, at the receive time of the first entry."""
         opening, self._opening = self._opening, None
         if opening is not None:
             self._sequence += 1
@@ -90,7 +90,7 @@ class Walker:
             self._writer.write_entry(self._sequence, self._log_time_ns, entry)
 
     def apply(self, entry: Entry, log_time_ns: int = 0) -> None:
-        """Apply an entry that is no sample."""
+        """Apply an entry other than a sample."""
         self._log_time_ns = log_time_ns or self._log_time_ns
         self._entry(entry)
         self.session.apply(entry)
@@ -98,7 +98,7 @@ class Walker:
             self.on_reset()
 
     def samples(self, stamp_ns: NDArray[np.int64], wrench: NDArray[np.float64], log_time_ns: NDArray[np.int64]) -> None:
-        """Apply samples of stamps that do not fall."""
+        """Apply samples whose stamps do not fall."""
         for begin in range(0, len(stamp_ns), BATCH):
             part = slice(begin, begin + BATCH)
             self._walk(stamp_ns[part], wrench[part], log_time_ns[part])
@@ -155,21 +155,21 @@ class Walker:
 
 
 class JournalWalk:
-    """The journal of a run through walkers of the run's scene and of others; nothing is held.
+    """Pass the journal of a run through walkers of its scene and of other scenes.
 
-    `used` and `late` count samples; a late one stands where its stamp puts it, if the walkers have not passed that.
-    `missing` counts entries that are not there: after them a new stretch begins.
+    `used` and `late` count samples; a late one is sorted in by its stamp unless the walkers have passed it. `missing`
+    counts entries that the journal lacks: after them a new stretch begins.
 
     Parameters
     ----------
     own
-        Walkers that take over states from the journal: after a loss, and wear that was set.
+        Walkers that restore states of the journal: after a loss, and wear that was set.
     others
-        Walkers that go on from states of their own.
+        Walkers that keep their own states.
     whole
-        Whether the journal begins with the run: else its first snapshot is taken over.
+        Whether the journal begins with the run; otherwise its first snapshot is restored.
     same_scene
-        Whether `own` are of the run's scene: they follow changes of the model and motions that were restored.
+        Whether `own` have the scene of the run: then they follow changes of the model and restored motions.
     """
 
     def __init__(
@@ -177,7 +177,7 @@ class JournalWalk:
     ) -> None:
         self._own, self._all = own, (*own, *others)
         self._same = own if same_scene else ()
-        #: speeds whose stamps have not been reached, by these
+        #: speeds by their stamps, which have not been reached
         self._travels: list[Travel] = []
         self._lost = not whole
         self._reached_ns = -1
@@ -185,7 +185,7 @@ class JournalWalk:
         self._holes = Holes()
 
     def add(self, entries: Entries) -> None:
-        """Take in entries."""
+        """Process entries."""
         begin = 0
         for place, count in self._holes.take(entries).items():
             self._whole(entries[begin:place])
@@ -194,7 +194,7 @@ class JournalWalk:
         self._whole(entries[begin:])
 
     def _hole(self, count: int) -> None:
-        """Begin a new stretch: a load is not drawn over what is not there."""
+        """Begin a new stretch: no load is interpolated over missing entries."""
         self.missing += count
         self._entry(Loss(count))
 
@@ -216,7 +216,7 @@ class JournalWalk:
         stamps, wrench = stamps[order], wrench[order]
         while len(stamps):
             count = len(stamps)
-            if self._travels:  # what was sent ahead of its time acts from its stamp on
+            if self._travels:  # a speed sent ahead of its time acts from its stamp on
                 count = int(np.searchsorted(stamps, self._travels[0].stamp_ns, "right"))
             if count:
                 self._reached_ns = int(stamps[count - 1])
@@ -232,7 +232,7 @@ class JournalWalk:
             walker.apply(Travel(max(0, self._reached_ns), speed_m_s))  # at once
 
     def _begin_anew(self) -> None:
-        """Forget the time reached: the next stamp may be any; speeds that were to come act from now on."""
+        """Forget the time reached: any stamp may come next; speeds ahead of their time act from now on."""
         for travel in self._travels:
             self._speed(travel.speed_m_s)
         self._travels, self._reached_ns = [], -1

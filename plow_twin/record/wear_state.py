@@ -1,4 +1,4 @@
-"""The wear of a head's pads on disk: it outlives the process, and belongs to one head in one slide."""
+"""The file with the wear of the pads of one head in one slide, which outlives the process."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.durable import write_whole
 
-#: The file in the folder that the user names.
+#: Name of the file in the folder of the user.
 FILE_NAME: Final = "wear.json"
 VERSION: Final = 1
 
 
 class WearStateError(PlowTwinError, ValueError):
-    """A file of wear cannot be used; the message says which and why."""
+    """A file of wear cannot be used; the message names it and the reason."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class WearState:
 
 
 def scene_identity(scene: Scene) -> str:
-    """Return a hash of what makes a pad's depth comparable: frame, clearance, head, and the initial depths.
+    """Return a hash of the numbers that define the pads: frame, clearance, head, and the initial depths.
 
-    Loads, contact parameters and the wear coefficient may change: the pads stay the same.
+    Loads, contact parameters and the wear coefficient may change for the same pads.
     """
     numbers = (
         *(scene.frame.width_m, scene.frame.height_m),
@@ -51,14 +51,14 @@ def scene_identity(scene: Scene) -> str:
 
 
 def check_depth(depth_m: Sequence[float], scene: Scene) -> None:
-    """Raise a `ValueError` for a depth that no pad of a scene's frame can have lost."""
+    """Raise a `ValueError` for a depth that is impossible for the frame of a scene."""
     most = 0.5 * min(scene.frame.width_m, scene.frame.height_m)
     if not all(0.0 <= depth <= most for depth in depth_m):
         raise ValueError(f"got {list(depth_m)}, expected depths from 0 to half the frame's smaller side, {most:g} m")
 
 
 def read_wear(folder: Path) -> bytes | None:
-    """Return what the file in a folder holds, or None when there is none.
+    """Return the content of the file in a folder, or None without a file.
 
     Raises
     ------
@@ -75,12 +75,12 @@ def read_wear(folder: Path) -> bytes | None:
 
 
 def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[float, ...]:
-    """Return the depths [m] that the content of a file holds.
+    """Return the depths [m] in the content of a file.
 
     Raises
     ------
     WearStateError
-        It is damaged, or that of another head or scene.
+        It is damaged, or belongs to another head or scene.
     """
     state = _parse(content, path)
     for name, got, expected in (("head", state.head, head), ("scene", state.scene, scene_identity(scene))):
@@ -97,12 +97,12 @@ def parse_wear(content: bytes, path: Path, head: str, scene: Scene) -> tuple[flo
 
 
 def claim_folder(folder: Path) -> int:
-    """Make sure that no other twin keeps its wear in a folder, as long as the descriptor returned is open.
+    """Lock a folder against other twins as long as the returned descriptor is open.
 
     Raises
     ------
     WearStateError
-        No file can be written there, or another twin keeps its wear there: two would overwrite each other's.
+        No file can be written there, or another twin keeps its wear there.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ def _unwritable(folder: Path, error: OSError) -> WearStateError:
 
 
 def wear_content(state: WearState) -> bytes:
-    """Return what a file of that wear, saved now, holds."""
+    """Return the content of a file with that wear, saved now."""
     record = {
         "version": VERSION,
         "head": state.head,
@@ -144,12 +144,12 @@ def wear_content(state: WearState) -> bytes:
 
 
 def save_wear(folder: Path, content: bytes) -> None:
-    """Write a file so that after a crash at any time it is the old one or the new one, whole.
+    """Write the file in one step: after a crash it is the old or the new one, whole.
 
     Raises
     ------
     OSError
-        The disk does not take it; the file is the old one, or the new one when the disk does not answer for it.
+        The disk refuses it; the file is the old one, or the new one that the disk does not confirm.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / FILE_NAME, content, sync=True)

@@ -1,4 +1,4 @@
-"""Eight bytes at any place of an array as one number inside compiled code: messages begin anywhere.
+"""Access to eight bytes at any place of an array as one number, for compiled code.
 
 Numbers are little-endian, as in MCAP and in the CDR that is written here.
 """
@@ -23,7 +23,7 @@ def _place(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
 
 
 def _word(typingctx: Any, data: Any, place: Any) -> Any:
-    """Return the eight bytes from byte `place` of a contiguous array on as an int64; nothing is checked."""
+    """Return the eight bytes from byte `place` of a contiguous array on as an int64, unchecked."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(_place(context, builder, signature, arguments), align=1)
@@ -32,7 +32,7 @@ def _word(typingctx: Any, data: Any, place: Any) -> Any:
 
 
 def _set_word(typingctx: Any, data: Any, place: Any, value: Any) -> Any:
-    """Write an int64 to the eight bytes from byte `place` of a contiguous array on; nothing is checked."""
+    """Write an int64 to the eight bytes from byte `place` of a contiguous array on, unchecked."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         number = context.cast(builder, arguments[2], signature.args[2], types.int64)
@@ -52,7 +52,7 @@ def _bits(typingctx: Any, number: Any) -> Any:
 
 
 def _fetch(typingctx: Any, data: Any, place: Any) -> Any:
-    """Have the cache line of byte `place` of a contiguous array fetched; it need not be there."""
+    """Prefetch the cache line of byte `place` of a contiguous array, which may be outside of it."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         pointer, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
@@ -61,7 +61,7 @@ def _fetch(typingctx: Any, data: Any, place: Any) -> Any:
             builder.module, kind, "llvm.prefetch.p0"
         )
         here = builder.bitcast(_place(context, builder, signature, arguments), pointer)
-        # to be read, into all caches, data
+        # for reading, into all caches, data
         builder.call(prefetch, [here, flag(0), flag(3), flag(1)])
         return context.get_dummy_value()
 
@@ -69,7 +69,7 @@ def _fetch(typingctx: Any, data: Any, place: Any) -> Any:
 
 
 def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
-    """Return 0 when the 64 bytes from byte `place` of a contiguous array on are those at an address in memory."""
+    """Return 0 if the 64 bytes from byte `place` of a contiguous array on equal those at an address."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         vector = ir.VectorType(_WORD, 8)
@@ -86,7 +86,7 @@ def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
 
 
 def _word_at(typingctx: Any, address: Any) -> Any:
-    """Return the eight bytes at an address in memory as an int64."""
+    """Return the eight bytes at an address as an int64."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.load(builder.inttoptr(arguments[0], _WORD.as_pointer()), align=8)

@@ -29,7 +29,7 @@ from plow_twin.stream.journal import Digest, Entry, Sample
 from plow_twin.stream.outputs import Publication, Publications
 from plow_twin.stream.topics import TOPICS
 
-#: Folder in a run's folder with what was recorded beside it; further ones are `beside_2`, ...
+#: Folder of other topics in the folder of a run; further ones are `beside_2`, ...
 BESIDE: Final = "beside"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 Made = TypeVar("Made")
@@ -55,22 +55,22 @@ class _Part:
 
 
 class RunWriter:
-    """Write entries and outputs in the order given.
+    """Writes entries and outputs in the order of the calls.
 
-    The journal and the outputs stand in chunks of their own, a chunk of the journal before that of what was sent after
-    its entries. Every method may raise `OSError` (disk full). After a `flush` or a write that did, the file is whole up
-    to what was flushed before and can be written on; after any other method only `abandon` may be called.
+    Journal and outputs have chunks of their own; the chunk of entries comes before that of the outputs sent after them.
+    Every method may raise `OSError` (disk full). After a failed `flush` or write the file is whole up to the flush
+    before and can be written on; after any other failed method only `abandon` may be called.
 
     Parameters
     ----------
     folder
-        Made by the writer; must not exist or be empty.
+        Folder to make; it must not exist or be empty.
     chunk_size
         Bytes [B] of journal and outputs at which their chunks are closed.
     min_free_bytes
-        `shortage` speaks up when the disk has less free space [B] than that.
+        Least free space on the disk [B], below which `shortage` returns a text.
     sync
-        Whether each flush waits for the disk, and so do parts that begin and end, with their folder.
+        Whether each flush, and the begin and end of each part, wait for the disk.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class RunWriter:
         return self._part.file.size
 
     def write_entry(self, sequence: int, log_time_ns: int, entry: Entry | Dropped) -> None:
-        """Write one journal entry under its place in the common order."""
+        """Write a journal entry with its sequence number."""
         topic = self.header.entries_topic
         if isinstance(entry, Sample | Digest):
             topic = self.header.samples_topic if isinstance(entry, Sample) else self.header.digests_topic
@@ -168,7 +168,7 @@ class RunWriter:
     def write_sent(
         self, sequence: Indexes, log_time_ns: Indexes, stamp_ns: Indexes, sent: Sequence[Mapping[str, bytes]]
     ) -> None:
-        """Write what was sent of publications: journal entry before, log time, stamp [ns], bytes by base name."""
+        """Write publications that were sent: entry before them, log time, stamp [ns], bytes by base name."""
         channels = self._part.sent
         if not channels:
             for name, template in self._templates.items():
@@ -186,7 +186,7 @@ class RunWriter:
         self._close_full_chunks()
 
     def write_output(self, topic: str, sequence: int, log_time_ns: int, stamp_ns: int, message: Message) -> None:
-        """Write one message that the node sent after journal entry number `sequence`."""
+        """Write a message that the node sent after journal entry number `sequence`."""
         self._write(self._outputs, topic, sequence, log_time_ns, stamp_ns, message)
 
     def _write(
@@ -218,32 +218,32 @@ class RunWriter:
             self._part.file.chunk(self._journal)
             self._part.file.chunk(self._outputs)
         except OSError:
-            self._outputs.clear()  # without the journal's chunk they are of no use
+            self._outputs.clear()  # useless without the chunk of the journal
             raise
 
     def flush(self) -> None:
-        """Hand all that was written to the operating system; a killed process loses nothing of it."""
+        """Hand all bytes to the operating system: they survive a kill of the process."""
         self._close_chunks()
         if self._sync:
             self._part.file.sync()
 
     def reason_to_stop(self) -> str | None:
-        """Return why recording should end now for good: its file is gone."""
+        """Return why recording must end for good, or None."""
         if not self._part.file.is_linked():
             return "the file was removed or replaced"
         return None
 
     def shortage(self) -> str | None:
-        """Return what is wrong with the space on the disk, if anything: the end of the file must have room, too."""
+        """Return a text when the disk has too little free space for the end of the file, or None."""
         return self._shortage(self.folder)
 
     def _shortage(self, folder: Path) -> str | None:
         return shortage(folder, self._min_free_bytes)
 
     def split(self, loss: Mapping[str, int], keep_bytes: int = 0) -> None:
-        """Go on in a new part, which is opened before the old one is closed.
+        """Go on in a new part, opened before the old one is closed.
 
-        Whoever asks must write a snapshot next. With `keep_bytes` the oldest parts are removed while all are larger.
+        The caller must write a snapshot next. With `keep_bytes` the oldest parts are removed while all are larger.
         """
         self._close_chunks()
         old, self._number = self._part, self._number + 1
@@ -269,7 +269,7 @@ class RunWriter:
         self._done.append(part.facts())
 
     def close(self, loss: Mapping[str, int], stop_reason: str | None = None) -> None:
-        """Write the loss counters, why recording ended before the run (if it did), the index and `metadata.yaml`."""
+        """Write the loss counters, the reason of an early end, the index and `metadata.yaml`."""
         record = {topic: str(count) for topic, count in loss.items()}
         custom: dict[str, str] = {f"plow_twin_lost {topic}": count for topic, count in record.items()}
         if stop_reason is not None:
@@ -280,25 +280,25 @@ class RunWriter:
         write_metadata(self.folder, bag_metadata(self._done, custom), sync=self._sync)
 
     def abandon(self) -> None:
-        """Leave the file as it is, without an index: after an error."""
+        """Close the file without an index, after an error."""
         self._part.file.close()
 
 
 def shortage(folder: Path, min_free_bytes: int) -> str | None:
-    """Return what is wrong with the space on the disk of a folder, if anything."""
+    """Return a text when the disk of a folder has too little free space, or None."""
     free = shutil.disk_usage(folder).free
     return f"{free} B free on the disk, expected at least {min_free_bytes} B" if free < min_free_bytes else None
 
 
 def _is_free(folder: Path) -> bool:
-    """Tell whether a recording can be made there; what is recorded beside it may have come first."""
+    """Return whether a recording can be made there; folders of other topics may exist already."""
     if not folder.exists():
         return True
     return folder.is_dir() and all(item.name.startswith(BESIDE) and item.is_dir() for item in folder.iterdir())
 
 
 def free_folder(folder: Path) -> Path:
-    """Return the folder, or the first of `<folder>_2`, `<folder>_3`, ... when it holds something already."""
+    """Return the folder, or the first free one of `<folder>_2`, `<folder>_3`, ...."""
     path, number = folder, 1
     while not _is_free(path):
         number += 1
@@ -307,7 +307,7 @@ def free_folder(folder: Path) -> Path:
 
 
 def in_free_folder(folder: Path, make: Callable[[Path], Made]) -> Made:
-    """Make a recording in `free_folder`, or in the next one where another process is quicker."""
+    """Make a recording in `free_folder`, or in the next one if another process has made that."""
     while True:
         try:
             return make(free_folder(folder))
@@ -328,7 +328,7 @@ def make_folder(folder: Path) -> None:
     Raises
     ------
     TakenError
-        It holds something already.
+        It is not empty.
     RecordingError
         It cannot be made.
     """
@@ -341,7 +341,7 @@ def make_folder(folder: Path) -> None:
 
 
 def warm_up_writer(header: RunHeader) -> None:
-    """Compile what lays messages into chunks, so that no compiler runs beside the first samples."""
+    """Compile the functions that lay messages into chunks, before the first samples."""
     templates: dict[str, Any] = {"sample": sample_template(header.frame_id)}
     templates |= publication_templates(header.frame_id, header.child_frame_id)
     one = np.zeros(1, np.int64)
