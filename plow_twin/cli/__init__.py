@@ -1,4 +1,4 @@
-"""The command `plow-twin`: verbs over the library, nothing else.
+"""The command `plow-twin`: verbs that call the library.
 
 Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss. Results go to standard output, progress
 and errors to standard error.
@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     _open_what_is_closed()
     with _ending_at_once():
-        # with all that compiles: an import that is interrupted may end in an error of its own making
+        # the imports of the verbs: an interrupted import may end in another error
         import plow_twin.run.twin  # noqa: F401
         from plow_twin.cli.app import main as run
 
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _open_what_is_closed() -> None:
-    """Let standard streams that were closed before the start lead nowhere: no file that is opened takes their place."""
+    """Open standard streams that are closed at the start as /dev/null, so that no file gets their descriptors."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
@@ -38,13 +38,13 @@ def _open_what_is_closed() -> None:
 
 @contextmanager
 def _ending_at_once() -> Iterator[None]:
-    """Let Ctrl-C end the process without a traceback: nothing has been begun yet."""
+    """End the process on Ctrl-C without a traceback, before any work has begun."""
 
     def end(*_: object) -> None:
         os.write(2, b"plow-twin: interrupted\n")
         os._exit(1)
 
-    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # not ignored, nor somebody else's
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler  # neither ignored nor handled by the caller
     if not ours or threading.current_thread() is not threading.main_thread():
         yield
         return

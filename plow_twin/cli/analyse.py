@@ -1,4 +1,4 @@
-"""`plow-twin analyse`: what recordings show, predicted against measured."""
+"""`plow-twin analyse`: recordings compared with the predictions of the model."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def analyse(
         Task(path, scene_file, mapping, further, folder, beside, units)
         for path, folder in zip(found, folders, strict=True)
     ]
-    for task in tasks:  # before the first of them removes anything
+    for task in tasks:  # before any of them removes a file
         task.check(found)
     results = _run(tasks, workers or os.cpu_count() or 1, dask, quiet) if many else [_alone(tasks[0], quiet)]
     if many and out is not None:
@@ -102,13 +102,13 @@ def analyse(
 
 
 def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tuple[Path, ...]]:
-    """Return the recordings that paths and folders stand for, and what of the folders is none, which is said."""
+    """Return the recordings at paths and in folders; name the items of folders that are no recordings."""
     from plow_twin.study.analysis.analyse import expand, left_out
 
     for path in recordings:
         if not path.exists():
             raise click.BadParameter(f"{path}: does not exist", param_hint="RUN...")
-    # the results of an analysis before are no recording that was forgotten
+    # results of an earlier analysis are not named
     results_before = () if out is None else (out.resolve(), (out / "run").resolve())
     left = {item: path for path in recordings for item in left_out(path) if item.resolve() not in results_before}
     for item, path in left.items():
@@ -117,7 +117,7 @@ def _found(recordings: Sequence[Path], out: Path | None) -> tuple[list[Path], tu
 
 
 def _watched(task: Any, every: float, as_json: bool, quiet: bool) -> int:
-    """Follow a run to its end, say what it came to, and return the exit code."""
+    """Follow a run to its end, print the result, and return the exit code."""
     facts = _watch(task, every, as_json, quiet)
     if as_json:
         click.echo(json.dumps(facts, allow_nan=False))
@@ -133,7 +133,7 @@ def _alone(task: Any, quiet: bool) -> dict[str, Any]:
 
 
 def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[dict[str, Any]]:
-    """Analyse on all cores or a cluster; what is there already is taken, so that an interrupted call goes on."""
+    """Analyse on all cores or a cluster; results that exist are kept, so that an interrupted call can be continued."""
     from plow_twin.study.analysis.many import run_many
 
     with progress("analysing", quiet) as on_progress:
@@ -141,7 +141,7 @@ def _run(tasks: list[Any], workers: int, dask: str | None, quiet: bool) -> list[
 
 
 def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any]:
-    """Analyse a run while it is recorded: again and again, until it ends or the command is interrupted."""
+    """Analyse a run repeatedly while it is recorded, until it ends or the command is interrupted."""
     import time
 
     from plow_twin.cli.interruption import interruptible
@@ -165,7 +165,7 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
             sys.stdout.flush()
         else:
             _show([facts], False, False, quiet)
-        # a long run takes long to sum up: at most a tenth of the time
+        # summing up a long run takes a tenth of the time at most
         due = time.monotonic() + max(every, 9.0 * (time.monotonic() - begin))
 
     with interruptible() as stopped:

@@ -1,4 +1,4 @@
-"""The command group: how verbs are run and how errors become exit codes."""
+"""The command group: runs verbs and turns errors into exit codes."""
 
 from __future__ import annotations
 
@@ -87,14 +87,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     code = run(arguments)
     if threading.current_thread() is threading.main_thread():
-        # all is done: one more signal, as of a terminal and a launch at once, would end the process with another code
+        # the work is done: another signal, as from terminal and launch at once, would change the exit code
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
     try:
         if sys.stdout is not None:  # closed before the start
             sys.stdout.flush()
     except BrokenPipeError:
-        # the reader has gone: nothing is left to say, and Python must not complain at exit
+        # no reader: Python must not complain at exit
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 

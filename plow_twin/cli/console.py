@@ -1,4 +1,4 @@
-"""What the verbs share: exit codes, consoles, progress, checked numbers."""
+"""Common parts of the verbs: exit codes, consoles, progress, checked numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FAILED: Final = 1
 WRONG_INPUT: Final = 2
 DONE_WITH_LOSS: Final = 3
 
-#: Called with the share of the work that is done, 0..1.
+#: Called with the share of the work done, 0..1.
 OnProgress = Callable[[float], None]
 
 quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress and no tables; files and errors only.")
@@ -39,7 +39,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="The result a
 
 
 def say_error(text: str) -> None:
-    """Print a line on standard error; where that takes none, a full disk or a terminal that has gone, work goes on."""
+    """Print a line on standard error; a full disk or a closed terminal does not end the work."""
     with suppress(OSError):
         click.echo(text, err=True)
 
@@ -74,7 +74,7 @@ def error_console() -> Console:
 
 
 class _RateColumn(ProgressColumn):
-    """How much of the work is done in a second."""
+    """Share of the work done in a second."""
 
     def render(self, task: Task) -> Text:
         """Return the text for a task."""
@@ -108,7 +108,7 @@ def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
 
 @contextmanager
 def _interruption() -> Iterator[Callable[[], bool]]:
-    """Remember Ctrl-C beside the exception, which is lost where it falls into a destructor."""
+    """Note Ctrl-C beside the exception, which is lost in a destructor."""
     before, asked = signal.getsignal(signal.SIGINT), False
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -128,7 +128,7 @@ def _interruption() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def busy(title: str, quiet: bool) -> Iterator[None]:
-    """Show on standard error that work without known length goes on."""
+    """Show progress of unknown length on standard error."""
     if quiet:
         yield
         return
@@ -137,7 +137,7 @@ def busy(title: str, quiet: bool) -> Iterator[None]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return a table whose first column is text and whose others are numbers; a unit in brackets is no markup."""
+    """Return a table of a text column and columns of numbers; brackets of units are no markup."""
     result = Table(title=escape(title), title_justify="left")
     for index, name in enumerate(columns):
         result.add_column(escape(name), justify="left" if index == 0 else "right", no_wrap=index == 0)
@@ -145,7 +145,7 @@ def table(title: str, *columns: str) -> Table:
 
 
 def show_facts(console: Console, facts: Mapping[Any, Any], indent: int = 0) -> None:
-    """Print one fact a line, those of a mapping indented below its name; long texts stay in one piece."""
+    """Print a fact on each line, those of a mapping indented below its name; long texts are not wrapped."""
     for key, value in facts.items():
         name = " " * indent + str(key)
         if isinstance(value, Mapping) and value:
@@ -166,7 +166,7 @@ def _plain(value: Any) -> str:
 
 
 def counts(found: Mapping[str, int]) -> str:
-    """Return counts under their names as text."""
+    """Return counts with their names as text."""
     return ", ".join(f"{name}: {count}" for name, count in found.items())
 
 

@@ -1,4 +1,4 @@
-"""`plow-twin demo`: the main job, live."""
+"""`plow-twin demo`: publisher, node and recorder together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`plow-twin doctor`: what is in a recording, what is missing, and its repair."""
+"""`plow-twin doctor`: content and losses of a recording, and its repair."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def doctor(recording: Path, repair: bool, as_json: bool) -> int:
 
 
 def _shown(facts: dict[str, Any]) -> dict[str, Any]:
-    """Return the facts as they are shown: the parts by name, each problem in a line of its own."""
+    """Return the facts for the terminal: parts by name, each problem on a line."""
     parts = {part["file"]: {key: value for key, value in part.items() if key != "file"} for part in facts["parts"]}
     problems: dict[str, Any] = {
         key: dict(enumerate(facts[key], 1)) if facts[key] else None

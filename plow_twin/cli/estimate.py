@@ -162,7 +162,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Task:
-    """What is to be estimated: `run` returns the estimate and what else is to be said."""
+    """An estimate to make: `run` returns the estimate and further facts."""
 
     scene: Scene
     load: Load
@@ -171,7 +171,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class _Given:
-    """What was measured, and how many rows of it could not be used."""
+    """All measurements, and the number of rows that could not be used."""
 
     measured: Measured
     load: Load
@@ -181,7 +181,7 @@ class _Given:
 
 
 def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Given:
-    """Return all that was measured."""
+    """Return all measurements."""
     from plow_twin.estimate.gaps import Gaps
     from plow_twin.estimate.measurements import Load, Poses
     from plow_twin.record.measured import read_measured, read_recording
@@ -196,7 +196,7 @@ def _measured(source: Path, scene: Path | None, mapping: Path | None, folder: bo
 
 
 def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool) -> _Task:
-    """Return the task of estimating from all that was measured."""
+    """Return the task of an estimate from all measurements."""
     from plow_twin.estimate.estimate import estimate as run
 
     given = _measured(source, scene, mapping, folder)
@@ -235,7 +235,7 @@ def _check_units(source: Path, measured: Measured) -> None:
 
 
 def _repeated(source: Path) -> _Task | None:
-    """Return the task of making the newest estimate of a live node again, or None where it made none."""
+    """Return the task of computing the newest estimate of a live node again, or None without one."""
     from plow_twin.estimate.answer import answer
     from plow_twin.live.estimation import asked_of
     from plow_twin.live.parameters import settings
@@ -266,7 +266,7 @@ def _repeated(source: Path) -> _Task | None:
 
 
 def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
-    """Return the forces under the load believed; None where nothing was estimated that they could be drawn from."""
+    """Return the forces under the load believed, or None without an estimate to draw twins from."""
     from plow_twin.estimate.forces import forces_of
     from plow_twin.estimate.result import State
 
@@ -285,7 +285,7 @@ def _show_forces(forces: Forces) -> None:
 
 
 def _show_live(live: dict[str, Any]) -> None:
-    """Say which estimate this is: its own times count from the window's first sample."""
+    """Print which estimate this is; its times count from the first sample of the window."""
     same = "the same bit for bit" if live["repeated"] else "not the same"
     window = f"{1e-9 * live['start_ns']:.3f} s to {1e-9 * live['end_ns']:.3f} s"
     text = (
@@ -320,8 +320,8 @@ def _show(result: Estimate, scene: Scene) -> None:
     console.print(view)
     console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)
     if result.forces_measured is not None:
-        told = result.forces_measured.as_dict()
-        why = told["unused"] and f": {told['unused']}"
-        console.print(f"measured forces: {told['rows']} rows used{why}", highlight=False)
+        measured = result.forces_measured.as_dict()
+        why = measured["unused"] and f": {measured['unused']}"
+        console.print(f"measured forces: {measured['rows']} rows used{why}", highlight=False)
     for reason in result.reasons:
         console.print(f"  {reason}", highlight=False)

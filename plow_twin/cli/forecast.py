@@ -134,7 +134,7 @@ def forecast(
 
 
 def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
-    """Return the scene, of a run as left, the newest estimate of these pads, and what is lost of the journal."""
+    """Return the scene (of a run that at its end), the newest estimate of its pads, and the losses of the journal."""
     from plow_twin.record.estimated import left_by
     from plow_twin.record.reader import RunReader, own_run
     from plow_twin.scene_file import load_scene
@@ -149,7 +149,7 @@ def _scene(name: str) -> tuple[Scene, dict[str, Any] | None, dict[str, int]]:
 
 
 def _estimate(path: Path) -> Any:
-    """Return what the JSON of an estimate says, unchecked."""
+    """Return the content of the JSON of an estimate, unchecked."""
     try:
         facts = json.loads(path.read_text(encoding="utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -188,7 +188,7 @@ def _history(path: Path) -> History:
 
 
 def _now(scene: Scene, facts: dict[str, Any] | None) -> tuple[Scene, tuple[float, float]]:
-    """Return the scene with the clearances estimated, if there is an estimate, and their standard deviations."""
+    """Return the scene with the estimated clearances, and their standard deviations."""
     from plow_twin.estimate.forecast import with_estimate
     from plow_twin.estimate.life import LifeError
 
@@ -202,9 +202,9 @@ def _now(scene: Scene, facts: dict[str, Any] | None) -> tuple[Scene, tuple[float
 
 def _show(facts: dict[str, Any]) -> None:
     view = table("Time to the limit", "", "hours", "km", "passes", "shifts")
-    for title, told in (("", facts), *facts["scenarios"].items()):
+    for title, times in (("", facts), *facts["scenarios"].items()):
         for name in ("p10", "p50", "p90"):
-            cells = [told[name][key] for key in ("hours", "km", "passes", "shifts")]
+            cells = [times[name][key] for key in ("hours", "km", "passes", "shifts")]
             text = ("not reached" if cell is None else f"{cell:.4g}" for cell in cells)
             view.add_row(f"{title} {name.upper()}".strip(), *text)
     console = output_console()

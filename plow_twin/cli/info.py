@@ -1,4 +1,4 @@
-"""`plow-twin info`: what a scene, a recording or this installation is made of."""
+"""`plow-twin info`: content of a scene, a recording or this installation."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _scene(target: str, as_json: bool) -> int:
 
 
 def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]) -> None:
-    """Print the numbers by section; sources, which are long and stand behind many, are numbered and follow."""
+    """Print the numbers by section, then their sources, which are numbered."""
     sources = list(dict.fromkeys(row["source"] for row in rows if row["source"]))
     stated = table(f"{target}: what is stated", "number", "value", "unit", "mark, source")
     section = ""
@@ -107,7 +107,7 @@ def _recording(path: Path, as_json: bool) -> int:
 
 
 def _unused(path: Path, as_json: bool) -> int:
-    """Print what was not used as CSV, or as an object of JSON a line."""
+    """Print the messages that were not used as CSV, or as JSON lines."""
     from plow_twin.record.unused import unused_messages
 
     table = csv.writer(sys.stdout, lineterminator="\n")

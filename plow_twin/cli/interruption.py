@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP of a verb that may be waiting in another library's code: it ends in bounded time."""
+"""Ctrl-C, SIGTERM and SIGHUP end a verb in bounded time, even if it waits in the code of a library."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Final
 
 from plow_twin.live.stop import stop_signals
 
-#: An interrupted verb has that long to end by itself [s].
+#: Time in which an interrupted verb must end by itself [s].
 PATIENCE_S: Final = 3.0
 
 
 @contextmanager
 def interruptible(on_overdue: Callable[[], object] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Give a function that tells whether the process was asked to end.
+    """Give a function that returns whether the process was asked to end.
 
-    When the block goes on for longer than `PATIENCE_S` after that, `on_overdue` is called and the process ends with
-    exit code 1: a call into a library that waits for a viewer cannot be interrupted otherwise.
+    If the block lasts longer than `PATIENCE_S` after that, `on_overdue` is called and the process ends with exit code
+    1: a library that waits for a viewer cannot be interrupted otherwise.
     """
     asked, done = threading.Event(), threading.Event()
     receive, send = os.pipe()
     os.set_blocking(send, False)
 
     def watch() -> None:
-        os.read(receive, 1)  # written by the signal itself, whatever the main thread does
+        os.read(receive, 1)  # written by the signal handler, whatever the main thread does
         asked.set()
         if not done.wait(PATIENCE_S):
             on_overdue()

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from plow_twin.live.stop import StopSignals
 
 _LEVELS = ("OK", "WARN", "ERROR")
-#: Counters that say that something of the input was not used.
+#: Counters of input that was not used.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
@@ -127,11 +127,11 @@ def _live(
 
 
 def _said(line: str) -> bool:
-    """Print a line; False where standard output takes none, as on a full disk: the twin goes on."""
+    """Print a line; return False where standard output fails, as on a full disk: the twin goes on."""
     try:
         click.echo(line)
         sys.stdout.flush()
-    except BrokenPipeError:  # nobody reads them any more
+    except BrokenPipeError:  # no reader any more
         raise
     except OSError:
         return False
@@ -143,7 +143,7 @@ def _shown(values: dict[str, str]) -> list[str]:
 
 
 def _settings(options: dict[str, Any]) -> Settings:
-    """Return the parameters: of the file, then those given one by one, then those that have options of their own."""
+    """Return the parameters: from the file, then from --set, then from options of their own."""
     from plow_twin.live import parameters
 
     values = parameters.read_parameters(options["params"]) if options["params"] else {}

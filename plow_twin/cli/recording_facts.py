@@ -1,4 +1,4 @@
-"""Facts of a recording: what it holds, how it ended, what was lost."""
+"""Facts of a recording: content, end and losses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from plow_twin.record.unused import InputCounts
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
-    """Return the facts of a recording, read from front to back, and whether anything of it was lost.
+    """Read a recording from front to back; return its facts, and whether it has losses.
 
     Raises
     ------

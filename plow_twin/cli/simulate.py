@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from plow_twin.run.sensitivity import Sensitivity
     from plow_twin.run.simulate import Result
 
-#: A row takes some 200 B.
+#: Most rows; a row takes some 200 B.
 MOST_ROWS: Final = 10_000_000
 
 
@@ -104,7 +104,7 @@ def simulate(
 def _run(
     scene: str, quiet: bool, t_end: float, *settings: Any, **limits: Any
 ) -> tuple[Result, LimitError | RunInterrupted | None]:
-    """Run the scene; after Ctrl-C or at a limit return what has been computed, and what ended it."""
+    """Run the scene; after Ctrl-C or at a limit return the motion so far and the reason of the end."""
     from plow_twin.errors import LimitError, RunInterrupted, SceneError, ToleranceWarning
     from plow_twin.run.simulate import simulate as run
     from plow_twin.scene_file import load_scene
@@ -113,7 +113,7 @@ def _run(
     try:
         title = f"simulating {t_end:g} s (the first run compiles)"
         with progress(title, quiet) as on_progress, warnings.catch_warnings():
-            # said with the results
+            # printed with the results
             warnings.simplefilter("ignore", ToleranceWarning)
             return run(model, t_end, *settings, **limits, on_progress=on_progress), None
     except (LimitError, RunInterrupted) as stop:

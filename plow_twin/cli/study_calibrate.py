@@ -83,7 +83,7 @@ def calibrate(
 
 
 def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
-    """Return the unknowns of the target file and those given, which take the place of one of the same parameter.
+    """Return the unknowns of the target file and those given, which replace those of the same parameter.
 
     `contact.damping` and `contact.restitution` exclude each other, and so does a range that is `PATH=fixed`.
     """
@@ -103,7 +103,7 @@ def _check_options(options: dict[str, Any]) -> None:
 def _objective(
     scene: str, settings: Sequence[str], options: dict[str, Any]
 ) -> tuple[Scene, Objective, str, tuple[str, ...]]:
-    """Return the scene, the objective, what it is called, and the unknowns that the target file proposes."""
+    """Return the scene, the objective, its name, and the unknowns that the target file proposes."""
     from dataclasses import replace
 
     from plow_twin.study.calibration.objective import RecordingObjective, TargetObjective

@@ -1,4 +1,4 @@
-"""What the verbs of `plow-twin study` share."""
+"""Common options of the verbs of `plow-twin study`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ set_option = click.option(
 
 @contextmanager
 def usage_errors() -> Iterator[None]:
-    """Turn what is wrong with a question into a usage error, exit code 2."""
+    """Turn errors of a question into a usage error, exit code 2."""
     from plow_twin.study.parameters import StudyError
 
     try:
@@ -32,7 +32,7 @@ def usage_errors() -> Iterator[None]:
 
 
 def study_scene(name: str, settings: Sequence[str]) -> Scene:
-    """Load a scene and change what `--set` names.
+    """Load a scene and make the changes of `--set`.
 
     Raises
     ------

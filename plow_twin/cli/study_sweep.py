@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from plow_twin.study.store import Store
     from plow_twin.study.sweep.table import Axis, Table
 
-#: Rows of a table on the terminal; larger ones are thinned out, files hold everything.
+#: Most rows of a table on the terminal; larger tables are thinned out, files have all rows.
 MOST_ROWS: Final = 24
-#: Characters that a column of numbers takes, and the first column with its frame.
+#: Width of a column of numbers, and of the first column with its frame [characters].
 _COLUMN, _FIRST_COLUMN = 12, 8
 
 
@@ -86,7 +86,7 @@ def sweep(
 
 
 def _list_failed(result: Table) -> None:
-    """Name the members that failed, by reason; all of them stand in the Parquet file."""
+    """Name the members that failed, by reason; the Parquet file has all of them."""
     reasons: dict[str, list[str]] = {}
     for member in result.failed:
         values = ", ".join(f"{path}={_text(value)}" for path, value in result.sweep.values(member).items())

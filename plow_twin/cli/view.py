@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from plow_twin.view.rrd import ViewSummary
 
 
-#: A clearance that is drawn wider than that is nowhere near the frame.
+#: Largest factor of the drawn clearance; beyond it the cavity is far from the frame.
 _MOST_EXAGGERATED = 1e4
 
 
@@ -117,7 +117,7 @@ def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
 
 
 def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:
-    """Say what was drawn and what was missing; return the exit code."""
+    """Print the content of the drawing and the losses; return the exit code."""
     lossy = _tell_loss(recording, summary.status, summary.lost)
     if not quiet:
         thinned = "" if summary.curve_rows == summary.rows else f" of {summary.rows} read"
@@ -128,7 +128,7 @@ def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> in
 
 
 def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int]) -> bool:
-    """Say what of a recording is missing; return whether something is."""
+    """Print the losses of a recording; return whether it has any."""
     from plow_twin.record.reader import FileStatus
 
     whole = status in (FileStatus.COMPLETE, FileStatus.UNREAD)
@@ -140,7 +140,7 @@ def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int]) -> 
 
 
 def _serve(file: Path, port: int) -> int:
-    """Serve a .rrd with the viewer's own program on the loopback address until it is interrupted."""
+    """Serve a .rrd by the program of the viewer on the loopback address until it is interrupted."""
     from plow_twin.view.viewer import LOOPBACK, free_port, page_address, page_port, viewer_program
 
     program, data_port = viewer_program(), free_port()
@@ -148,7 +148,7 @@ def _serve(file: Path, port: int) -> int:
     command = [program, str(file), "--serve-web", "--bind", LOOPBACK, "--port", str(data_port)]
     click.echo(f"serving until interrupted: {page_address(port, data_port)}")
     sys.stdout.flush()
-    # in the place of this process: whoever stops it stops the server
+    # in place of this process: a signal to it reaches the server
     # without the program's own lines: its address opens the light theme, on which labels cannot be read
     os.execve(program, [*command, "--web-viewer-port", str(port)], {"RUST_LOG": "error", **os.environ})
 
@@ -180,12 +180,14 @@ def _follow(
             sys.stdout.flush()
         show = partial(follow, run, exaggerate=exaggerate, others=others)
         if viewer is not None:
-            summary = show(viewer.take, stopped)
+            summary = show(viewer.attach, stopped)
         elif out is not None:
             with RrdFile(out) as file:
-                summary = show(file.take, lambda: stopped() or file.failed)
+                summary = show(file.attach, lambda: stopped() or file.failed)
         code = _show(run, out or run, summary, quiet)
         sys.stdout.flush()
-        while viewer is not None and viewer.process.poll() is None and not stopped():  # the run has ended: look on
+        while (
+            viewer is not None and viewer.process.poll() is None and not stopped()
+        ):  # the run has ended: the viewer stays open
             time.sleep(0.2)
     return code

@@ -1,7 +1,7 @@
 """A cutting load along the face: Gamma-distributed about its mean, correlated in space, new in each pass.
 
-The fluctuation belongs to the coal at a place of the face, not to a time: the same seed gives the same load at the same
-place of the same pass, at any sampling rate and speed.
+The fluctuation depends on the place along the face and the pass: the same seed gives the same load there at any
+sampling rate and speed.
 
 References
 ----------
@@ -25,7 +25,7 @@ from plow_twin.scene_file.validation import Schema, validate
 
 Array = NDArray[np.float64]
 
-#: Points of the field in a correlation length: between two of them it is straight, which takes 1 % of its variance.
+#: Points of the field per correlation length; linear interpolation between them loses 1 % of its variance.
 _POINTS: Final = 25
 
 
@@ -52,7 +52,7 @@ _SCHEMA: Final[Schema] = {
 
 @dataclass(frozen=True)
 class Face:
-    """The face and how the plough runs along it: there at `speed_m_s`, a turn of `turn_s`, and back."""
+    """The face and the motion of the plough along it: there at `speed_m_s`, a turn of `turn_s`, and back."""
 
     length_m: float = 250.0
     speed_m_s: float = 2.0
@@ -63,7 +63,7 @@ class Face:
 
         In a turn the speed falls linearly to zero and rises to the other side; half of it belongs to each pass.
         """
-        # the distance of the turn is run within the face: its ends are reached in the middle of the turn
+        # the turn happens within the face: its end is reached in the middle of the turn
         steady = (self.length_m - 0.5 * self.speed_m_s * self.turn_s) / self.speed_m_s
         period = steady + self.turn_s
         number = np.floor(t / period).astype(np.int64)
@@ -84,7 +84,7 @@ class Face:
 
 @dataclass(frozen=True)
 class CuttingLoad:
-    """A force into the face that fluctuates, and a lateral one about zero, at one point of the head.
+    """A fluctuating force into the face and a lateral force with mean zero, at one point of the head.
 
     Parameters
     ----------

@@ -168,7 +168,7 @@ class BridgeFront:
             if messages:
                 if not bridge.ends:
                     inputs.waited(len(messages), (time.time_ns() - messages[0].log_time_ns) * 1e-9)
-                self._feeder.take(messages)
+                self._feeder.feed(messages)
             for timer in periodic:
                 timer.look()
         if self._settings.publish_mode == "fixed_rate":

@@ -1,11 +1,11 @@
-"""From what a plough's drive tells to the load on its head, with an interval: nobody measures the wrench itself.
+"""The load on the head from signals of the drive, with an interval: the wrench itself is not measured.
 
-The drive pulls the chain with C = efficiency P / v (or C is measured); what is left after the drag of chain and plough
-is the cutting force along the face, Z = C - idle. A second opinion is the coal: Z = specific_force * depth *
-resistance(position). The two are averaged by their variances. Force into the face Fx = push_ratio Z, lateral
-Fy = lateral_ratio Z, both at one point of the head: M = x Fy - y Fx. All coefficients have a standard deviation, which
-goes on to the result. They are a machine's own, from idle runs and from weighing; none is published for the paper's
-machine, so none has a default.
+The drive pulls the chain with C = efficiency P / v (or C is measured). Without the drag of chain and plough, the
+cutting force along the face is Z = C - idle. The coal gives a second value: Z = specific_force * depth *
+resistance(position). The two are averaged by their variances. The force into the face is Fx = push_ratio Z, the lateral
+one Fy = lateral_ratio Z, both at one point of the head: M = x Fy - y Fx. All coefficients have a standard deviation,
+which propagates to the result. They belong to a machine, from idle runs and weighing, and have no defaults: none are
+published for the machine of the paper.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from plow_twin.record.map_file import LOAD_MODEL, map_error, read_map_file
 
-#: Below that speed [m/s] the power says nothing of the chain's force.
+#: Least speed [m/s] at which the power determines the force of the chain.
 SLOWEST_M_S: Final = 0.1
 
 Number = tuple[float, float]
@@ -47,7 +47,7 @@ class LoadModel:
     specific_force_n_m : tuple of float, optional
         Cutting force per metre of depth [N/m].
     resistance : tuple of tuples, optional
-        Places along the face [m] and the factors of the specific force there, straight between two of them.
+        Places along the face [m] and the factors of the specific force there, linear between them.
     """
 
     push_ratio: Number
@@ -59,19 +59,19 @@ class LoadModel:
     resistance: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def cutting_force(self, drive: Mapping[str, float]) -> Number | None:
-        """Return mean and deviation of the cutting force [N], or None when the drive does not tell enough.
+        """Return mean and deviation of the cutting force [N], or None if the signals do not suffice.
 
         `drive` has some of `power` [W], `chain_force` [N], `speed` [m/s], `depth` and `position` [m]; NaN counts as
-        not told. Without travel nothing is cut.
+        missing. Without travel the force is zero.
         """
-        told = {name: value for name, value in drive.items() if math.isfinite(value)}
-        if abs(told.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in told:
+        known = {name: value for name, value in drive.items() if math.isfinite(value)}
+        if abs(known.get("speed", math.inf)) < SLOWEST_M_S and "chain_force" not in known:
             return 0.0, 0.0
-        opinions = [found for found in (self._by_drive(told), self._by_coal(told)) if found is not None]
+        opinions = [found for found in (self._by_drive(known), self._by_coal(known)) if found is not None]
         if not opinions:
             return None
         deviations = [max(deviation, 1.0) for _, deviation in opinions]
-        # against the smallest, and no powers below: numbers of any size go through to where they are refused
+        # relative to the smallest: numbers of any size reach the check that refuses them
         smallest = min(deviations)
         shares = [smallest / deviation for deviation in deviations]
         total = sum(share * share for share in shares)
@@ -79,7 +79,7 @@ class LoadModel:
         return max(mean, 0.0), smallest / math.sqrt(total)
 
     def wrench(self, drive: Mapping[str, float]) -> tuple[Wrench, Wrench] | None:
-        """Return Fx, Fy [N], M [N m], and their standard deviations, or None when the drive does not tell enough."""
+        """Return Fx, Fy [N], M [N m], and their standard deviations, or None if the signals do not suffice."""
         force = self.cutting_force(drive)
         if force is None:
             return None
@@ -97,30 +97,30 @@ class LoadModel:
         )
         return (fx, fy, x * fy - y * fx), deviations
 
-    def _by_drive(self, told: Mapping[str, float]) -> Number | None:
-        if "chain_force" in told:
-            pull, deviation = told["chain_force"], 0.0
-        elif self.efficiency is not None and "power" in told and abs(told.get("speed", 0.0)) >= SLOWEST_M_S:
-            share = told["power"] / abs(told["speed"])
+    def _by_drive(self, known: Mapping[str, float]) -> Number | None:
+        if "chain_force" in known:
+            pull, deviation = known["chain_force"], 0.0
+        elif self.efficiency is not None and "power" in known and abs(known.get("speed", 0.0)) >= SLOWEST_M_S:
+            share = known["power"] / abs(known["speed"])
             pull, deviation = self.efficiency[0] * share, self.efficiency[1] * abs(share)
         else:
             return None
         return pull - self.idle_force_n[0], math.hypot(deviation, self.idle_force_n[1])
 
-    def _by_coal(self, told: Mapping[str, float]) -> Number | None:
-        if self.specific_force_n_m is None or "depth" not in told:
+    def _by_coal(self, known: Mapping[str, float]) -> Number | None:
+        if self.specific_force_n_m is None or "depth" not in known:
             return None
         factor = 1.0
         if self.resistance is not None:
-            if "position" not in told:
+            if "position" not in known:
                 return None
-            factor = float(np.interp(told["position"], *self.resistance))
+            factor = float(np.interp(known["position"], *self.resistance))
         force, deviation = self.specific_force_n_m
-        return force * factor * told["depth"], deviation * factor * abs(told["depth"])
+        return force * factor * known["depth"], deviation * factor * abs(known["depth"])
 
 
 def read_load_model(path: Path | None) -> LoadModel | None:
-    """Return the load model of a mapping file, or None when it has none.
+    """Return the load model of a mapping file, or None without one.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The node's parameters: one table, from which come defaults, checks, ROS descriptors, config/twin.yaml and the docs.
+"""Table of the node's parameters: the source of defaults, checks, ROS descriptors, config/twin.yaml and the docs.
 
 `python -m plow_twin.live.parameters yaml` prints config/twin.yaml, `... markdown` the table of docs/node.md.
 """
@@ -18,12 +18,12 @@ from typing import Any, Final
 from plow_twin.errors import InputError, Problem
 from plow_twin.stream.topics import Cadence, names_of
 
-#: Topics of the estimate and of what follows from it.
+#: Topics of the estimate and of results that follow from it.
 ESTIMATES: Final = names_of(Cadence.ESTIMATE)
 
 
 class Effect(Enum):
-    """When a changed value takes effect; the value says so in words."""
+    """When a changed value takes effect, in words."""
 
     START = "at start (read only)"
     CONFIGURE = "on configure; can be changed while unconfigured"
@@ -366,7 +366,7 @@ class Settings:
     )
 
 
-#: Parameters that change numbers of the model while it runs, with their keys in the scene file.
+#: Parameters that change the running model, with their keys in the scene file.
 MODEL: Final[Mapping[str, str]] = {
     "clearance_horizontal": "clearance.horizontal_m",
     "clearance_vertical": "clearance.vertical_m",
@@ -376,16 +376,16 @@ MODEL: Final[Mapping[str, str]] = {
     "wear_coefficient": "wear.coefficient_m2_n",
 }
 SPECS: Final[Mapping[str, Field[Any]]] = {spec.name: spec for spec in fields(Settings)}
-#: A number that YAML 1.1 takes for a text: its mantissa has no point.
+#: A number that YAML 1.1, in ROS launch files, reads as a text: its mantissa has no point.
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 #: Declared by rclpy itself.
 _FOREIGN: Final = ("use_sim_time", "start_type_description_service")
 
 
 def coerce(name: str, value: Any) -> Any:
-    """Return the value in the parameter's own type where that loses nothing.
+    """Return the value in the type of the parameter if the conversion is exact.
 
-    An integer for a double; a text such as `1e-9`, which YAML takes for one, and any sequence for a list.
+    Integers become doubles, texts such as `1e-9`, which YAML 1.1 reads as texts, numbers, and sequences tuples.
     """
     default = SPECS[name].default
     if isinstance(default, tuple):
@@ -406,7 +406,7 @@ def _is_list(value: Any) -> bool:
 
 
 def expected(spec: Field[Any]) -> str:
-    """Say in words what a parameter must be."""
+    """Return the values that a parameter can have, in words."""
     if "choices" in spec.metadata:
         return f"one of {', '.join(spec.metadata['choices'])}"
     if isinstance(spec.default, tuple):
@@ -421,11 +421,12 @@ def _range(kind: str, spec: Field[Any]) -> str:
 
 
 def problems(values: Mapping[str, Any]) -> list[Problem]:
-    """Return every problem of the given values; names that are not in the table are passed over."""
+    """Return every problem of the given values; unknown names are ignored."""
     from plow_twin.scene_file.validation import validate
 
     known = {name: coerce(name, value) for name, value in values.items() if name in SPECS}
-    return validate(known, schema(), "parameters")
+    found = validate(known, schema(), "parameters")
+    return [Problem(problem.key, values.get(problem.key, problem.got), problem.expected) for problem in found]
 
 
 @cache
@@ -490,7 +491,7 @@ def read_parameters(path: Path) -> dict[str, Any]:
 
 
 def read_value(text: str) -> Any:
-    """Return a value as YAML has it; what is no YAML stays a text."""
+    """Return a value read as YAML; a text that is no YAML stays a text."""
     from plow_twin.scene_file.yaml_text import load_yaml
 
     value, found = load_yaml(text, "value", "a value")
@@ -498,7 +499,7 @@ def read_value(text: str) -> Any:
 
 
 def unknown(names: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Yield the names of no parameter, each with the nearest name of one, or an empty text."""
+    """Yield unknown names, each with the nearest parameter or an empty text."""
     for name in names:
         if name not in SPECS and name not in _FOREIGN and not name.startswith("qos_overrides."):
             yield name, next(iter(difflib.get_close_matches(name[:100], SPECS, 1)), "")

@@ -193,7 +193,7 @@ class Holes:
     def __init__(self) -> None:
         self._next: int | None = None  # number of the next entry
 
-    def take(self, entries: Entries) -> dict[int, int]:
+    def find(self, entries: Entries) -> dict[int, int]:
         """Return how many entries are missing before an index, for each index with a gap, in order."""
         if not len(entries):
             return {}

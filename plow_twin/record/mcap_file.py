@@ -96,7 +96,7 @@ class ChunkBuilder:
         self._times.append(time_ns)
         self._offsets.append(offset)
 
-    def take(self) -> tuple[Bytes, dict[int, Any]]:
+    def pop(self) -> tuple[Bytes, dict[int, Any]]:
         """Return the records and, by channel, times and offsets in order of time, and begin anew."""
         channels, times, offsets = map(np.concatenate, (self._channels, self._times, self._offsets))
         index = {}
@@ -228,7 +228,7 @@ class McapFile:
         """Write a chunk and its index; an empty one is left out."""
         if not builder.size:
             return
-        content, index = builder.take()
+        content, index = builder.pop()
         whole = self.size
         try:
             self._chunk(builder.compression, content, index)

@@ -179,7 +179,7 @@ def _journal(reader: RunReader) -> tuple[Array, list[int], Array, Array, Array, 
             elif isinstance(entry, Spread):
                 spread = np.maximum(spread, entry.deviation)
         before = sum(map(len, loads))
-        begins += [before + int(entries.sample[since:place].sum()) for place in holes.take(entries) if place >= since]
+        begins += [before + int(entries.sample[since:place].sum()) for place in holes.find(entries) if place >= since]
         loads.append(rows[since:][entries.sample[since:]])
     measured = np.array(poses, dtype=np.float64).reshape(-1, 4)
     all_gaps = np.array(gaps).reshape(-1, 1 + PAIR_COUNT)

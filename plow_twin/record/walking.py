@@ -187,7 +187,7 @@ class JournalWalk:
     def add(self, entries: Entries) -> None:
         """Process entries."""
         begin = 0
-        for place, count in self._holes.take(entries).items():
+        for place, count in self._holes.find(entries).items():
             self._whole(entries[begin:place])
             self._hole(count)
             begin = place

@@ -1,7 +1,7 @@
 """Scene files: YAML to `Scene` and back.
 
-Numbers are read by the YAML 1.2 core schema, so that `9.6975e6` is a number and `on` a text; integers stand for
-doubles. Whatever is wrong with a file comes in one `SceneError`.
+Numbers are read by the YAML 1.2 core schema: `9.6975e6` is a number and `on` a text; integers are read as doubles. A
+`SceneError` lists all problems of a file.
 """
 
 from plow_twin.scene_file.reader import load_scene as load_scene

@@ -1,4 +1,4 @@
-"""The one reader of CSV files: as spreadsheets of many countries write them."""
+"""Reader of CSV files as spreadsheets of many countries write them."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from typing import IO
 
 
 def open_csv(path: Path) -> IO[str]:
-    """Open a text; a mark of the byte order at its beginning, as spreadsheets write it, is no part of it."""
+    """Open a text file without the byte order mark that spreadsheets write."""
     return path.open(newline="", encoding="utf-8-sig", errors="replace")
 
 
 def delimiter_of(header: str) -> str:
-    """Return what parts the columns of a header line: comma, semicolon or tab, the most frequent outside quotes."""
+    """Return the delimiter of a header line: comma, semicolon or tab, the most frequent outside quotes."""
     return max(",;\t", key=re.sub(r'"[^"]*"', "", header).count)
 
 
 def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows that are not empty with the numbers of their lines, the header first.
+    """Yield line numbers and rows, the header first; empty rows are left out.
 
-    Columns are parted by commas, or by semicolons or tabs where the header has more of these; numbers may have decimal
-    commas then, which become points. Lines that begin with `comment` are none.
+    The delimiter is that of the header. With semicolons or tabs decimal commas become points. Lines that begin with
+    `comment` are left out.
 
     Raises
     ------

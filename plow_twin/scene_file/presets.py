@@ -1,4 +1,4 @@
-"""Where the files of `config/` lie: in the source tree, or in share/plow_twin of whatever prefix the package is in."""
+"""Paths of the files of `config/`: in the source tree, or in share/plow_twin of the prefix of the package."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parent.parent
     if (package.parent / "package.xml").is_file():
         return package.parent / "config"
-    # lib/pythonX.Y/site-packages/plow_twin of pip, colcon or a user's home: share/ lies beside lib/
+    # in lib/pythonX.Y/site-packages/plow_twin of pip, colcon or a user's home: share/ is beside lib/
     unresolved = Path(__file__).absolute().parent.parent
     for prefix in (*package.parents, *unresolved.parents):
         folder = prefix / "share" / "plow_twin" / "config"
@@ -32,5 +32,5 @@ def config_folder() -> Path:
 
 
 def scene_path(name: str | Path) -> Path:
-    """Return the file of a preset (`paper`, `bench_kv`, `bench_hc`), or the path itself when it is none of them."""
+    """Return the file of a preset (`paper`, `bench_kv`, `bench_hc`), or any other path unchanged."""
     return config_folder() / f"{name}.yaml" if str(name) in PRESETS else Path(name)

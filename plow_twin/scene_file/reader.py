@@ -30,7 +30,7 @@ from plow_twin.scene_file.validation import Schema, validate
 from plow_twin.scene_file.yaml_text import load_yaml, read_yaml
 
 _SECTIONS: Final = "the sections of a scene"
-#: Stands in for a part with problems, so that the other parts can still be checked against each other.
+#: Replacements of parts with problems, so that the other parts can be checked against each other.
 _SOUND: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "head": Head(1.0, 1.0),
@@ -107,7 +107,7 @@ def _scene(raw: Any, problems: list[Problem], base: Path, source: str) -> Scene:
 def _read_parts(
     raw: Mapping[str, Any], bad: set[str], marks: dict[str, Provenance], base: Path, problems: list[Problem]
 ) -> dict[str, Any]:
-    """Build the parts of a scene that have no problem."""
+    """Build the parts of a scene without problems."""
     parts: dict[str, Any] = {}
     for key, part in SECTIONS.items():
         if key in raw and key not in bad:
@@ -125,7 +125,7 @@ def _read_parts(
 
 
 def _arguments(part: type, raw: Mapping[str, Any], path: str, marks: dict[str, Provenance]) -> dict[str, Any]:
-    """Return the keyword arguments of a dataclass: numbers as floats, marks taken off and kept."""
+    """Return the keyword arguments of a dataclass: numbers as floats, their marks apart."""
     specs = {spec.name: spec for spec in fields(part)}
     return {
         key: _number(value, f"{path}.{key}", marks) if "unit" in specs[key].metadata else value
@@ -138,7 +138,7 @@ def _number(raw: Any, path: str, marks: dict[str, Provenance]) -> float | tuple[
         marks[path] = Provenance(Mark(raw["mark"]), raw.get("source", ""), _deviation(raw))
         raw = raw["value"]
     if isinstance(raw, list):
-        # the elements of a list are numbers, perhaps marked ones
+        # the items of a list may be marked
         return tuple(float(_number(item, f"{path}[{index}]", marks)) for index, item in enumerate(raw))  # type: ignore[arg-type]
     return float(raw)
 
@@ -178,7 +178,7 @@ def _samples(raw: Mapping[str, Any], path: str, base: Path) -> tuple[Any, Any]:
 
 
 def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
-    """Check the sound parts against each other, with harmless stand-ins for the rest."""
+    """Check the sound parts against each other, with replacements for the rest."""
     try:
         Scene(**{**_SOUND, **parts})
     except SceneError as error:
@@ -187,7 +187,7 @@ def _problems_across(parts: Mapping[str, Any]) -> tuple[Problem, ...]:
 
 
 def _as_written(problem: Problem, raw: Mapping[str, Any]) -> Problem:
-    """Give the key as it stands in the file: `loads[0].force_n` lies under the kind of the load there."""
+    """Return the problem with the key of the file, where `loads[0].force_n` is under the kind of the load."""
     head, _, rest = problem.key.partition("].")
     index = head.removeprefix("loads[")
     if index == head or not index.isdigit() or rest.startswith(("name", "at_m")):

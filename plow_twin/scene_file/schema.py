@@ -1,6 +1,6 @@
 """JSON Schema of the scene file, made from the dataclasses of `plow_twin.model.scene`: one source for both.
 
-A number may stand plain or as `{value, mark, source}`; so may a list of numbers. Samples of a table load are plain.
+A number, or a list of numbers, is plain or `{value, mark, source}`. Samples of a table load are plain.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ SECTIONS: Final[dict[str, type]] = {
     "gravity": Gravity,
     "initial": Initial,
 }
-#: Sections that a file must hold.
+#: Required sections.
 REQUIRED_SECTIONS: Final = ("head", "frame", "clearance", "contact")
-#: Kinds of load; exactly one stands beside the name.
+#: Kinds of load; a load has exactly one.
 LOAD_KINDS: Final[dict[str, type[Load]]] = {"harmonic": Harmonic, "constant": Constant, "table": Table}
 #: Columns of a load file unless `columns` names others: time, Fx, Fy, M.
 TABLE_COLUMNS: Final = ("t", "fx", "fy", "m")
@@ -165,7 +165,7 @@ def _load() -> Schema:
 
 
 def _table(plain: Schema) -> Schema:
-    """Let a table stand in a file (`file`, `columns`) or in the scene itself (`t`, `wrench`)."""
+    """Return the schema of a table in a file (`file`, `columns`) or in the scene (`t`, `wrench`)."""
     columns = {
         "type": "array",
         "items": {"type": "string", "description": "the name of a column"},

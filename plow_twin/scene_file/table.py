@@ -24,7 +24,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     Parameters
     ----------
     path : Path
-        The file, as `csv_rows` takes it; lines that start with `#` are left out.
+        The file, as `csv_rows` reads it; lines that start with `#` are left out.
     columns : sequence of str, optional
         Names in the header of time, Fx, Fy and M; `t, fx, fy, m` by default, or `time` for `t`.
     key : str
@@ -33,7 +33,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, key: str = "fil
     Raises
     ------
     SceneError
-        When the file, a column or a number is missing; it lists every line that is no use.
+        When the file, a column or a number is missing; it lists every bad line.
     """
     wanted = tuple(columns or TABLE_COLUMNS)
     try:
@@ -64,7 +64,7 @@ def _parse(rows: list[tuple[int, list[str]]], places: list[int], key: str) -> Sa
 
 
 def sample_table(t: list[Any], wrench: list[Any], key: str) -> Samples:
-    """Return the samples written in a scene as arrays; raises `SceneError` naming each row that is no use."""
+    """Return the samples written in a scene as arrays; raises `SceneError` naming each bad row."""
     problems = [
         Problem(f"{key}.t[{index}]", value, "a number [s]") for index, value in enumerate(t) if not _is_number(value)
     ]

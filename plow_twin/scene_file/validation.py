@@ -1,7 +1,7 @@
 """Check of plain data against a JSON schema, with messages for people: key, value got, value expected.
 
-Every mapping that a user writes is checked here: scenes, parameters, mappings of recordings, load models. Each schema
-says under `description` what stands in a place; that is what a message expects there.
+Scenes, parameters, mappings of recordings and load models are checked here. The `description` of a schema is the value
+expected in a message.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ class _Shown:
 NOTHING: Final = _Shown("nothing")
 #: Longest value that is printed, and longest name [characters].
 _LONGEST: Final = 200
-#: Most problems that are listed: nobody reads more, and looking up the nearest key for each takes a while.
+#: Most problems that are listed: finding the nearest key for each takes time.
 MOST_PROBLEMS: Final = 50
 
 
 def validate(raw: Any, schema: Schema, name: str) -> list[Problem]:
-    """Return the problems of plain data, which are called by `name` as a whole, in the order of the schema."""
+    """Return the problems of plain data, called `name` as a whole, in the order of the schema."""
     problems = (problem for error in _validator(schema).iter_errors(raw) for problem in _explain(error, name))
-    unique: dict[str, Problem] = {}  # jsonschema reports a mapping once for each key that it misses
+    unique: dict[str, Problem] = {}  # jsonschema reports a mapping once for each missing key
     for problem in islice(map(_brief, problems), 2 * MOST_PROBLEMS):
         unique[str(problem)] = problem
     return list(unique.values())[:MOST_PROBLEMS]
@@ -99,7 +99,7 @@ def _explain(error: ValidationError, whole: str) -> Iterator[Problem]:
 
 
 def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Problem]:
-    """Explain the branch whose type fits the value; when none fits, what the key takes at all."""
+    """Explain the branch whose type fits the value, or the key as a whole when no branch fits."""
     branches: dict[Any, list[ValidationError]] = {}
     for inner in error.context or ():
         branches.setdefault(inner.schema_path[0], []).append(inner)
@@ -112,7 +112,7 @@ def _closest_branch(key: str, error: ValidationError, whole: str) -> Iterator[Pr
 
 
 def _is_misfit(error: ValidationError) -> bool:
-    """Tell whether an error says that a branch is for another kind of value, or for other keys."""
+    """Return whether an error means that a branch is for values of another type, or for other keys."""
     keys_alone = error.validator == "required" and "properties" not in cast(Schema, error.schema)
     return keys_alone or error.validator in ("type", "const", "enum")
 

@@ -1,7 +1,7 @@
-"""YAML of files that a user names: safe, bounded, numbers by the YAML 1.2 core schema, floats written exactly.
+"""YAML of untrusted files: safe, bounded, numbers by the YAML 1.2 core schema, floats written exactly.
 
-A file may come from anybody. Its parser events are counted before any of it is built: libyaml builds nested
-collections by recursion in C, and aliases make a few lines stand for any number of values.
+The events of the parser are counted before a document is built: libyaml builds nested collections by recursion in C,
+and a few lines of aliases can stand for any number of values.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ class SceneLoader(_Loader):
 
 
 class SceneDumper(_Dumper):
-    """Safe dumper that quotes whatever YAML 1.1 or 1.2 would take for something else than a text."""
+    """Safe dumper that quotes all texts that YAML 1.1 or 1.2 would read as another type."""
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Write equal values out each time."""
+        """Write no aliases."""
         return True
 
 
@@ -81,7 +81,7 @@ def read_yaml(path: Path, name: str, sections: str) -> tuple[Any, list[Problem]]
 
 
 def load_yaml(text: str, name: str, sections: str, *, most_values: float = math.inf) -> tuple[Any, list[Problem]]:
-    """Return the document and its problems, which call it by `name`; it is None when it cannot be read at all."""
+    """Return the document, called `name` in messages, and its problems; None for an unreadable document."""
     try:
         excess = _excess(text, most_values)
         if excess is not None:
@@ -181,7 +181,7 @@ def dump_yaml(data: Any) -> str:
 
 def _repeated_keys(node: yaml.Node, path: str) -> Iterator[Problem]:
     if isinstance(node, yaml.SequenceNode):
-        # the rows of long tables hold no mappings
+        # rows of long tables have no mappings
         for index, item in enumerate(node.value):
             if not isinstance(item, yaml.ScalarNode):
                 yield from _repeated_keys(item, f"{path}[{index}]")

@@ -1,4 +1,4 @@
-"""Recordings turned into rerun files and pictures: what happened, moving in time."""
+"""Recordings as rerun files and pictures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import the viewer's library only for what needs it: a picture does not."""
+    """Import the library of the viewer on first use: a picture needs none."""
     if name in ("ViewSummary", "to_rrd"):
         from plow_twin.view import rrd
 

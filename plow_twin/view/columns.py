@@ -1,4 +1,4 @@
-"""Rows collected into columns: rerun takes 20 thousand rows at once at the cost of one."""
+"""Rows collected into columns: rerun logs 20 thousand rows at once at the cost of a single row."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RUN_TIME: Final = "run_time"
 
 
 class TimeAxis:
-    """The timelines that all curves share; `first_ns` is the stamp from which the time of the run counts."""
+    """The timelines of all curves; the time of the run counts from the stamp `first_ns`."""
 
     def __init__(self) -> None:
         self.first_ns: int | None = None
@@ -39,11 +39,10 @@ class TimeAxis:
 
 
 class Curves:
-    """Some curves with common times: rows in, one entity per curve out.
+    """Curves with common times: one entity for each column of the rows.
 
     With `span_ns` a curve keeps the least and the largest value in each such span of stamps: no peak is lost. `rows`
-    counts what came in, `sent` the values of the first curve that went out. A row without a value ends the lines where
-    something is missing.
+    counts the rows added, `sent` the values sent of the first curve. A row without values ends the lines at a gap.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, entities: Sequence[str], span_ns: int = 0) -> None:
@@ -52,13 +51,13 @@ class Curves:
         self.span_ns = span_ns
         self.entities = tuple(entities)
         self._parts: list[tuple[Indexes, Indexes, Array]] = []
-        self._ends: list[NDArray[np.bool_]] = []  # of each part the rows at which the lines end
+        self._ends: list[NDArray[np.bool_]] = []  # rows of each part at which the lines end
         self._last: tuple[Indexes, Indexes] | None = None
         self._waiting = self.rows = self.sent = 0
 
     @property
     def thinned(self) -> bool:
-        """Whether rows are left out."""
+        """Whether the curves are thinned."""
         return self.span_ns > 0
 
     def add(self, stamps: Indexes, steps: Indexes, values: Array) -> None:
@@ -72,7 +71,7 @@ class Curves:
             self.flush()
 
     def end(self) -> None:
-        """End the lines: the next row does not go on from the last one."""
+        """End the lines: the next row begins new ones."""
         if self._last is not None:
             self._append(*self._last, np.zeros((1, len(self.entities))), ends=True)
         self._last = None
@@ -102,7 +101,7 @@ class Curves:
             rr.send_columns(entity, indexes, columns, recording=self._stream)
 
     def _spans(self, stamps: Indexes, ends: NDArray[np.bool_]) -> Indexes:
-        """Return a number for each row that changes from span to span; the end of a line is one of its own."""
+        """Return for each row the number of its span; the end of a line has a span of its own."""
         spans = stamps // self.span_ns
         after = np.concatenate(([False], ends[:-1]))
         changes: Indexes = np.cumsum((np.diff(spans, prepend=spans[0]) != 0) | ends | after)
@@ -128,7 +127,7 @@ def extremes(spans, values):  # type: ignore[no-untyped-def]
 
 
 class Batches:
-    """One entity whose rows hold several instances each, such as the arrows of one moment."""
+    """An entity whose rows hold several instances each, such as the arrows at one instant."""
 
     def __init__(
         self, stream: rr.RecordingStream, axis: TimeAxis, entity: str, archetype: Any, fields: Sequence[str]
@@ -144,7 +143,7 @@ class Batches:
         self._lengths: list[int] = []
 
     def add(self, stamp_ns: int, step: int, **values: Sequence[Any] | Array) -> None:
-        """Add one row; all fields have as many instances."""
+        """Add a row; all fields have the same number of instances."""
         lengths = {name: len(values[name]) for name in self._fields}
         if len(set(lengths.values())) != 1:
             raise ValueError(f"{self._entity}: got {lengths} instances, expected as many in each")
@@ -168,7 +167,7 @@ class Batches:
 
 
 def buffers(*owners: object) -> Iterator[Curves | Batches]:
-    """Yield all curves and batches that the owners hold as attributes."""
+    """Yield all curves and batches among the attributes of the owners."""
     for owner in owners:
         for value in vars(owner).values():
             if isinstance(value, Curves | Batches):

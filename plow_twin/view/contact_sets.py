@@ -1,4 +1,4 @@
-"""Which corners carry force together, and how that is coloured: by the sense of the swing that they stop."""
+"""Sets of corners that carry force together, coloured by the sense of the rotation that they stop."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 ENTITY: Final = "contact_set"
 FREE: Final = "free"
 Color = tuple[int, int, int]
-#: No contact, a counter-clockwise swing stopped, a clockwise one, both senses at once.
+#: Colours: no contact, a counter-clockwise rotation stopped, a clockwise one, both.
 _COLORS: Final[tuple[Color, ...]] = ((235, 235, 235), (86, 180, 233), (240, 160, 60), (204, 121, 167))
 _CCW_BITS: Final = int((STOPS_COUNTER_CLOCKWISE.astype(np.int64) << np.arange(PAIR_COUNT)).sum())
 
 
 def set_color(mask: int) -> Color:
-    """Return the colour of a set of pairs, a bit each."""
+    """Return the colour of a set of pairs, given as bits."""
     return _COLORS[(1 if mask & _CCW_BITS else 0) + (2 if mask & ~_CCW_BITS else 0)]
 
 
 def masks_of(force: Array) -> Indexes:
-    """Return a bit for each pair that carries force, (n,) from (n, 8)."""
+    """Return the pairs that carry force as bits, (n,) from (n, 8)."""
     masks: Indexes = ((force > 0.0) << np.arange(PAIR_COUNT)).sum(axis=1)
     return masks
 
 
 class ContactSets:
-    """Write each change of the set; of a thinned run the first in each span of stamps [ns], and how the span ends."""
+    """Write each change of the set; of a thinned run the first in each span of stamps [ns], and the last set."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis, labels: tuple[str, ...], span_ns: int) -> None:
         self._names = tuple(label or name for label, name in zip(labels, CORNER_NAMES, strict=True))
@@ -40,7 +40,7 @@ class ContactSets:
         self._before: str | None = None
         self._at: int | None = None
         self._last: tuple[int, int] | None = None
-        #: set that the newest change within the span has left, and its step
+        #: newest set within the span, and its step
         self._left: tuple[str, int] | None = None
         names: dict[str, Color] = {}
         for ccw, cw in product(range(16), range(16)):
@@ -51,7 +51,7 @@ class ContactSets:
 
     @staticmethod
     def _pairs(corners: int, ccw: bool) -> int:
-        """Return the pairs of these corners that stop a swing of one sense."""
+        """Return the pairs of these corners that stop a rotation of one sense."""
         return sum(
             1 << pair
             for pair in range(PAIR_COUNT)
@@ -67,7 +67,7 @@ class ContactSets:
         return ", ".join(parts) or FREE
 
     def add(self, stamps: Indexes, steps: Indexes, force: Array) -> None:
-        """Take in forces, shape (n, 8)."""
+        """Add forces, shape (n, 8)."""
         masks = masks_of(force)
         if len(stamps):
             self._last = int(stamps[-1]) + 1, int(steps[-1])
@@ -85,7 +85,7 @@ class ContactSets:
             self._end_span(int(stamps[-1]))
 
     def _end_span(self, stamp_ns: int) -> None:
-        """Write how a span has ended that a stamp lies beyond."""
+        """Write the last set of a span once a stamp lies beyond it."""
         if self._left is None or self._at is None or stamp_ns // self._span_ns == self._at:
             return
         name, step = self._left
@@ -94,16 +94,16 @@ class ContactSets:
         self._before, self._left = name, None
 
     def finish(self) -> None:
-        """Write how the last span has ended."""
+        """Write the last set of the last span."""
         if self._left is not None and self._at is not None:
             self._end_span((self._at + 1) * self._span_ns)
 
     def end(self) -> None:
-        """End the lane: which corners carry force from here on is not known."""
+        """End the lane: the set is unknown from here on."""
         if self._last is not None:
             self._states.add(*self._last, state=[])
         self._before = self._at = self._last = self._left = None
 
     def flush(self) -> None:
-        """Send what has been collected."""
+        """Send the collected changes."""
         self._states.flush()

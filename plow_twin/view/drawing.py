@@ -1,4 +1,4 @@
-"""What a recording shows, drawn batch by batch: curves, moments of the cross-section, events."""
+"""Drawing of a recording, batch by batch: curves, instants of the cross-section, events."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from plow_twin.view.residuals import Residuals
 from plow_twin.view.section import ARROW_MM_PER_N, LABEL_MM, LOAD_COLOR, PAIR_COLORS, Section
 from plow_twin.view.what_if import WhatIf
 
-#: Stamps further than that from the recorder's clock [ns] are on another clock: no age is drawn.
+#: Largest distance of stamps from the recorder's clock [ns]; beyond it they are on another clock and have no age.
 _LARGEST_AGE_NS: Final = 3_600_000_000_000
 _GREY: Final = (150, 155, 165)
 _WHITE: Final = (235, 235, 235)
@@ -43,29 +43,29 @@ _PAD_POINTS: Final = [[CLEARANCE_NAMES.index(f"{name}{point}") for name in PAD_N
 _BOUNDS: Final = [
     CLEARANCE_NAMES.index(f"{way}/{point}") for way in ("horizontal", "vertical") for point in ("p05", "p95")
 ]
-#: Rows of a band for each message of a clearance, where curves are not thinned.
+#: Rows of a band for each message of a clearance, unless curves are thinned.
 _BAND_ROWS: Final = 10
-#: The chart of forces along the face is drawn that often [ns].
+#: Interval at which the chart of forces along the face is drawn [ns].
 _FACE_NS: Final = 1_000_000_000
 
 
 class Drawing:
-    """Send what batches of a recording hold to a stream of the viewer.
+    """Draws batches of a recording into a stream of the viewer.
 
     Parameters
     ----------
     stream
-        Where to.
+        Stream of the viewer.
     header, scene, source
-        Of the recording, and where it lies.
+        Header, scene and path of the recording.
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        How many times as wide the clearance is drawn in the second cross-section.
+        Factor of the width of the clearance in the second cross-section.
     span_ns
         Span of stamps in which a curve keeps its least and largest value [ns]; 0: it keeps every row.
     others
-        Further scenes, by name, whose forces under the run's load are drawn beside those of the run.
+        Other scenes, by name, whose forces under the load of the run are drawn too.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class Drawing:
         self._shown: int | None = None
         self._sample_ns: int | None = None
         self._early: list[tuple[int, DiagnosticStatus]] = []
-        self._wrench = np.full(3, np.nan)  # not known yet
+        self._wrench = np.full(3, np.nan)  # unknown so far
         self._worn = False
         self._largest_load = self._named_load = np.zeros(3)
         self._scene = scene
@@ -127,11 +127,11 @@ class Drawing:
 
     @property
     def first_ns(self) -> int:
-        """The first stamp; 0 without any."""
+        """The first stamp; 0 before it."""
         return self._axis.first_ns or 0
 
     def _draw_still(self, scene: Scene, source: Path) -> None:
-        """Write what does not change in time."""
+        """Draw the static parts."""
         layout.style_curves(self.stream)
         outline = self.section.frame_strip()
         self.stream.log("section/frame", rr.LineStrips2D([outline], colors=[_GREY], radii=[1.5]), static=True)
@@ -157,8 +157,8 @@ class Drawing:
         self.stream.log("about", document, static=True)
 
     def add(self, batch: Batch) -> None:
-        """Draw a batch; no line goes over entries that are not there, nor over a reset."""
-        missing = self._holes.take(batch.entries)
+        """Draw a batch; no line crosses missing entries or a reset."""
+        missing = self._holes.find(batch.entries)
         resets = {index for index, entry in batch.entries.others.items() if isinstance(entry, Reset)}
         places = sorted(resets | set(missing))
         for place, part in zip((None, *places), batch.parted(places), strict=True):
@@ -178,15 +178,15 @@ class Drawing:
         self._residuals = Residuals()
 
     def _hole(self, count: int, after: Batch) -> None:
-        """Note that entries are missing before a batch, and forget what was before them."""
+        """Write that entries are missing before a batch, and end all lines there."""
         self._sample_ns, self._wrench = None, np.full(3, np.nan)
         self.events.forget()
-        if not isinstance(after.entries.others.get(0), Loss):  # it says so itself
+        if not isinstance(after.entries.others.get(0), Loss):  # it is an event of its own
             text = f"{count} journal entries are not there after this"
             self.events.add(self.stamp_ns, max(self.step, 0), text, "ERROR")
 
     def _whole(self, batch: Batch) -> None:
-        """Draw entries and messages of which none is missing."""
+        """Draw entries and messages without a gap."""
         entries = batch.entries
         advance = entries.sample.copy()
         advance[[index for index, entry in entries.others.items() if isinstance(entry, Hold | Unload)]] = True
@@ -202,7 +202,7 @@ class Drawing:
         bounds = np.maximum.accumulate(entries.sequence) if len(entries) else entries.sequence
 
         def places(rows: Rows) -> Indexes:
-            """Return how many entries come before each message."""
+            """Return the number of entries before each message."""
             return np.asarray(np.searchsorted(bounds, rows.sequence, side="right"), np.int64)
 
         steps_before = np.concatenate(([before[0]], steps))
@@ -217,15 +217,15 @@ class Drawing:
             self._section(contact, head, steps_before[at], loads[np.searchsorted(np.flatnonzero(advance), at)])
         if head is not None:
             poses = [(index, entry) for index, entry in sorted(entries.others.items()) if isinstance(entry, Pose)]
-            self.residual.add(*self._residuals.take(poses, steps, head))
+            self.residual.add(*self._residuals.compare(poses, steps, head))
         self._statuses(batch)
 
     def _entries(self, entries: Entries, stamps: Indexes, steps: Indexes, advance: NDArray[np.bool_]) -> None:
         """Draw load, quality and events of the journal."""
         if self.header.excitation_source != "scene" and advance.any():
             loads = self._loads(entries, advance, self._wrench)
-            told = np.isfinite(loads[:, 0])
-            self.load.add(stamps[advance][told], steps[advance][told], loads[told] / 1e3)
+            finite = np.isfinite(loads[:, 0])
+            self.load.add(stamps[advance][finite], steps[advance][finite], loads[finite] / 1e3)
             self._wrench = loads[-1]
         samples = np.flatnonzero(entries.sample)
         if samples.size:
@@ -253,7 +253,7 @@ class Drawing:
 
     @staticmethod
     def _loads(entries: Entries, advance: NDArray[np.bool_], before: Array) -> Array:
-        """Return the load that each advance has led to, (n, 3): that of its sample, the one held, or none."""
+        """Return the load at the end of each advance, (n, 3): of its sample, held, or NaN."""
         places = np.flatnonzero(advance)
         loads = np.where(entries.sample[places, None], entries.wrench[places], 0.0)
         for row in np.flatnonzero(~entries.sample[places]).tolist():
@@ -287,9 +287,9 @@ class Drawing:
                 self._pads(stamps, steps, numbers)
 
     def _growth_m(self, numbers: Array) -> Array:
-        """Return the growth of the clearances by wear alone [m], with its points, in the order of `layout.GROWTH`.
+        """Return the growth of the clearances by wear alone [m] with its interval, in the order of `layout.GROWTH`.
 
-        It follows from the pads, so that an estimate or a changed parameter does not count as wear.
+        It is that of the pads: an estimate or a changed parameter is no wear.
         """
         new = clearances(self._scene, np.zeros(PAIR_COUNT))[:2]
         best, low, high = (clearances(self._scene, numbers[:, pads])[:, :2] - new for pads in _PAD_POINTS)
@@ -316,7 +316,7 @@ class Drawing:
         self.band.add(stamps, steps, np.where(bound[:, None], sides[:, :, 1], sides[:, :, 0]))
 
     def _color_bands(self, stamps: Indexes, steps: Indexes) -> None:
-        """Colour the bands: full at the first stroke that is drawn, faint from the next one on."""
+        """Colour the bands: the first stroke opaque, all others faint."""
         behind = int(np.searchsorted(stamps, stamps[0] + 2 * self.band.span_ns))
         changes = [0, min(max(1, behind), len(stamps) - 1)]
         for entity in layout.BAND:
@@ -332,13 +332,13 @@ class Drawing:
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=middles, half_sizes=halves)
                 labels = [f"{depth:.3g} mm" if depth >= 1.0 else f"{1e3 * depth:.3g} µm" for depth in depth_mm[row]]
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=places, labels=labels)
-            elif self._worn:  # the pads are new ones
+            elif self._worn:  # the pads are new
                 self.pads.add(int(stamps[row]), int(steps[row]), centers=[], half_sizes=[])
                 self.pad_names.add(int(stamps[row]), int(steps[row]), positions=[], labels=[])
             self._worn = bool(depth_mm[row].any())
 
     def _along_face(self, entries: Entries, rows: Rows, places: Indexes) -> None:
-        """Assign the forces of some messages to places along the face, each under the speed at its time."""
+        """Assign forces to places along the face by the speed at the time of each message."""
         largest, begin = rows.numbers[:, 2 * PAIR_COUNT :].max(axis=1), 0
         for index, entry in sorted(entries.others.items()):
             if isinstance(entry, Travel | Reset):
@@ -355,7 +355,7 @@ class Drawing:
             self._drawn_face_ns = self.stamp_ns
 
     def _section(self, contact: Rows, head: Rows, steps: Indexes, loads: Array) -> None:
-        """Draw the first moment in each span, where forces and pose of one publication are there."""
+        """Draw the first instant in each span with forces and pose of one publication."""
         at = np.minimum(np.searchsorted(contact.sequence, head.sequence), len(contact) - 1)
         spans = head.stamp_ns // round(1e9 / self.section_hz)
         for row in np.flatnonzero(contact.stamp_ns[at] == head.stamp_ns).tolist():
@@ -382,7 +382,7 @@ class Drawing:
         self.walls.add(stamp_ns, step, strips=list(walls), colors=shades)
 
     def _load(self, stamp_ns: int, step: int, pose: tuple[float, float, float], load: Array) -> None:
-        """Draw the head's name and the sampled load at its centre; the scene's own loads are not journalled."""
+        """Draw the name of the head and the sampled load at its centre; loads of the scene are not in the journal."""
         centre, name = self.section.head_points(pose)
         self.names.add(stamp_ns, step, positions=[name])
         fx, fy, moment = load.tolist()
@@ -392,7 +392,7 @@ class Drawing:
             self.load_arrow.add(stamp_ns, step, origins=[centre], vectors=[vector], labels=[label])
 
     def _statuses(self, batch: Batch) -> None:
-        """Write changes of status and alarms; those from before the first sample at its stamp: playing starts there."""
+        """Write changes of status and alarms; those before the first sample are written at its stamp."""
         topics = (self.header.topic("status"), self.header.topic(ALARMS))
         for part in batch.outputs:
             for channel in [number for number, (name, _) in part.topics.items() if name in topics]:
@@ -412,7 +412,7 @@ class Drawing:
         self._early = []
 
     def flush(self) -> None:
-        """Send what is still collected."""
+        """Send the collected rows."""
         if (self._largest_load > 1.05 * self._named_load).any():
             layout.style_load(self.stream, self._largest_load)
             self._named_load = self._largest_load
@@ -422,13 +422,13 @@ class Drawing:
             part.flush()
 
     def finish(self, reader: RunReader) -> None:
-        """Draw how the recording ended and which parts are not there, and send what is still collected."""
+        """Write how the recording ended and the missing parts, and send the collected rows."""
         self._write_statuses()
         self.face.draw(self.stamp_ns, max(self.step, 0))
         self.contact_sets.finish()
-        told = [f"{count} {name.replace('_', ' ')}" for name, count in reader.lost_parts.items()]
+        notes = [f"{count} {name.replace('_', ' ')}" for name, count in reader.lost_parts.items()]
         if reader.status not in (FileStatus.COMPLETE, FileStatus.UNREAD):
-            told.append(reader.status.value)
-        for text in told:
+            notes.append(reader.status.value)
+        for text in notes:
             self.events.add(self.stamp_ns, max(self.step, 0), f"recording: {text}", "ERROR")
         self.flush()

@@ -24,23 +24,23 @@ class Events:
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._makes_before: NDArray[np.float64] | None = None
         self._status: dict[str, tuple[int, str]] = {}
-        #: whether the load is held for want of samples
+        #: whether the load is held without samples
         self.silent = False
         self._speed_m_s: float | None = None
 
     def add(self, stamp_ns: int, step: int, text: str, level: str = "INFO") -> None:
-        """Write one line."""
+        """Write a line."""
         self.count += 1
         self._lines.add(stamp_ns, step, text=[text], level=[level])
 
     def sample(self, stamp_ns: int, step: int) -> None:
-        """Write that a sample has come after a silence."""
+        """Write the end of a silence."""
         if self.silent:
             self.add(stamp_ns, step, "excitation is back")
         self.silent = False
 
     def entry(self, stamp_ns: int, step: int, entry: Entry | Dropped, excitation_source: str) -> None:
-        """Write what an entry of the journal means, if it is an event."""
+        """Write an entry of the journal that is an event."""
         match entry:
             case Hold() | Unload():
                 if not self.silent and excitation_source != "scene":
@@ -48,7 +48,7 @@ class Events:
                     self.add(stamp_ns, step, f"excitation silent: {what}", "WARN")
                     self.silent = True
             case Travel(_, speed):
-                if speed != self._speed_m_s:  # sensors repeat it many times a second
+                if speed != self._speed_m_s:  # sensors repeat the same speed many times a second
                     self.add(stamp_ns, step, f"travel along the face at {speed:g} m/s")
                 self._speed_m_s = speed
             case Reset(_, reason):
@@ -67,7 +67,7 @@ class Events:
                 self.add(stamp_ns, step, f"{count} messages on {topic} were not recorded before this", "ERROR")
 
     def peaks(self, stamps: Indexes, steps: Indexes, makes: Array, peak: Array) -> None:
-        """Write the touches in rows of `contact_peaks`: all makes so far, (n, 8), largest forces [N], (n, 8)."""
+        """Write the touches in rows of `contact_peaks`: cumulative makes (n, 8) and largest forces [N] (n, 8)."""
         if not len(stamps):
             return
         before = makes[:1] if self._makes_before is None else self._makes_before[None]
@@ -80,11 +80,11 @@ class Events:
             self.add(int(stamps[row]), int(steps[row]), text)
 
     def forget(self) -> None:
-        """Take the next counts of touches for the first ones: what was before them is not known."""
+        """Count touches from the next row on: the rows before it are unknown."""
         self._makes_before = None
 
     def status(self, stamp_ns: int, step: int, message: DiagnosticStatus) -> None:
-        """Write a status, or what alarms there are, when it differs from the one before of that name."""
+        """Write a status or the alarms when they have changed."""
         now = (message.level, message.message)
         if now != self._status.get(message.name):
             what = "alarms" if message.name.endswith(f": {ALARMS}") else "status"
@@ -92,5 +92,5 @@ class Events:
         self._status[message.name] = now
 
     def flush(self) -> None:
-        """Send what has been collected."""
+        """Send the collected lines."""
         self._lines.flush()

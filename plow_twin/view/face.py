@@ -1,4 +1,4 @@
-"""Largest contact force over the place along the face, pass by pass: a chart drawn anew while the run goes on."""
+"""Chart of the largest contact force over the place along the face, pass by pass, drawn anew during the run."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 #: Size of the chart in the units of its view.
 WIDTH: Final = 300.0
 HEIGHT: Final = 90.0
-#: Length of a piece of the face to begin with [m]; it doubles when there are more than `_MOST_PIECES`.
+#: First length of a piece of the face [m]; it doubles when there are more than `_MOST_PIECES`.
 _PIECE_M: Final = 0.1
 _MOST_PIECES: Final = 600
-#: Passes that are drawn; the newest is bright.
+#: Number of passes that are drawn; the newest is bright.
 _MOST_PASSES: Final = 8
 _AXIS: Final = (110, 115, 125)
 _NEWEST: Final = (240, 160, 60)
@@ -27,9 +27,9 @@ _EARLIER: Final = (90, 110, 130)
 
 
 class FaceChart:
-    """Collect forces by place, and draw them.
+    """Collects forces by place and draws them.
 
-    `known` says whether the run has a speed along the face at all.
+    `known` is whether the run has a speed along the face.
     """
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
@@ -44,19 +44,19 @@ class FaceChart:
         self._speed = self._place_m = 0.0
         self._direction = 0.0
         self._reached_ns: int | None = None
-        #: speeds whose stamps have not been reached, by these
+        #: speeds by their stamps, which have not been reached
         self._coming: list[Travel] = []
         self.known = False
 
     def travel(self, travel: Travel) -> None:
-        """Go on with another speed from its stamp on."""
+        """Change the speed from its stamp on."""
         if self._reached_ns is not None and travel.stamp_ns > self._reached_ns:
             insort(self._coming, travel, key=lambda one: one.stamp_ns)
         else:
             self._set_speed(travel.speed_m_s)
 
     def _set_speed(self, speed_m_s: float) -> None:
-        """Go on with another speed; a change of direction begins a pass."""
+        """Change the speed; another direction begins a pass."""
         direction = math.copysign(1.0, speed_m_s) if speed_m_s else 0.0
         if direction and self._direction and direction != self._direction:
             self._passes.append({})
@@ -65,7 +65,7 @@ class FaceChart:
         self.known = self.known or bool(speed_m_s)
 
     def forces(self, stamps: Indexes, force: Array) -> None:
-        """Take in forces [N], shape (n,), each under the speed at its time."""
+        """Add forces [N], shape (n,), each under the speed at its time."""
         while len(stamps) and self._coming and stamps[-1] > self._coming[0].stamp_ns:
             count = int(np.searchsorted(stamps, self._coming[0].stamp_ns, "right"))
             self._forces(stamps[:count], force[:count])
@@ -74,7 +74,7 @@ class FaceChart:
         self._forces(stamps, force)
 
     def _forces(self, stamps: Indexes, force: Array) -> None:
-        """Take in forces under the present speed."""
+        """Add forces under the present speed."""
         if not len(stamps):
             return
         last = int(stamps[0]) if self._reached_ns is None else self._reached_ns
@@ -93,13 +93,13 @@ class FaceChart:
             here = self._passes[-1]
 
     def restart(self) -> None:
-        """Go on after a reset: the stamps may go back, and speeds that were to come act."""
+        """Continue after a reset: stamps may go back, and speeds ahead of their time act now."""
         for travel in self._coming:
             self._set_speed(travel.speed_m_s)
         self._coming, self._reached_ns = [], None
 
     def draw(self, stamp_ns: int, step: int) -> None:
-        """Draw what there is."""
+        """Draw the chart."""
         filled = [one for one in self._passes if one]
         if not filled:
             return
@@ -121,7 +121,7 @@ class FaceChart:
         self._ticks.add(stamp_ns, step, positions=[(x, y) for x, y, _ in ticks], labels=[text for *_, text in ticks])
 
     def flush(self) -> None:
-        """Send what has been collected."""
+        """Draw the chart at the end."""
         self._lines.flush()
         self._ticks.flush()
 

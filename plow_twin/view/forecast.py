@@ -1,4 +1,4 @@
-"""The picture of a forecast: the clearances as they may grow, and when the first of them reaches its limit."""
+"""Picture of a forecast: the clearances over time, and when the first reaches its limit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plow_twin.record.durable import whole_file
 if TYPE_CHECKING:
     from plow_twin.estimate.forecast import Forecast
 
-#: Moments at which the clearances are drawn.
+#: Number of instants at which the clearances are drawn.
 _MOMENTS = 120
 _COLOURS = ("#1f4e9c", "#d62728")
 
@@ -27,14 +27,14 @@ def draw_forecast(found: Forecast, path: FilePath) -> None:
     left, right = figure.subplots(1, 2)
     plan = found.plan
     reached = found.hours[np.isfinite(found.hours)]
-    # where all is reached now there is no time to show
+    # limits that are reached already leave no span to show
     last = 1.3 * float(np.quantile(reached, 0.95)) if len(reached) else 0.0
     end = min(plan.horizon_h, last) if last > 0.0 else plan.horizon_h
     hours = np.linspace(0.0, end, _MOMENTS)
     growing = 1e3 * found.clearances(hours)
     limits = (plan.limit_horizontal_m, plan.limit_vertical_m)
     for axis, (name, limit, colour) in enumerate(zip(("horizontal", "vertical"), limits, _COLOURS, strict=True)):
-        # infinite where a limit is behind
+        # infinite for a limit that is reached already
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
         middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)

@@ -1,4 +1,4 @@
-"""How the viewer arranges a recording: the blueprint, and how each curve looks."""
+"""Blueprint of the viewer for a recording, and the style of each curve."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ AGE: Final = ("quality/sample_age_ms",)
 INTERVAL: Final = ("quality/sample_interval_ms",)
 TOTAL: Final = tuple(f"clearance/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
 GROWTH: Final = tuple(f"growth/{name}" for name in CLEARANCE_NAMES if not name.startswith("pad_"))
-#: The area between the bounds of a clearance: a curve that changes between them.
-#: Their names sort before those of the clearances, so that these are drawn above them.
+#: Areas between the bounds of a clearance: each is a curve that alternates between them. Their names sort before
+#: those of the clearances, which are therefore drawn above.
 BAND: Final = tuple(f"{group}/band/{way}" for group in ("clearance", "growth") for way in ("horizontal", "vertical"))
 RESIDUAL: Final = ("residual/x", "residual/y", "residual/theta")
 WEAR: Final = tuple(f"wear/{name}" for name in CLEARANCE_NAMES if name.startswith("pad_"))
 
-#: Bounds are left out where a view opens: bands show those of the clearances, and a legend of more than eight is cut.
+#: Views hide bounds at first: bands show those of the clearances, and a legend of more than eight names is cut.
 _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
@@ -51,7 +51,7 @@ _WHAT_IF_COLORS: Final = (
     (204, 121, 167),
     (240, 228, 66),
 )
-#: Strokes of a band lie several deep on each pixel: wide and faint ones give an even area, without stripes.
+#: Several strokes of a band overlap at each pixel: wide and faint strokes give an even area without stripes.
 _BAND_ALPHA: Final = 10
 _BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
@@ -60,7 +60,7 @@ _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160,
 def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb.Blueprint:
     """Return the arrangement: the cross-sections beside the curves, the events and data quality below.
 
-    With `what_if` the predictions of other scenes are in front.
+    With `what_if` the view of other scenes is in front.
     """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
@@ -103,7 +103,7 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
         ),
-        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets is seen whole in a window of 600 pixels too
+        row_shares=[4.7, 2.2, 2.7, 3.4],  # the lane of the sets fits in a window of 600 pixels too
     )
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -136,7 +136,7 @@ def style_curves(stream: rr.RecordingStream) -> None:
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
         _style(stream, entity, "5..95 %", None, AggregationPolicy.MinMax, _BAND_WIDTH)
-    for entity in (*TOTAL, *GROWTH, *WEAR):  # the bounds of an interval thinner than the value that they belong to
+    for entity in (*TOTAL, *GROWTH, *WEAR):  # bounds of an interval are thinner than their value
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
         color = _CLEARANCE_COLORS.get(base) or PAIR_COLORS[PAIR_NAMES.index(base)]
@@ -145,20 +145,20 @@ def style_curves(stream: rr.RecordingStream) -> None:
 
 
 def band_colors(entity: str) -> list[tuple[int, ...]]:
-    """Return the colours of a band's first strokes and of all others: the legend shows that of the first."""
+    """Return the colours of the first stroke of a band, which the legend shows, and of all others."""
     color = _CLEARANCE_COLORS[entity.rpartition("/")[2]]
     return [(*(part // 2 for part in color), 255), (*color, _BAND_ALPHA)]
 
 
 def style_load(stream: rr.RecordingStream, largest: Iterable[float]) -> None:
-    """Name the curves of the load with their largest values: the axis of a low plot names only powers of ten."""
+    """Name the curves of the load with their largest values: the axis of a low plot has only powers of ten."""
     for entity, name, unit, color, value in zip(LOAD, *_LOAD_NAMES, _LOAD_COLORS, largest, strict=True):
         named = f"{name}, to {value:.3g} {unit}" if value else f"{name} [{unit}]"
         _style(stream, entity, named, color, AggregationPolicy.MinMax)
 
 
 def what_if_curves(stream: rr.RecordingStream, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the entities of the run's curve and of those of other scenes, which are named and coloured."""
+    """Name and colour the curves of the run and of other scenes; return their entities."""
     entities = tuple(f"what_if/{number}" for number in range(len(names) + 1))
     for number, (entity, name) in enumerate(zip(entities, ("the run", *names), strict=True)):
         color = _WHAT_IF_COLORS[number % len(_WHAT_IF_COLORS)]
@@ -185,7 +185,7 @@ def _style(
 
 
 def about(scene: Scene, header: RunHeader, source: Path) -> str:
-    """Return, in Markdown, what was run and how to read the picture."""
+    """Return a description of the run and of the picture in Markdown."""
     contact = scene.contact
     frame = "fixed frame" if scene.support is None else "frame, on springs, from which all is seen here,"
     return f"""# {source.name}

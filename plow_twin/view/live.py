@@ -1,7 +1,7 @@
-"""A run shown while it is recorded: the file is followed by a process of its own, whatever the viewer does.
+"""A run shown while it is recorded, by a process of its own that follows the file.
 
-Nothing leads from here back to the node: a viewer that is slow, stopped or gone stops this process alone. What is shown
-is thinned to a fixed rate, the least and the largest value of each span being kept.
+The node is independent of it: a slow or closed viewer stops this process alone. Curves are thinned to the least and the
+largest value of each span.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from plow_twin.view.drawing import Drawing
 from plow_twin.view.rrd import ViewSummary
 from plow_twin.view.section import Section
 
-#: Spans a second in which a curve keeps two values [Hz]: an hour of all curves is some 200 MB in the viewer.
+#: Rate of the spans in which a curve keeps two values [Hz]: an hour of all curves takes some 200 MB in the viewer.
 CURVE_HZ: Final = 25.0
-#: Moments of the cross-section [Hz], and those of what was recorded before.
+#: Rates of the cross-section [Hz]: live, and for the part recorded before the start.
 SECTION_HZ: Final = 20.0
 _SECTION_HZ_BEFORE: Final = 1.0
 
-#: Takes the stream and its arrangement to where they go.
+#: Receives the stream and its blueprint.
 Sink = Callable[[rr.RecordingStream, rrb.Blueprint], object]
 
 
@@ -64,7 +64,7 @@ def follow(
     for batch in reader.batches():
         if len(batch.entries) or batch.outputs:
             drawing.add(batch)
-        else:  # all there is
+        else:  # all that is recorded so far
             drawing.section_hz = SECTION_HZ
             drawing.flush()
             stream.flush()

@@ -71,7 +71,7 @@ def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int]]:
 
 
 def _title(reader: RunReader, first_ns: int | None, lost: dict[str, int]) -> str:
-    """Return file, scene, date and how the recording ended."""
+    """Return file, scene, date and end of the recording."""
     parts = [reader.path.name]
     scene = reader.header.parameters.get("scene")
     if isinstance(scene, str) and scene:
@@ -95,7 +95,7 @@ def _draw_instant(upper: Any, lower: Any, section: Section, instant: Instant | N
 
 
 def _say_nothing(axis: Any, text: str) -> None:
-    """Write a text in the place of a drawing."""
+    """Write a text in place of a drawing."""
     axis.text(0.5, 0.5, text, ha="center", va="center", transform=axis.transAxes)
     axis.set(yticks=[])
 
@@ -114,7 +114,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant) -> None:
             sideways = abs(vector[0]) > abs(vector[1])
             side = "center" if not sideways else "left" if vector[0] > 0.0 else "right"
             axis.annotate(text, origin + 1.1 * vector, color=color, ha=side, va="center", fontsize=8)
-        # annotations do not count for the limits of the axes: the ends of the arrows do
+        # the limits of the axes follow the ends of the arrows, not the annotations
         axis.update_datalim(
             np.concatenate([origins + 1.1 * vectors + side for side in (-_LABEL_ROOM_MM, _LABEL_ROOM_MM)])
         )
@@ -126,7 +126,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant) -> None:
 
 
 def _y_upwards(axis: Any) -> None:
-    """Let y count upwards: the section has y downwards, as viewers do."""
+    """Label y upwards: the section has y downwards as the viewer has."""
     axis.invert_yaxis()
     axis.yaxis.set_major_formatter(lambda y, _: f"{0.0 - y:g}")
 
@@ -169,7 +169,7 @@ def _thresholds(axis: Any, thresholds: Thresholds) -> None:
 
 
 def _clearance(axis: Any, curves: RunCurves) -> None:
-    """Draw both clearances with their intervals, and where they changed by something else than wear."""
+    """Draw both clearances with their intervals, and the changes by other causes than wear."""
     axis.set_ylabel("clearance with its\n5..95 % interval [mm]")
     if not curves.clearance:
         _say_nothing(axis, "not in the recording")

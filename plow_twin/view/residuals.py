@@ -1,4 +1,4 @@
-"""Measured poses of the journal less those of the model at the same stamps."""
+"""Residuals: measured poses of the journal minus those of the model at the same stamps."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _SCALE = 1e3
 
 
 class Residuals:
-    """Poses wait until the model has passed their stamps; then they are compared on the straight line between two."""
+    """Compares poses once the model has passed their stamps, linear between two of its rows."""
 
     def __init__(self) -> None:
         self._waiting: list[tuple[int, int, tuple[float, ...]]] = []
         self._last: tuple[int, Array] | None = None
 
-    def take(self, poses: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows) -> tuple[Indexes, Indexes, Array]:
-        """Return stamps, steps and residuals x, y [mm], theta [mrad], (n, 3), of what can be compared now.
+    def compare(self, poses: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows) -> tuple[Indexes, Indexes, Array]:
+        """Return stamps, steps and residuals x, y [mm], theta [mrad], (n, 3), of the poses that can be compared now.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""A recording turned into a rerun file with its arrangement: `to_rrd`."""
+"""A recording as a rerun file with its blueprint: `to_rrd`."""
 
 from __future__ import annotations
 
@@ -16,21 +16,20 @@ from plow_twin.view.drawing import Drawing
 from plow_twin.view.rrd_file import RrdFile
 from plow_twin.view.section import Section
 
-#: A curve with more rows is thinned.
+#: Most rows of a curve that is not thinned.
 MOST_ROWS: Final = 200_000
-#: The cross-section moves at this rate [Hz]; curves keep every row.
+#: Rate of the cross-section [Hz]; curves keep every row.
 SECTION_HZ: Final = 100.0
-#: Size of a recording for each row of its curves [B].
+#: Size of a recording per row of its curves [B].
 _BYTES_PER_ROW: Final = 400
 
 
 @dataclass(frozen=True)
 class ViewSummary:
-    """What a .rrd holds: first stamp, rows of the curves, moments of the cross-section, events.
+    """Content of a .rrd: first stamp, rows of the curves, instants of the cross-section, events.
 
-    `status` is how the recording ended, `lost` what its recorder counted as lost, by topic, parts that are not there or
-    of another run, and samples that came too late for further scenes. `rows` were read of the force curves; fewer
-    `curve_rows` were sent where they are thinned.
+    `status` is how the recording ended. `lost` has the counts of its recorder by topic, of parts that are missing or of
+    another run, and of samples too late for other scenes. Of `rows` of the force curves `curve_rows` were sent.
     """
 
     path: Path
@@ -79,12 +78,12 @@ def to_rrd(
     section_hz
         Rate of the cross-section [Hz].
     exaggerate
-        How many times as wide the clearance is drawn in the second cross-section; None: so that it is well seen.
+        Factor of the width of the clearance in the second cross-section; None: chosen by its size.
     most_rows
         Rows of a curve, and a twentieth of them of the cross-section, beyond which a long run is thinned: a curve keeps
         the least and the largest value of each span, so that no peak is lost.
     others
-        Further scenes, by name: their forces under the load of the run are drawn beside those of the run.
+        Other scenes, by name, whose forces under the load of the run are drawn too.
     on_progress
         Receives the share done, 0..1.
 
@@ -99,7 +98,7 @@ def to_rrd(
     stream = rr.RecordingStream("plow_twin")
     duration_s = reader.duration_s()
     with RrdFile(out) as file:
-        file.take(stream, layout.blueprint(Section.of(scene), wide, bool(others)))
+        file.attach(stream, layout.blueprint(Section.of(scene), wide, bool(others)))
         drawing = Drawing(
             stream,
             reader.header,

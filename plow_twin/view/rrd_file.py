@@ -1,4 +1,4 @@
-"""A .rrd file whose bytes are written here: what does not fit on the disk is an error, and nothing waits for it."""
+"""Writer of .rrd files that fails on a full disk instead of waiting for it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import rerun.blueprint as rrb
 
 from plow_twin.errors import RecordingError
 
-#: What is copied at once [B]; a pipe holds less.
+#: Bytes copied at once [B]; a pipe holds less.
 _CHUNK: Final = 1 << 20
 
 
 class RrdFile:
-    """Receives a stream through a pipe and writes it to a file, which stays only if it is whole.
+    """Receives a stream through a pipe and writes it to a file, which is removed unless it is whole.
 
     The SDK's own file sink (0.41) waits forever for a disk that is full: in `save`, `flush` or `disconnect`.
 
@@ -62,18 +62,18 @@ class RrdFile:
         if error is None:
             self.check()
 
-    def take(self, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
-        """Receive a stream and its arrangement, all of it that comes before the end."""
+    def attach(self, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+        """Attach a stream with its blueprint."""
         self._stream = stream
         stream.save(f"/dev/fd/{self._inlet}", default_blueprint=blueprint)
 
     @property
     def failed(self) -> bool:
-        """Whether something could not be written."""
+        """Whether a write has failed."""
         return self._error is not None
 
     def check(self) -> None:
-        """Raise RecordingError if something could not be written."""
+        """Raise RecordingError if a write has failed."""
         if self._error is not None:
             raise self._refused(self._error) from self._error
 
@@ -87,5 +87,5 @@ class RrdFile:
                     shutil.copyfileobj(outlet, self._file, _CHUNK)
             except OSError as error:
                 self._error = error
-                while outlet.read(_CHUNK):  # else the stream waits
+                while outlet.read(_CHUNK):  # otherwise the stream would wait
                     pass

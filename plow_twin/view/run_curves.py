@@ -65,7 +65,7 @@ class RunCurves:
         topics = {reader.header.topic(name): name for name in templates}
         holes = Holes()
         for batch in reader.batches():
-            missing = holes.take(batch.entries)
+            missing = holes.find(batch.entries)
             resets = {index for index, entry in batch.entries.others.items() if isinstance(entry, Reset)}
             places = sorted(resets | set(missing))
             for place, part in zip((None, *places), batch.parted(places), strict=True):

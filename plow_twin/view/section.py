@@ -1,4 +1,4 @@
-"""The cross-section as rerun draws it: millimetres, and y downwards: each y changes its sign here."""
+"""The cross-section for rerun: in millimetres, with y downwards."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Array = NDArray[np.float64]
 _MM: Final = 1000.0
 #: Length of an arrow [mm] per force [N].
 ARROW_MM_PER_N: Final = 7e-4
-#: A force below that is not drawn [N].
+#: Least force that is drawn [N].
 FAINT_N: Final = 500.0
-#: The head's body is drawn that much larger than its cavity [mm]; its true outline is not part of a scene.
+#: Distance of the body's outline from the cavity [mm]; a scene has no true outline.
 BODY_MARGIN_MM: Final = 60.0
 
-#: Depth of a pad as it is drawn [mm] per wear depth [mm], and the pad's length [mm].
+#: Drawn depth of a pad [mm] per wear depth [mm], and its length [mm].
 PAD_MM_PER_MM: Final = 200.0
 _PAD_MM: Final = 60.0
-#: A label stands so far below its place [mm].
+#: Distance of a label below its place [mm].
 LABEL_MM: Final = 16.0
 
 #: One hue per corner; the pair with the vertical wall in the lighter shade (Okabe and Ito's palette).
@@ -43,17 +43,17 @@ _OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 
 @dataclass(frozen=True)
 class Section:
-    """Sizes [mm] of what does not change in a run."""
+    """Sizes [mm] that are constant in a run."""
 
     frame: Array
     cavity: Array
     labels: tuple[str, ...]
-    #: what to call the frame: with springs under it all is seen from it
+    #: name of the frame; with a support the section is drawn in its axes
     frame_name: str = "frame (fixed)"
 
     @classmethod
     def of(cls, scene: Scene) -> Section:
-        """Take them from a scene."""
+        """Return the sizes of a scene."""
         frame = _MM * np.array([scene.frame.width_m, scene.frame.height_m])
         gaps = _MM * np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
         letters = {corner: letter for letter, corner in scene.frame.labels.items()}
@@ -84,17 +84,17 @@ class Section:
         return max(1.0, round(float(self.frame.min()) / 3.0 / gap, 1)) if gap > 0.0 else 1.0
 
     def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Return the four walls where the gaps are `factor` times as wide, shape (4, 2, 2), and which of them touch.
+        """Return the four walls with gaps `factor` times as wide, shape (4, 2, 2), and which of them touch.
 
-        Walls in the order top, right, bottom, left; each is drawn through its two places beside the frame's corners, so
-        that wear is part of it.
+        Walls in the order top, right, bottom, left; each passes through its two points at the frame's corners, wear
+        included.
         """
         places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
         return places[walls], (penetration[walls] > 0.0).any(axis=1)
 
     def pads(self, wear_depth_mm: Array) -> tuple[Array, Array, Array]:
-        """Return middles, half sizes and places of labels of bars inside the frame that show the wear of its pads.
+        """Return centres, half sizes and places of labels of the bars inside the frame that show the wear of its pads.
 
         A bar lies along the wall that its pair touches, from the corner on. Each has shape (8, 2).
         """
@@ -102,7 +102,7 @@ class Section:
         along = _SIGNS - _OUTWARDS
         depth = np.minimum(PAD_MM_PER_MM * wear_depth_mm, 0.25 * self.frame.min())[:, None]
         middles = (corners - 0.5 * depth * _OUTWARDS - (0.5 * _PAD_MM + 12.0) * along) * _FLIP
-        # well inside the frame, where no wall comes: two rows to a corner, that of its vertical wall nearer the middle
+        # inside the frame, away from the walls: two rows at a corner, that of its vertical wall nearer the centre
         inwards = np.stack((np.full(PAIR_COUNT, 0.5), np.where(np.abs(_OUTWARDS[:, 0]) > 0.5, 0.26, 0.64)), axis=1)
         labels = corners * inwards * _FLIP - [0.0, LABEL_MM]
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels
@@ -129,7 +129,7 @@ class Section:
 
 
 def _placed(points: Array, pose: Iterable[float]) -> Array:
-    """Return points of the head, shape (..., 2) [mm], where the pose x, y [m], theta [rad] puts them, y downwards."""
+    """Return points of the head, shape (..., 2) [mm], at the pose x, y [m], theta [rad], y downwards."""
     x, y, theta = pose
     turn = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
     placed: Array = (points @ turn + _MM * np.array([x, y])) * _FLIP

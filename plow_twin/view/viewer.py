@@ -1,4 +1,4 @@
-"""rerun's own viewer as a program: found, started on the loopback address, ended with whoever started it."""
+"""rerun's viewer as a program: found, started on the loopback address, ended with the process that started it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ import rerun.blueprint as rrb
 from plow_twin.errors import RecordingError
 
 LOOPBACK: Final = "127.0.0.1"
-#: Data beyond that are dropped, the oldest first: hours do not fill the machine.
+#: Memory of the viewer; beyond it the oldest data are dropped.
 _MEMORY: Final = "2GB"
 _START_S: Final = 60.0
 
 
 def viewer_program() -> str:
-    """Return rerun's own program, not the wrapper of the same name, which would outlive whoever stops it.
+    """Return the program of rerun, not the wrapper of the same name, which would outlive the process that stops it.
 
     Raises
     ------
@@ -43,24 +43,24 @@ def viewer_program() -> str:
 
 @dataclass(frozen=True)
 class Viewer:
-    """A viewer that runs; `url` takes data, `page` shows them in a browser (empty: in a window)."""
+    """A running viewer; `url` receives data, `page` shows them in a browser (empty: a window)."""
 
     process: subprocess.Popen[bytes]
     url: str
     page: str
 
-    def take(self, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
-        """Show a stream in its arrangement."""
+    def attach(self, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
+        """Attach a stream with its blueprint."""
         stream.connect_grpc(self.url, default_blueprint=blueprint)
 
     def close(self) -> None:
-        """End it; one that is stopped too."""
+        """End the viewer, also when it is suspended."""
         self.process.kill()
         self.process.wait()
 
 
 def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) -> Viewer:
-    """Start a viewer that only this machine can reach: a page on `web_port`, or a window.
+    """Start a viewer on the loopback address: a page on `web_port`, or a window.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def start_viewer(*, web_port: int | None = None, options: Sequence[str] = ()) ->
     if web_port is not None:
         command += ["--serve-web", "--web-viewer-port", str(web_port), "--server-memory-limit", _MEMORY]
     bound = shutil.which("setpriv")
-    if bound is not None:  # killed with this process
+    if bound is not None:  # it is killed with this process
         command = [bound, "--pdeathsig", "KILL", *command]
     environment = {"RUST_LOG": "warn", **os.environ}
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment)
@@ -91,7 +91,7 @@ def _address(port: int) -> str:
 
 
 def page_address(web_port: int, port: int) -> str:
-    """Return the address of the page that shows the data on a port; without it the page is empty.
+    """Return the address of the page that shows the data on a port.
 
     In the dark theme: the cross-section's names are not legible on the light one's labels.
     """
@@ -99,14 +99,14 @@ def page_address(web_port: int, port: int) -> str:
 
 
 def free_port() -> int:
-    """Return a port of the loopback address that nobody uses."""
+    """Return a free port of the loopback address."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])
 
 
 def page_port(asked: int) -> int:
-    """Return the port for a page: the one asked for, any for 0.
+    """Return the port for a page: the given one, or a free one for 0.
 
     Raises
     ------

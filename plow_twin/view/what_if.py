@@ -1,4 +1,4 @@
-"""What other scenes would have borne under the load of a run: their largest contact forces beside those of the run."""
+"""Largest contact forces of other scenes under the load of a run, beside those of the run."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from plow_twin.view.columns import Array, Curves, Indexes, TimeAxis
 
 
 class WhatIf:
-    """Walk other scenes, by name, through the journal of a run, and draw their forces; without any nothing is done.
+    """Passes the journal of a run through other scenes, by name, and draws their forces; idle without scenes.
 
     Raises
     ------
     RecordingError
-        The run was under loads of its own scene: there is no load in its journal.
+        The run was under the loads of its scene: its journal has no load.
     """
 
     def __init__(
@@ -52,28 +52,28 @@ class WhatIf:
 
     @property
     def lost(self) -> dict[str, int]:
-        """Samples that came when the scenes had passed their stamps, under their name in `lost`, if any."""
+        """Count of samples that came after the scenes had passed their stamps, by its name in `lost`."""
         return {"samples_too_late": self._walk.late} if self._walk.late else {}
 
     def add(self, entries: Entries, stamps: Indexes, steps: Indexes) -> None:
-        """Go on by entries of the journal."""
+        """Advance by entries of the journal."""
         if self._curves:
             order = np.argsort(stamps[entries.sample], kind="stable")
             self._stamps, self._steps = stamps[entries.sample][order], steps[entries.sample][order]
             self._walk.add(entries)
 
     def run(self, stamps: Indexes, steps: Indexes, peak: Array) -> None:
-        """Draw what the run itself bore: largest forces [N], shape (n, 8)."""
+        """Draw the largest forces [N] of the run, shape (n, 8)."""
         if self._curves:
             self._curves[0].add(stamps, steps, _largest_kn(peak))
 
     def end_lines(self) -> None:
-        """End the lines: what comes does not go on from what was."""
+        """End the lines: the next rows begin new ones."""
         for curve in self._curves:
             curve.end()
 
     def flush(self) -> None:
-        """Send what has been collected."""
+        """Send the collected rows."""
         for curve in self._curves:
             curve.flush()
 

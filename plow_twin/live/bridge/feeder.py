@@ -1,4 +1,4 @@
-"""From messages of a bridge to the inputs of a live twin, by the mapping."""
+"""Messages of a bridge as inputs of a live twin, by the mapping."""
 
 from __future__ import annotations
 
@@ -15,28 +15,27 @@ from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
 
-#: A number that falls by more than this is that of a sender that has begun anew, if the next one goes on from it; one
-#: that rises by more is believed then too.
+#: A number that falls or rises by more than this is believed if the next one continues it: the sender has restarted.
 _RESTART = 1000
-#: More samples than that are not lost between two messages: a day at 10 kHz.
+#: Most samples lost between two messages: a day at 10 kHz.
 _MOST_LOST = 10**9
-#: A 0 or 1 after this many is a new beginning, before it one that came late.
+#: A 0 or 1 after this number of messages is a restart, before it a late message.
 _FIRST = 10
-#: A deviation of the load that changes by a smaller share is not journaled anew.
+#: Least relative change of a deviation of the load that is journalled.
 _NOTABLE = 0.02
 
 
 class Feeder:
-    """Read messages by their roles and hand them to a runtime.
+    """Reads messages by their roles and passes them to a runtime.
 
     Parameters
     ----------
     roles
-        The mapping; roles that the twin does not take are passed over.
+        The mapping; roles that a live twin does not use are ignored.
     runtime
         The live twin.
     model
-        What makes a load of what the drive tells; None: the load itself comes.
+        Model of the load from the drive's signals; None: the load is measured.
     """
 
     def __init__(self, roles: Mapping[str, Role], runtime: Runtime, model: LoadModel | None = None) -> None:
@@ -46,13 +45,13 @@ class Feeder:
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
         for name, role in roles.items():
             self._by_topic.setdefault(role.topic, []).append((name, role))
-        #: the time of a source that brings its own [ns]: the newest stamp, unless it stands alone far ahead
+        #: time of a source with its own time [ns]: the newest stamp, unless it lies alone far ahead
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
         self._number = 0
-        #: a number that does not go on from those before, of the newest message
+        #: number of the newest message, where it does not continue those before
         self._odd: int | None = None
-        #: whether the sender has told a number
+        #: whether the sender numbers its messages
         self._counts = False
         self._sender = 0
         self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
@@ -66,21 +65,21 @@ class Feeder:
         inputs.senders.alive([self._name])
 
     def begin(self, messages: list[Arrived]) -> None:
-        """Begin the time of a source that brings its own: at the first message that the next one goes on from."""
+        """Begin the time of a source with its own time at the first message that the next one continues."""
         read = [role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ())]
         stamps = [found[0] for found in read if found is not None]
         back_ns = round(self._runtime.settings.jump_back * 1e9)
         goes_on = (first for first, second in pairwise(stamps) if second >= first - back_ns)
         self.newest_ns = next(goes_on, stamps[0] if stamps else 0)
 
-    def take(self, messages: list[Arrived]) -> None:
-        """Take messages in order of arrival."""
+    def feed(self, messages: list[Arrived]) -> None:
+        """Process messages in order of arrival."""
         samples: list[Arrival] = []
         for arrived in messages:
             roles = self._by_topic.get(arrived.topic, ())
             for name, role in roles:
                 if len(roles) > 1 and role.empty(arrived):
-                    continue  # another role's row
+                    continue  # a row of another role
                 if name in ("excitation", "drive"):
                     samples += self._sample(role, arrived)
                 elif name in self._optional:
@@ -91,7 +90,7 @@ class Feeder:
             self._runtime.samples(samples)
 
     def _follow_time(self, stamp_ns: int) -> None:
-        """Go on to the time of a sample; to one far ahead only when the next one does not go back from there."""
+        """Advance to the time of a sample; a sample far ahead counts only if the next one stays there."""
         jump_ns = round(self._runtime.settings.jump_forward * 1e9)
         far_ns, self._far_ahead_ns = self._far_ahead_ns, None
         if far_ns is not None and stamp_ns >= far_ns - jump_ns:
@@ -131,33 +130,33 @@ class Feeder:
         wrench, deviation = load
         absurd = intake.limits is not None and intake.limits.exceeded(wrench)
         if absurd or not all(map(math.isfinite, (*wrench, *deviation))):
-            return [(stamp_ns, wrench)]  # will not be used, and its deviation is none of the others'
+            return [(stamp_ns, wrench)]  # it will not be used, nor its deviation
         if any(abs(new - old) > _NOTABLE * max(new, old) for new, old in zip(deviation, self._deviation, strict=True)):
             self._deviation = deviation
             self._runtime.driver.spread(stamp_ns, deviation)
         return [(stamp_ns, wrench)]
 
     def _numbered(self, role: Role, arrived: Arrived) -> tuple[bytes, int, bool]:
-        """Return the sender, its number of the message (one without is counted here), and whether it came before."""
+        """Return the sender, the number of the message (counted here if it has none), and whether it came before."""
         number = role.number(arrived) if role.sequence else None
         if number is None:
-            # unreadable, or not numbered: it is the one that follows
+            # unreadable or not numbered: the next number
             number = self._number + 1
         elif not self._counts:
             self._counts = True
-            if self._number:  # those before had no numbers: they tell nothing of this one's
+            if self._number:  # the messages before had no numbers
                 self._begin_anew()
         elif number == self._odd:
             return self._name, number, True
         elif self._goes_on(number):
             self._odd = None
-        else:  # it is taken for the one that follows, until the next one tells
+        else:  # counted as the next number until the next message decides
             self._odd, number = number, self._number + 1
         again, self._number = number == self._number, number
         return self._name, number, again
 
     def _goes_on(self, number: int) -> bool:
-        """Tell whether a number can be counted: it goes on from those before, or from an odd one just before it."""
+        """Return whether a number continues those before, or an odd one just before it."""
         odd, before = self._odd, self._number
         if odd is not None and abs(number - odd) < abs(number - before):
             if not before < odd <= before + _MOST_LOST:
@@ -170,7 +169,7 @@ class Feeder:
         return abs(number - before) <= _RESTART and not number <= 1 < before - _FIRST
 
     def _begin_anew(self) -> None:
-        """Take what follows for another sender's."""
+        """Count the following messages as those of another sender."""
         self._sender += 1
         self._runtime.inputs.senders.start([self._name])
         self._runtime.inputs.senders.alive([self._name])
@@ -187,8 +186,8 @@ class Feeder:
         elif name == "travel":
             inputs.take_travel(found[0], found[1]["speed"])
         elif name == "gaps":
-            told = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
-            inputs.take_gaps(found[0], told)
+            measured = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
+            inputs.take_gaps(found[0], measured)
         else:
             x, y, theta = (found[1].get(name, math.nan) for name in ROLES["head_pose"])
             inputs.take_pose(found[0], (x, y, theta))

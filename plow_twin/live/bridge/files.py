@@ -19,9 +19,9 @@ from plow_twin.record.times import NO_TIME
 
 #: Most bytes read from a source at once.
 _BLOCK: Final = 1 << 18
-#: Bytes by which a file is known again.
+#: Bytes by which a file is recognised.
 _REMEMBERED: Final = 256
-#: A followed file is looked at that often [s].
+#: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02
 STDIN_TOPIC: Final = "stdin"
 
@@ -34,9 +34,9 @@ class _Tail:
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
-    #: the newest bytes read: others stand there when the file was written anew
+    #: the newest bytes read, which differ in a file that was written anew
     _newest: bytes = b""
-    #: half lines that no end came for: the file was cut or replaced
+    #: lines whose end never came: the file was cut or replaced
     left: int = 0
 
     @property
@@ -53,7 +53,7 @@ class _Tail:
     def _block(self) -> bytes:
         if self._file is None or self._is_another():
             rest = b"" if self._file is None or self._is_anew() else self._read()
-            if rest:  # what the writer left in the one that was moved away
+            if rest:  # the rest of the file that was moved away
                 return rest
             try:
                 file = self.path.open("rb")
@@ -62,7 +62,7 @@ class _Tail:
             self.close()
             self._file, self._newest = file, b""
             self.rows = self.rows.of_another_file()
-            # half a line that was left there: a number in it may have been cut
+            # an incomplete line: a number in it may have been cut
             self.left += self.lines.begun
             self.lines = Lines()
         return self._read()
@@ -73,16 +73,16 @@ class _Tail:
         return data
 
     def _is_anew(self) -> bool:
-        """Tell whether the file was cut; what was written since may be longer than what was there."""
+        """Return whether the file was cut, even if it has grown beyond its old size since."""
         begin = self._file.tell() - len(self._newest)
         return os.pread(self._file.fileno(), len(self._newest), begin) != self._newest
 
     def _is_another(self) -> bool:
-        """Tell whether the file was written anew, or another one stands at its path."""
+        """Return whether the file was written anew, or another file is at its path."""
         try:
             found = self.path.stat()
         except FileNotFoundError:
-            return False  # until there is another, the one that was moved away may grow
+            return False  # until another file is there, the one that was moved away may grow
         ours = os.fstat(self._file.fileno())
         return (found.st_dev, found.st_ino) != (ours.st_dev, ours.st_ino) or self._is_anew()
 
@@ -111,7 +111,7 @@ class Files:
     paths
         The files; when they are read once, their messages are put in order by the times in them.
     follow
-        Go on when the end is reached: what is appended later is read then.
+        Continue at the end with lines that are appended later.
 
     Raises
     ------
@@ -179,12 +179,12 @@ def _all(tail: _Tail) -> Iterator[Arrived]:
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
-    """Return the stamp in a row; when it was read says nothing of its place."""
+    """Return the stamp in a row; the time of reading is not its time."""
     return None if stamp_ns is None else stamp_ns(Arrived(row.topic, NO_TIME, row.content))
 
 
 class StandardInput:
-    """Lines on standard input, or on another descriptor; they end with it.
+    """Lines on standard input or another descriptor, until its end.
 
     Raises
     ------
@@ -211,10 +211,10 @@ class StandardInput:
         return {STDIN_TOPIC: self._rows.header("-")}
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Take note of nothing: there is one topic."""
+        """Do nothing: there is one topic."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:
-        """Return what has come."""
+        """Return the messages that have come."""
         if self._first:
             first, self._first = self._first, []
             return first
@@ -233,4 +233,4 @@ class StandardInput:
         return messages(STDIN_TOPIC, lines, self._rows)
 
     def close(self) -> None:
-        """Leave the descriptor to its owner."""
+        """Do nothing: the descriptor belongs to its owner."""

@@ -16,14 +16,14 @@ from plow_twin.live.bridge.source import BridgeError, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
 
-#: Messages that wait to be read; what comes when so many wait is counted as lost.
+#: Most messages that wait to be read; further ones are counted as lost.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 
 
 @dataclass(frozen=True)
 class Access:
-    """How a broker is reached.
+    """Address and credentials of a broker.
 
     `url` is `mqtt://HOST:PORT`, or `mqtts://` with TLS; without a host it is this machine. `user` and `password` may be
     empty. `ca`, `certificate` and `key` are PEM files; without `ca` those of the system are trusted. `plain` allows a
@@ -41,7 +41,7 @@ class Access:
 
 
 class Mqtt:
-    """A session with a broker that outlives a broken connection: what is sent meanwhile with QoS 1 comes later.
+    """A session with a broker that outlives a broken connection: messages of QoS 1 sent meanwhile come later.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Mqtt:
     Raises
     ------
     BridgeError
-        The address cannot be used, or nobody answers there, or the broker refuses.
+        The address is invalid, no broker answers, or the broker refuses.
     """
 
     def __init__(self, access: Access, connect_s: float = 10.0) -> None:
@@ -66,7 +66,7 @@ class Mqtt:
         self.host, self.port, tls = _address(access)
         self._topics: list[str] = []
         self._subscribed = False
-        #: whether what the broker calls retained was sent before anybody listened
+        #: whether messages marked as retained are older than the subscription
         self._from_before = True
         self._queue: deque[tuple[str, bytes, int, bool]] = deque()
         self._arrived = threading.Event()
@@ -95,7 +95,7 @@ class Mqtt:
             raise BridgeError(f"{self._access.url}: {trouble}")
 
     def poll(self, timeout_s: float) -> list[Arrived]:
-        """Return what has arrived."""
+        """Return the messages that have arrived."""
         if not self._queue:
             self._arrived.wait(timeout_s)
         self._arrived.clear()
@@ -103,7 +103,7 @@ class Mqtt:
         return [Arrived(topic, time_ns, read_json(payload), retained) for topic, payload, time_ns, retained in taken]
 
     def close(self) -> None:
-        """Leave the broker; it keeps what comes until the session is resumed."""
+        """Disconnect; the broker keeps messages until the session is resumed."""
         self._client.disconnect()
         self._client.loop_stop()
 
@@ -133,7 +133,7 @@ class Mqtt:
             self.trouble = f"refused: {reason}"
             self._answer.set()
             return
-        # in a session that goes on brokers may send what they kept for it as retained too
+        # in a resumed session brokers may mark messages that they kept for it as retained too
         self._from_before = not flags.session_present
         if self._subscribed and flags.session_present:
             self.connected, self.trouble = True, ""

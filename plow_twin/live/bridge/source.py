@@ -1,4 +1,4 @@
-"""What a source of messages is, and how a line or a payload becomes one."""
+"""Interface of sources of messages, and parsing of lines and payloads."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from plow_twin.scene_file.csv_rows import delimiter_of
 
 #: Most messages that a source hands over at once.
 BATCH: Final = 256
-#: A longer line or payload is none of a sensor's [B].
+#: Longest line or payload that is read [B].
 LONGEST: Final = 65536
 
 
 class BridgeError(PlowTwinError):
-    """A source cannot be opened or has ended for good; the message says which and why."""
+    """A source cannot be opened or has failed for good; the message names it and the reason."""
 
 
 class Bridge(Protocol):
-    """Where messages come from.
+    """A source of messages.
 
     Attributes
     ----------
     ends : bool
         Whether the source has an end and its own time: a file that is read once.
     finished : bool
-        Whether nothing more will come.
+        Whether the source has ended.
     connected : bool
     lost : int
-        Messages that could not be kept until they were read.
+        Messages that were dropped before they were read.
     trouble : str
-        Why nothing comes just now; empty: it may.
+        Why no messages can come just now, or empty.
     """
 
     ends: bool
@@ -45,20 +45,20 @@ class Bridge(Protocol):
     trouble: str
 
     def topics(self) -> Mapping[str, TopicType] | None:
-        """Return types by topic; None: any topic that the mapping names."""
+        """Return types by topic, or None: the mapping may name any topic."""
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
-        """Begin to receive these topics; files that are read once are put in order by `stamp_ns`."""
+        """Subscribe to these topics; messages of files that are read once are ordered by `stamp_ns`."""
 
     def poll(self, timeout_s: float) -> list[Arrived]:
-        """Return what has arrived; wait at most so long for the first message. Unreadable content is None."""
+        """Return the messages that have come, waiting `timeout_s` at most; unreadable content is None."""
 
     def close(self) -> None:
-        """Let go of the source."""
+        """Close the source."""
 
 
 def read_json(data: bytes) -> dict[str, Any] | None:
-    """Return the object that JSON text stands for, or None."""
+    """Return the object in JSON text, or None."""
     if len(data) > LONGEST:
         return None
     try:
@@ -69,14 +69,14 @@ def read_json(data: bytes) -> dict[str, Any] | None:
 
 
 class Lines:
-    """Bytes as they come, cut into whole lines; one that is too long is given up and comes as None."""
+    """Splits bytes into whole lines; a line that is too long is None."""
 
     def __init__(self) -> None:
         self._rest = b""
         self._skipping = False
 
     def add(self, data: bytes) -> list[bytes | None]:
-        """Return the lines that are whole now."""
+        """Return the lines that are complete now."""
         *whole, self._rest = (self._rest + data).split(b"\n")
         found: list[bytes | None] = []
         for line in whole:
@@ -88,24 +88,24 @@ class Lines:
 
     @property
     def begun(self) -> bool:
-        """Whether a line has begun and not ended."""
+        """Whether a line is incomplete."""
         return self._skipping or bool(self._rest)
 
     def end(self) -> list[bytes | None]:
-        """Return what is left at the end, where the last line may lack its newline."""
+        """Return the last line, which may lack its newline."""
         rest, self._rest = self._rest, b""
         return [None] if self._skipping else [rest] if rest else []
 
 
 class Rows:
-    """Lines of CSV under a header, or JSON objects one a line; which one, the first line tells."""
+    """Parser of lines: CSV under a header, or JSON objects, as the first line shows."""
 
     def __init__(self) -> None:
         #: names of the columns, or keys of the first object; None before the first line
         self.columns: list[str] | None = None
         self._json = False
         self._delimiter = ","
-        #: columns of the file in whose place this one stands
+        #: columns of the file that this one replaces
         self._before: list[str] | None = None
 
     def header(self, source: str) -> Columns:
@@ -113,13 +113,13 @@ class Rows:
         return columns_of(source, self.columns or ())
 
     def of_another_file(self) -> Rows:
-        """Return what reads a file that takes this one's place: under its own header, without one under this one's."""
+        """Return the parser of a file that replaces this one: by its own header, or without one by this header."""
         rows = Rows()
         rows._before = self.columns
         return rows
 
     def read(self, line: bytes | None) -> dict[str, Any] | bool | None:
-        """Return the content of a line: None where it is unreadable, False where it says nothing (header, empty)."""
+        """Return the content of a line: None if it is unreadable, False for a header or an empty line."""
         if line is None:
             return None
         line = line.strip(b"\r \xef\xbb\xbf")  # not tabs: empty cells may stand between them
@@ -127,7 +127,7 @@ class Rows:
             return False
         if self.columns is None and (self._json or line.startswith(b"{")):
             self._json = True
-            self.columns = list(read_json(line) or ()) or None  # an object that is cut or empty has no keys to tell
+            self.columns = list(read_json(line) or ()) or None  # a cut or empty object has no keys
         if self._json:
             return read_json(line)
         cells = self._cells(line)
@@ -139,7 +139,7 @@ class Rows:
                 return False
             self.columns = self._before
         if [cell.strip() for cell in cells] == self.columns:
-            return False  # a file that goes on under its header again
+            return False  # a file that repeats its header
         if len(cells) != len(self.columns):
             return None
         if self._delimiter != ",":  # decimal commas
