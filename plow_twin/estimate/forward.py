@@ -54,6 +54,8 @@ class Forward:
     """
 
     def __init__(self, scene: Scene, load: Load) -> None:
+        if scene.head.carries != "walls":
+            raise EstimateError(f"scene: got head.carries {scene.head.carries}, expected walls: the fit knows no block")
         if scene.support is not None:
             raise EstimateError(f"scene: got {scene.support}, expected no support: the fit does not know its place")
         nominal = compile_scene(replace(scene, loads=(), wear=None), TOLERANCE, sampled=True)

@@ -12,6 +12,13 @@ centre at p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
 
 with (rx, ry) the offset of G from the cavity's centre in head axes. The penetration past a wall with outward normal n
 at distance H is n . p - H; its rate is n . dp/dt, positive inward.
+
+A head that carries corners (`carries: corners`) is a block in a fixed cavity. Its state is kept in world axes, and its
+corner c = (cx, cy) is at
+
+    p_x = X + c cx - s cy              p_y = Y + s cx + c cy
+
+so penetrations and arms are linear again, and the same equations hold with other coefficients.
 """
 
 from __future__ import annotations
@@ -46,11 +53,11 @@ def wall_distances(scene: Scene) -> NDArray[np.float64]:
 def penetration_rows(scene: Scene) -> NDArray[np.float64]:
     """Return the coefficients of each penetration, shape (5, 8): rows for c, s, X, Y and 1, before wear.
 
-    n . p - H  with p of the module's docstring.
+    n . p - H  with p of the module's docstring, or with the corner's place x + R c of a head that carries corners.
     """
     corner_x, corner_y = corner_positions(scene)
     offset_x, offset_y = scene.head.com_offset_m
-    return np.array(
+    rows = np.array(
         [
             NORMAL_X * corner_x + NORMAL_Y * corner_y,
             NORMAL_X * corner_y - NORMAL_Y * corner_x,
@@ -59,6 +66,22 @@ def penetration_rows(scene: Scene) -> NDArray[np.float64]:
             NORMAL_X * offset_x + NORMAL_Y * offset_y - wall_distances(scene),
         ]
     )
+    return _of_places(scene, rows)
+
+
+def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rows of a place; R c with the corner c turns the other way than R^T c, and the head's place counts up."""
+    if scene.head.carries == "corners":
+        rows[1:4] *= -1.0
+    return rows
+
+
+def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rows of an arm about G; that of a corner of the head does not depend on the head's place."""
+    if scene.head.carries == "corners":
+        rows[0] *= -1.0
+        rows[2:] = 0.0
+    return rows
 
 
 def arm_rows(scene: Scene) -> NDArray[np.float64]:
@@ -67,7 +90,7 @@ def arm_rows(scene: Scene) -> NDArray[np.float64]:
     The force of a pair acts at the corner along n, so its moment about G is (p - r) x n per newton.
     """
     corner_x, corner_y = corner_positions(scene)
-    return np.array(
+    rows = np.array(
         [
             NORMAL_Y * corner_x - NORMAL_X * corner_y,
             NORMAL_Y * corner_y + NORMAL_X * corner_x,
@@ -75,6 +98,7 @@ def arm_rows(scene: Scene) -> NDArray[np.float64]:
             NORMAL_X,
         ]
     )
+    return _of_arms(scene, rows)
 
 
 def slip_rows(scene: Scene) -> NDArray[np.float64]:
@@ -83,7 +107,7 @@ def slip_rows(scene: Scene) -> NDArray[np.float64]:
     t . p without its constant, t the wall's outward normal turned by +90 degrees.
     """
     corner_x, corner_y = corner_positions(scene)
-    return np.array(
+    rows = np.array(
         [
             -NORMAL_Y * corner_x + NORMAL_X * corner_y,
             -NORMAL_Y * corner_y - NORMAL_X * corner_x,
@@ -91,6 +115,7 @@ def slip_rows(scene: Scene) -> NDArray[np.float64]:
             -NORMAL_X,
         ]
     )
+    return _of_places(scene, rows)
 
 
 def slip_arm_rows(scene: Scene) -> NDArray[np.float64]:
@@ -99,7 +124,7 @@ def slip_arm_rows(scene: Scene) -> NDArray[np.float64]:
     (p - r) x t per newton.
     """
     corner_x, corner_y = corner_positions(scene)
-    return np.array(
+    rows = np.array(
         [
             NORMAL_X * corner_x + NORMAL_Y * corner_y,
             NORMAL_X * corner_y - NORMAL_Y * corner_x,
@@ -107,6 +132,7 @@ def slip_arm_rows(scene: Scene) -> NDArray[np.float64]:
             -NORMAL_Y,
         ]
     )
+    return _of_arms(scene, rows)
 
 
 def body_state(
@@ -145,6 +171,38 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
         ],
         axis=1,
     )  # fmt: skip
+
+
+def tumbles(scene: Scene) -> bool:
+    """Tell whether the head may turn beyond 45 degrees: a square block without wear, whose corners are all alike."""
+    alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
+    return scene.head.carries == "corners" and alike
+
+
+def state_of(
+    scene: Scene,
+    q: tuple[float, float, float] | NDArray[np.float64],
+    v: tuple[float, float, float] | NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Convert pose and rate of the cavity's or the block's centre, shape (3,) each, to the solver's state, shape (8,).
+
+    Of a head that carries walls these are body coordinates. Where it carries corners place and velocity are resolved in
+    world axes; cosine and sine are those of the angle without the quarter turns of a block that tumbles.
+    """
+    if scene.head.carries == "walls":
+        return body_state(q, v, scene.head.com_offset_m)
+    x, y, theta = (float(value) for value in q)
+    vx, vy, omega = (float(value) for value in v)
+    quarter = 0.5 * math.pi
+    angle = theta - quarter * round(theta / quarter) if tumbles(scene) else theta
+    return np.array([x, y, vx, vy, omega, math.cos(angle), math.sin(angle), theta])
+
+
+def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert poses and rates, shape (s, 6), to the solver's states, shape (s, 8) (`state_of`, row by row)."""
+    if scene.head.carries == "walls":
+        return body_states(states, scene.head.com_offset_m)
+    return np.array([state_of(scene, row[:3], row[3:]) for row in states]).reshape(-1, STATE_SIZE)
 
 
 def length_scale(scene: Scene) -> float:

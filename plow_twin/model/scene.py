@@ -77,7 +77,7 @@ def _choice(doc: str, choices: Collection[str], default: Any = ...) -> Any:
 
 @dataclass(frozen=True)
 class Head:
-    """The plough head: a rigid body with a rectangular cavity."""
+    """The moving body: a plough head with a rectangular cavity about the frame, or a block inside a fixed cavity."""
 
     mass_kg: float = _quantity("kg", "mass", gt=0.0)
     inertia_kg_m2: float = _quantity("kg m^2", "moment of inertia about the centre of mass", gt=0.0)
@@ -89,6 +89,12 @@ class Head:
     )
     com_offset_m: tuple[float, float] = _quantity(
         "m", "centre of mass from the cavity's centre, head axes (rotation: consistent)", (0.0, 0.0)
+    )
+    carries: str = _choice(
+        "walls: the head is the cavity, its walls meet the corners of a fixed frame; corners: the head is a block of "
+        "the frame's size, its corners meet the walls of a fixed cavity",
+        ("walls", "corners"),
+        "walls",
     )
 
 
@@ -544,6 +550,11 @@ def _check_friction(friction: Friction) -> Iterator[Problem]:
 
 def _check_rotation(scene: Scene) -> Iterator[Problem]:
     offset = any(value != 0.0 for value in scene.head.com_offset_m)
+    if scene.head.carries == "corners":
+        if offset:
+            yield Problem("head.com_offset_m", scene.head.com_offset_m, "(0, 0) for carries: corners")
+        if scene.support is not None:
+            yield Problem("support", scene.support, "none for carries: corners, whose walls are fixed")
     if scene.head.rotation == "paper" and offset:
         yield Problem("head.com_offset_m", scene.head.com_offset_m, "(0, 0) for rotation: paper")
     if scene.head.rotation == "consistent":

@@ -21,7 +21,7 @@ from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.modes import settle_moved
-from plow_twin.solve.state import PARAMS, ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_records, new_work, state_type
+from plow_twin.solve.state import ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_records, new_work, state_type
 
 __all__ = ["TwinBatch"]
 
@@ -77,10 +77,10 @@ class TwinBatch:
         self.scenes = tuple(scenes)
         self.tol = tol
         self._compiled = [compile_scene(scene, tol, sampled=True) for scene in scenes]
-        self._params = new_records(PARAMS, len(scenes))
+        self._params = new_records(self._compiled[0].params.dtype, len(scenes))
+        terms = _merge(self._compiled)
         for index, compiled in enumerate(self._compiled):
             self._params[index] = compiled.params
-        terms = _merge(self._compiled)
         self._stick = terms.stick
         self._states = new_records(state_type(self._compiled[0].parts.terms), len(scenes))
         self._wrench = np.zeros((len(scenes), 3))
@@ -210,8 +210,7 @@ class TwinBatch:
         self._states["damping_factor"] = damping
         for index in np.flatnonzero(displaced):
             there = pose + away[index]
-            offset = self.scenes[index].head.com_offset_m
-            self._states["y"][index] = geometry.body_state(there[:3], there[3:], offset)
+            self._states["y"][index] = geometry.state_of(self.scenes[index], there[:3], there[3:])
 
     def move(self, which: ArrayLike, q: ArrayLike, v: ArrayLike) -> None:
         """Put some twins elsewhere at the present time; their wear and counts stay.
@@ -224,8 +223,8 @@ class TwinBatch:
             Poses x, y [m], theta [rad] and their rates. A contact that goes on keeps the damping of its touch.
         """
         index = np.asarray(which, dtype=np.int64)
-        states = np.concatenate([np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)], axis=1)
-        places = geometry.body_states(states, self.scenes[0].head.com_offset_m)
+        poses, rates = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
+        places = geometry.states_of(self.scenes[0], np.concatenate([poses, rates], axis=1))
         settle_moved(self._params, self._states, index, places, self.time, self._stick)
 
     def set_travel_speed(self, speed_m_s: ArrayLike) -> None:
@@ -352,6 +351,11 @@ def _merge(compiled: Sequence[CompiledScene]) -> Terms:
             raise ArgumentError(
                 f"scenes[{index}].friction: got {one.scene.friction}, expected friction with stick in all or in none: "
                 f"scenes[0] has {compiled[0].scene.friction}"
+            )
+        if one.scene.head.carries != compiled[0].scene.head.carries:
+            raise ArgumentError(
+                f"scenes[{index}].head.carries: got {one.scene.head.carries}, expected that of scenes[0]: "
+                f"{compiled[0].scene.head.carries}"
             )
         if terms.support != first.support:
             raise ArgumentError(

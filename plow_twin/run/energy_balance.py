@@ -94,7 +94,7 @@ def _potential(scene: Scene, state: State) -> float:
     x, y, theta, lift = state.y[X], state.y[Y], state.y[THETA], 0.0
     if scene.support is not None:
         theta, lift = theta + state.frame[2], state.frame[1]
-    height = math.sin(theta) * x + math.cos(theta) * y + lift
+    height = y if scene.head.carries == "corners" else math.sin(theta) * x + math.cos(theta) * y + lift
     return float(scene.head.mass_kg * scene.gravity.acceleration_m_s2 * (height + scene.gravity.arm_m * theta))
 
 

@@ -354,7 +354,7 @@ def _beside(
     for index in free:
         displaced, shadow = start.copy(), _copy(state)
         displaced[index] += moved[index]
-        shadow.y[:] = geometry.body_state(displaced[:3], displaced[3:], compiled.scene.head.com_offset_m)
+        shadow.y[:] = geometry.state_of(compiled.scene, displaced[:3], displaced[3:])
         states.append(shadow)
     for own in before:
         shadow = _copy(state)

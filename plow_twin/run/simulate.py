@@ -324,7 +324,9 @@ def contact_sets_of(scene: Scene, totals: Totals) -> dict[str, dict[str, float]]
     labels = [letters.get(corner, corner) for corner in CORNER_NAMES]
     joint = "" if letters else "+"
     senses = {}
-    for sense, times in zip(("ccw", "cw"), totals.set_time, strict=True):
+    # the force on a block that is at a wall turns it the other way than that on a cavity about a corner
+    order = ("ccw", "cw") if scene.head.carries == "walls" else ("cw", "ccw")
+    for sense, times in sorted(zip(order, totals.set_time, strict=True), key=lambda item: item[0]):
         total = times.sum()
         shares = {
             joint.join(sorted(labels[i] for i in range(4) if mask >> i & 1)): float(times[mask] / total)

@@ -25,7 +25,6 @@ from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
 from plow_twin.solve.state import (
     BOUND,
-    PARAMS,
     ROW,
     TOTALS,
     WORK,
@@ -105,7 +104,7 @@ class Twin:
         self.excitation: Literal["scene", "sampled"] = excitation
         self.max_evaluations = max_evaluations
         compiled = compile_scene(scene, tol, sampled=excitation == "sampled")
-        self._params = new_records(PARAMS, 1)
+        self._params = new_records(compiled.params.dtype, 1)
         self._states = new_records(state_type(compiled.parts.terms), 1)
         self._params[0] = compiled.params
         self._state: State = first_of(self._states)

@@ -18,6 +18,7 @@ from plow_twin.model.scene import DOF_NAMES, Contact, Scene, Wear
 from plow_twin.solve.method.implicit import OVERDAMPED_RATIO, new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
+    CORNER_PARAMS,
     COS,
     HARMONIC,
     MAX_ORDER,
@@ -66,7 +67,7 @@ class CompiledScene:
     def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
         """Return the scene's initial state, its pads worn by `wear_depth` [m] instead of the scene's initial depth."""
         state = new_record(state_type(self.parts.terms))
-        state.y[:] = geometry.body_state(self.scene.initial.q, self.scene.initial.v, self.scene.head.com_offset_m)
+        state.y[:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
         if self.parts.terms.hysteretic is not None:
             state.damping_factor[:] = self.scene.contact.damping or 0.0
         if wear_depth is not None:
@@ -113,7 +114,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     speed = _velocity_scale(scene, loads, length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order, radius = order_for(admissible), geometry.half_diagonal(scene)
-    params, rows = new_record(PARAMS), geometry.penetration_rows(scene)
+    params, rows = new_record(_params_type(scene)), geometry.penetration_rows(scene)
     values: dict[str, Any] = dict(
         penetration_rows=rows,
         arm_rows=geometry.arm_rows(scene),
@@ -145,6 +146,8 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
         max_events=MAX_EVENTS_AT_ONCE,
     )
+    if scene.head.carries == "corners":
+        values["tumbles"] = float(geometry.tumbles(scene))
     for name, value in (values | _rubbing(scene) | _slip(scene) | _frame(scene)).items():
         params[name] = value
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
@@ -152,6 +155,10 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         segments = np.zeros(1, SEGMENT)
     terms = _scene_terms(scene, terms, loads, harmonics, segments)
     return CompiledScene(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
+
+
+def _params_type(scene: Scene) -> np.dtype[np.void]:
+    return PARAMS if scene.head.carries == "walls" else CORNER_PARAMS
 
 
 def _scene_terms(
@@ -171,6 +178,8 @@ def _scene_terms(
     present["support"] = scene.support is not None
     # with the loads' moment about another point than the centre of mass the flight has no elementary integral
     present["flight"] = present["harmonics"] and not present["offset"] and not present["support"]
+    # a flight may be longer than a quarter turn of a block that tumbles
+    present["flight"] &= scene.head.carries == "walls"
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
     present["rest"] = not (creeps or present["support"])
     if present["harmonics"]:
@@ -201,7 +210,7 @@ def _initial_depth(scene: Scene) -> float:
     """Return the penetration in m of the pair that is deepest at the start, at least 0."""
     if not any(scene.initial.q):
         return 0.0  # centred: no wall is reached
-    y = geometry.body_state(scene.initial.q, scene.initial.v, scene.head.com_offset_m)
+    y = geometry.state_of(scene, scene.initial.q, scene.initial.v)
     rows = geometry.penetration_rows(scene)
     return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)
 

@@ -8,7 +8,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import pair_force
-from plow_twin.solve.kinematics import row_values
+from plow_twin.solve.kinematics import row_values, spin_of_axes
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.modes import any_penetrates
 from plow_twin.solve.state import COS, OMEGA, ON, SIN, VX, VY, X, Y
@@ -76,7 +76,8 @@ def pair_outputs(p, state, wear_depth, y, penetration, rate, force) -> None:
         0,
         row_values(p.penetration_rows, c, s, y[X], y[Y]) + (row(p.penetration_rows, 4) - row(wear_depth, 0)),
     )
-    set_row(rate, 0, row_values(p.penetration_rows, -om * s, om * c, y[VX] + om * y[Y], y[VY] - om * y[X]))
+    spin = spin_of_axes(p, om)
+    set_row(rate, 0, row_values(p.penetration_rows, -om * s, om * c, y[VX] + spin * y[Y], y[VY] - spin * y[X]))
     for pair in range(PAIR_COUNT):
         force[pair] = 0.0
         if state.mode[pair] == ON:

@@ -10,7 +10,16 @@ from plow_twin.model.friction import friction_force
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.grip import tangential_force
-from plow_twin.solve.kinematics import penetration_at, rate_at, row_rate, row_value, to_body_axes, to_world_axes
+from plow_twin.solve.kinematics import (
+    along,
+    named_angle,
+    penetration_at,
+    rate_at,
+    row_rate,
+    row_value,
+    to_body_axes,
+    to_world_axes,
+)
 from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import ON, Harmonics, Segments
 
@@ -43,7 +52,7 @@ def push(p, slip, stick, state, frozen, pair, force, c, s, omega, x, y, vx, vy):
     fx, fy = -p.penetration_rows[2, pair] * force, -p.penetration_rows[3, pair] * force
     torque, power = row_value(p.arm_rows, pair, c, s, x, y) * force, 0.0
     if slip is not None or stick is not None:
-        rate = row_rate(p.slip_rows, pair, c, s, omega, x, y, vx, vy)
+        rate = row_rate(p, p.slip_rows, pair, c, s, omega, x, y, vx, vy)
         if stick is not None:
             place = row_value(p.slip_rows, pair, c, s, x, y)
             drag = tangential_force(p, state, frozen, pair, force, place, rate)
@@ -102,12 +111,14 @@ def _accelerate(p, offset, free, slip, stick, support, frozen, state, z, load, o
     if support is not None:
         _accelerate_both(p, offset, free, slip, stick, frozen, state, z, load, out)
         return
-    c, s, om = math.cos(z[2]), math.sin(z[2]), z[5]
-    x, y = to_body_axes(c, s, z[0], z[1])
-    vx, vy = to_body_axes(c, s, z[3], z[4])
+    angle, om = named_angle(p, state.y, z[2]), z[5]
+    c, s = math.cos(angle), math.sin(angle)
+    ca, sa = along(p, c, s)
+    x, y = to_body_axes(ca, sa, z[0], z[1])
+    vx, vy = to_body_axes(ca, sa, z[3], z[4])
     fx, fy, torque = _contacts(p, slip, stick, frozen, state, c, s, om, x, y, vx, vy)
     out[0], out[1], out[2] = z[3], z[4], z[5]
-    along_x, along_y = to_world_axes(c, s, fx, fy)
+    along_x, along_y = to_world_axes(ca, sa, fx, fy)
     _accelerate_head(p, offset, free, c, s, load, along_x, along_y, torque, 3, out)
 
 

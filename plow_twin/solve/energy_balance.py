@@ -18,7 +18,7 @@ from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.dense_output import evaluate, pair_outputs, time_along, wear_depth_at
 from plow_twin.solve.dynamics import about_mass, push
-from plow_twin.solve.kinematics import to_world_axes
+from plow_twin.solve.kinematics import along, named_angle, to_world_axes
 from plow_twin.solve.loads import load_at
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y, new_record
 from plow_twin.solve.support import to_ground
@@ -73,7 +73,8 @@ def _powers(p, parts, state, wear_depth, y, frame, t, balance, out) -> None:
     """Write powers and forces at time t in body coordinates y; `frame` is the state of a frame that gives way."""
     terms, load = parts.terms, out[LOAD_X : LOAD_M + 1]
     load_at(p, parts.harmonics, parts.segments, t, load)
-    y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
+    angle = named_angle(p, y, y[THETA])
+    y[COS], y[SIN] = math.cos(angle), math.sin(angle)
     ground = _on_ground(terms.support, y, frame, balance)
     _powers_under(
         p, terms.offset, terms.free, terms.slip, terms.stick, state, wear_depth, y, ground, load, balance.pairs, out
@@ -121,13 +122,14 @@ def _powers_under(p, offset, free, slip, stick, state, wear_depth, y, ground, lo
         torque += moment
         out[NORMAL] += force * pairs[1, pair]
         out[FRICTION] += power
-    out[CONTACT_X], out[CONTACT_Y] = to_world_axes(c, s, fx, fy)
+    ca, sa = along(p, c, s)
+    out[CONTACT_X], out[CONTACT_Y] = to_world_axes(ca, sa, fx, fy)
     out[CONTACT_M] = torque
     if free is not None:
         for j in range(3):
             load[j] *= p.free[j]
             out[CONTACT_X + j] *= p.free[j]
-    vx, vy = to_world_axes(c, s, ground[VX], ground[VY])
+    vx, vy = to_world_axes(ca, sa, ground[VX], ground[VY])
     out[LOADS] = load[0] * vx + load[1] * vy + load[2] * ground[OMEGA]
 
 
@@ -136,7 +138,7 @@ def _balance(p, support, seen, frame, balance, start) -> None:
     """Take energy and momentum from the state; note the largest imbalances."""
     sums, y = balance.sums, _on_ground(support, seen, frame, balance)
     m, inertia = 1.0 / p.inverse_mass, 1.0 / p.inverse_inertia
-    c, s = math.cos(y[THETA]), math.sin(y[THETA])
+    c, s = along(p, math.cos(y[THETA]), math.sin(y[THETA]))
     sums.energy[1] = 0.5 * m * (y[VX] * y[VX] + y[VY] * y[VY]) + 0.5 * inertia * y[OMEGA] * y[OMEGA]
     if support is not None:
         for j in range(3):

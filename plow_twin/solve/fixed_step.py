@@ -83,7 +83,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
     pen, rate, now, before = bound.pairs[0], bound.pairs[1], bound.pairs[2], bound.pairs[3]
     start = state.step_start
     dt = (target - start) / bound.steps
-    _to_world(parts.terms.support, state, z)
+    _to_world(p, parts.terms.support, state, z)
     for pair in range(PAIR_COUNT):
         # a pair that was clipped or released is inside all the same
         state.mode[pair] = OFF if state.mode[pair] == OFF else ON
@@ -100,7 +100,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.steps += 1
-        _to_body(parts.terms.support, state, z)
+        _to_body(p, parts.terms.support, state, z)
         _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
         for pair in range(PAIR_COUNT):
             before[pair] = now[pair]
@@ -139,7 +139,7 @@ def integrate_fixed(
     terms = parts.terms
     support, half = terms.support, z.size // 2
     if done[0] == 0:
-        _to_world(support, state, z)
+        _to_world(p, support, state, z)
     pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
     if balance is not None and done[0] == 0:
         start_balance(p, parts, state, y, 0.0, balance)
@@ -171,7 +171,7 @@ def integrate_fixed(
         if not np.isfinite(z).all():
             return _NON_FINITE
         state.steps += 1
-        _to_body(support, state, z)
+        _to_body(p, support, state, z)
         _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
         before[:] = now
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)
@@ -185,19 +185,19 @@ def integrate_fixed(
 
 
 @kernel()
-def _to_world(support, state, z) -> None:
+def _to_world(p, support, state, z) -> None:
     if support is not None:
-        to_world_both(state.y, state.frame, z)
+        to_world_both(p, state.y, state.frame, z)
     else:
-        to_world(state.y, z)
+        to_world(p, state.y, z)
 
 
 @kernel()
-def _to_body(support, state, z) -> None:
+def _to_body(p, support, state, z) -> None:
     if support is not None:
-        to_body_both(z, state.y, state.frame)
+        to_body_both(p, z, state.y, state.frame)
     else:
-        to_body(z, state.y)
+        to_body(p, state.y, z, state.y)
 
 
 @kernel()

@@ -30,7 +30,7 @@ _FINEST = 4e-15
 def _along(p, pair, y):
     """Return the place of a corner along its wall and the rate at which it slips, in body coordinates y."""
     place = row_value(p.slip_rows, pair, y[COS], y[SIN], y[X], y[Y])
-    return place, row_rate(p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+    return place, row_rate(p, p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
 
 
 @kernel(inline="code")

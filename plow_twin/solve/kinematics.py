@@ -7,9 +7,58 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from numba.extending import overload
+
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
+
+#: A quarter turn in rad: so far apart are the angles at which each corner of a block has the next one's name.
+QUARTER_TURN = 0.5 * math.pi
+
+
+def fixed_axes(p):
+    """Return 1 where the state is resolved along world axes (the head carries corners), else None; compiled only.
+
+    The type of the parameters tells, so the code of the other kind of scene is left out.
+    """
+    raise NotImplementedError(f"fixed_axes: called with {p!r}, expected a call from a compiled function")
+
+
+@overload(fixed_axes)
+def _fixed_axes(p):
+    if "tumbles" in p.fields:
+        return lambda p: 1
+    return lambda p: None
+
+
+@kernel(inline="code")
+def along(p, c, s):
+    """Return cosine and sine of the angle of the axes along which the state is resolved; the head's are at (c, s)."""
+    if fixed_axes(p) is not None:
+        return 1.0, 0.0
+    return c, s
+
+
+@kernel(inline="code")
+def spin_of_axes(p, omega):
+    """Return the rate in rad/s at which the axes turn along which the state is resolved."""
+    if fixed_axes(p) is not None:
+        return 0.0
+    return omega
+
+
+@kernel(inline="code")
+def named_angle(p, y, theta):
+    """Return theta without the quarter turns after which the corners have the names that they have in y.
+
+    Cosine and sine in y are those of that angle. Nothing is taken away where the head carries walls.
+    """
+    if fixed_axes(p) is not None:
+        turns = np.rint((y[THETA] - math.atan2(y[SIN], y[COS])) / QUARTER_TURN)
+        return theta - turns * QUARTER_TURN
+    return theta
 
 
 @kernel(inline="source")
@@ -25,9 +74,10 @@ def row_values(rows, c, s, x, y):
 
 
 @kernel(inline="source")
-def row_rate(rows, pair, c, s, omega, x, y, vx, vy):
-    """Return the rate of rows . (c, s, x, y) of one pair: body axes turn with omega."""
-    return row_value(rows, pair, -omega * s, omega * c, vx + omega * y, vy - omega * x)
+def row_rate(p, rows, pair, c, s, omega, x, y, vx, vy):
+    """Return the rate of rows . (c, s, x, y) of one pair."""
+    spin = spin_of_axes(p, omega)
+    return row_value(rows, pair, -omega * s, omega * c, vx + spin * y, vy - spin * x)
 
 
 @kernel(inline="code")
@@ -45,7 +95,7 @@ def penetration_of(p, state, pair, y):
 @kernel(inline="code")
 def rate_at(p, pair, c, s, omega, x, y, vx, vy):
     """Return the rate of one pair's penetration in m/s."""
-    return row_rate(p.penetration_rows, pair, c, s, omega, x, y, vx, vy)
+    return row_rate(p, p.penetration_rows, pair, c, s, omega, x, y, vx, vy)
 
 
 @kernel(inline="code")
@@ -67,20 +117,26 @@ def to_world_axes(c, s, x, y):
 
 
 @kernel()
-def to_body(z, y) -> None:
-    """Write body coordinates from z = (x, y, theta, vx, vy, omega) of the centre of mass."""
-    c, s = math.cos(z[2]), math.sin(z[2])
-    y[X], y[Y] = to_body_axes(c, s, z[0], z[1])
-    y[VX], y[VY] = to_body_axes(c, s, z[3], z[4])
+def to_body(p, named, z, y) -> None:
+    """Write body coordinates from z = (x, y, theta, vx, vy, omega) of the centre of mass.
+
+    The corners have the names that they have in `named`, which are body coordinates too (`named_angle`).
+    """
+    angle = named_angle(p, named, z[2])
+    c, s = math.cos(angle), math.sin(angle)
+    ca, sa = along(p, c, s)
+    y[X], y[Y] = to_body_axes(ca, sa, z[0], z[1])
+    y[VX], y[VY] = to_body_axes(ca, sa, z[3], z[4])
     y[OMEGA] = z[5]
     y[COS], y[SIN], y[THETA] = c, s, z[2]
 
 
 @kernel()
-def to_world(y, z) -> None:
+def to_world(p, y, z) -> None:
     """Write z = (x, y, theta, vx, vy, omega) of the centre of mass from body coordinates."""
-    z[0], z[1] = to_world_axes(y[COS], y[SIN], y[X], y[Y])
-    z[3], z[4] = to_world_axes(y[COS], y[SIN], y[VX], y[VY])
+    c, s = along(p, y[COS], y[SIN])
+    z[0], z[1] = to_world_axes(c, s, y[X], y[Y])
+    z[3], z[4] = to_world_axes(c, s, y[VX], y[VY])
     z[2], z[5] = y[THETA], y[OMEGA]
 
 
@@ -91,6 +147,7 @@ def pose_of(p, y, offset, q, v) -> None:
     if offset is not None:
         x, yy = x - p.offset[0], yy - p.offset[1]
         vx, vy = vx + om * p.offset[1], vy - om * p.offset[0]
-    q[0], q[1] = to_world_axes(y[COS], y[SIN], x, yy)
-    v[0], v[1] = to_world_axes(y[COS], y[SIN], vx, vy)
+    c, s = along(p, y[COS], y[SIN])
+    q[0], q[1] = to_world_axes(c, s, x, yy)
+    v[0], v[1] = to_world_axes(c, s, vx, vy)
     q[2], v[2] = y[THETA], om

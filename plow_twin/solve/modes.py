@@ -12,7 +12,7 @@ from plow_twin.model.geometry import STATE_SIZE
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.grip import grasp, weigh_grips
-from plow_twin.solve.kinematics import penetration_of, rate_of, row_value, row_values
+from plow_twin.solve.kinematics import named_angle, penetration_of, rate_of, row_value, row_values
 from plow_twin.solve.state import (
     ACTS,
     BASE,
@@ -33,8 +33,8 @@ from plow_twin.solve.state import (
 _SHALLOW = 1e-3
 #: Halvings of a bracket: to the last bit of a double.
 _BISECTIONS = 60
-#: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees.
-LARGEST_ANGLE = 0.25 * math.pi
+#: Largest |theta| in rad at which each corner still meets the walls that belong to it: 45 degrees, and some roundings.
+LARGEST_ANGLE = 0.25 * math.pi + 1e-12
 _ALL_PAIRS = 2**PAIR_COUNT - 1
 
 
@@ -201,9 +201,9 @@ def _all_shallow(p, state, y) -> bool:
 def within_range(p, state, y) -> bool:
     """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
     if _all_shallow(p, state, y):
-        return abs(y[THETA]) <= LARGEST_ANGLE
+        return abs(named_angle(p, y, y[THETA])) <= LARGEST_ANGLE
     deepest = 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             deepest = max(deepest, penetration_of(p, state, pair, y))
-    return abs(y[THETA]) <= LARGEST_ANGLE and deepest <= p.half_cavity
+    return abs(named_angle(p, y, y[THETA])) <= LARGEST_ANGLE and deepest <= p.half_cavity

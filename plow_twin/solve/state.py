@@ -111,52 +111,54 @@ def _in_lines(fields: list[tuple[Any, ...]]) -> np.dtype[np.void]:
 
 
 #: Constants of one scene and one tolerance, per mass and inertia where that saves work.
-PARAMS: Final = _in_lines(
-    [
-        ("penetration_rows", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
-        ("arm_rows", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
-        ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
-        ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # its arm about G
-        ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
-        ("speed_per_wear", "f8"),  # A / k_s, which makes v of that; 0 where sliding in the plane does not wear
-        ("running_in", "f8"),  # share by which a new pad wears faster
-        ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which that falls with the depth
-        ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
-        ("inverse_mass", "f8"),
-        ("inverse_inertia", "f8"),
-        ("stiffness", "f8"),
-        ("exponent", "f8"),
-        ("viscous", "f8"),  # C in N s/m, 0 without
-        ("damping_number", "f8"),  # D of lambda = D / v0, or a negative number when lambda is constant
-        ("speed_floor", "f8"),  # smallest v0
-        ("ramp", "f8"),  # penetration over which C grows, 0 without
-        ("gravity", "f8"),
-        ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
-        ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
-        ("offset", "f8", (2,)),  # centre of mass from the cavity's centre
-        ("free", "f8", (3,)),  # 1 free, 0 locked
-        ("friction", "f8"),  # mu
-        ("slip_speed", "f8"),  # regularisation speed in m/s
-        ("static_friction", "f8"),  # mu up to which a corner sticks
-        ("stick_stiffness", "f8"),
-        ("stick_damping", "f8"),
-        ("frame_mobility", "f8", (3,)),  # 1/m, 1/m, 1/I of a frame that gives way, else 0
-        ("frame_stiffness", "f8", (3,)),  # of its support, per mass and inertia
-        ("frame_damping", "f8", (3,)),
-        ("order", "i8"),
-        ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
-        ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
-        ("velocity_tolerance", "f8"),  # admissible error of a velocity
-        ("position_tolerance", "f8"),  # admissible error of a position
-        ("weight", "f8"),  # turns cos and sin into velocities
-        ("radius", "f8"),  # turns angles into lengths
-        ("release", "f8"),  # penetration below which the force is negligible
-        ("fastest", "f8"),  # largest angular frequency of the harmonics
-        ("leverage", "f8"),  # distance of a corner of the frame from its centre
-        ("half_cavity", "f8"),  # penetration that ends the model's range
-        ("max_events", "i8"),  # events at one instant before recovery
-    ]
-)
+_PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
+    ("penetration_rows", "f8", (5, PAIR_COUNT)),  # penetration rows for c, s, X, Y, 1
+    ("arm_rows", "f8", (4, PAIR_COUNT)),  # arm rows for c, s, X, Y
+    ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
+    ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # its arm about G
+    ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
+    ("speed_per_wear", "f8"),  # A / k_s, which makes v of that; 0 where sliding in the plane does not wear
+    ("running_in", "f8"),  # share by which a new pad wears faster
+    ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which that falls with the depth
+    ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
+    ("inverse_mass", "f8"),
+    ("inverse_inertia", "f8"),
+    ("stiffness", "f8"),
+    ("exponent", "f8"),
+    ("viscous", "f8"),  # C in N s/m, 0 without
+    ("damping_number", "f8"),  # D of lambda = D / v0, or a negative number when lambda is constant
+    ("speed_floor", "f8"),  # smallest v0
+    ("ramp", "f8"),  # penetration over which C grows, 0 without
+    ("gravity", "f8"),
+    ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
+    ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
+    ("offset", "f8", (2,)),  # centre of mass from the cavity's centre
+    ("free", "f8", (3,)),  # 1 free, 0 locked
+    ("friction", "f8"),  # mu
+    ("slip_speed", "f8"),  # regularisation speed in m/s
+    ("static_friction", "f8"),  # mu up to which a corner sticks
+    ("stick_stiffness", "f8"),
+    ("stick_damping", "f8"),
+    ("frame_mobility", "f8", (3,)),  # 1/m, 1/m, 1/I of a frame that gives way, else 0
+    ("frame_stiffness", "f8", (3,)),  # of its support, per mass and inertia
+    ("frame_damping", "f8", (3,)),
+    ("order", "i8"),
+    ("lacuna", "i8"),  # orders in a row that may vanish while the series goes on
+    ("threshold", "f8", (_ROWS,)),  # admissible size of term k of a velocity over a step
+    ("velocity_tolerance", "f8"),  # admissible error of a velocity
+    ("position_tolerance", "f8"),  # admissible error of a position
+    ("weight", "f8"),  # turns cos and sin into velocities
+    ("radius", "f8"),  # turns angles into lengths
+    ("release", "f8"),  # penetration below which the force is negligible
+    ("fastest", "f8"),  # largest angular frequency of the harmonics
+    ("leverage", "f8"),  # distance of a corner of the frame from its centre
+    ("half_cavity", "f8"),  # penetration that ends the model's range
+    ("max_events", "i8"),  # events at one instant before recovery
+]
+PARAMS: Final = _in_lines(_PARAM_FIELDS)
+
+#: Those of a scene whose head carries corners; 1 where the block may tumble. What is more comes first (`state_type`).
+CORNER_PARAMS: Final = _in_lines([("tumbles", "f8"), *_PARAM_FIELDS])
 
 #: Everything that the future depends on, and the step under way. Times in s.
 _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [

@@ -17,11 +17,13 @@ from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.dense_output import evaluate, time_along, wear_depth_at
 from plow_twin.solve.events import first_event, note_switches
 from plow_twin.solve.grip import grasp, switch_grip
+from plow_twin.solve.kinematics import named_angle
 from plow_twin.solve.method import flight, implicit, rest, taylor
 from plow_twin.solve.method.protocol import Method
 from plow_twin.solve.modes import penetration_and_rate, slow_touch, touch, weigh_pairs
 from plow_twin.solve.state import COS, CROSSING, OFF, ON, RELEASED, SIN, SLIPS_FORWARD, THETA
 from plow_twin.solve.totals import log_event
+from plow_twin.solve.tumbling import turn_at, turn_corners
 
 #: The methods in the order in which they are asked; a kernel calls each by its name.
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
@@ -90,6 +92,9 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
         # modes flip at one instant: go on past it with the modes as they are
         state.recoveries += 1
         end, pair = max(end, min(sigma, _PAST_AN_INSTANT)), -1
+    turn = turn_at(p, state, w, order, end)
+    if turn < end:
+        end, pair = turn, -1
     if pair >= 0:
         note_switches(p, state, w, order, end, pair, target, penetrating, *law, stick)
     if pair >= 0 or end != sigma:
@@ -109,7 +114,8 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
     evaluate(p, harmonics, flight, support, state, w, sigma, y)
     if support is not None:
         state.frame[:] = w.frame_now
-    y[COS], y[SIN] = math.cos(y[THETA]), math.sin(y[THETA])
+    angle = named_angle(p, y, y[THETA])
+    y[COS], y[SIN] = math.cos(angle), math.sin(angle)
     before = state.step_start
     state.step_start = before + state.step_size
     if state.ends_at_stop == 1:
@@ -122,6 +128,7 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
         state.last_step_size = state.step_start - before
     touching = state.touching if at_once else 0
     state.touching = 0
+    turn_corners(p, state, stick, totals, log)
     if state.event_pair < 0:
         state.events_at_once = 0
         return

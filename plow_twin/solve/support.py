@@ -52,24 +52,24 @@ def from_ground(y, frame, out) -> None:
 
 
 @kernel()
-def to_world_both(y, frame, z) -> None:
+def to_world_both(p, y, frame, z) -> None:
     """Write z = (x, y, theta, u, v, phi) and its rate, shape (12,), world axes, from what is seen from the frame."""
     absolute, head = np.empty(8), np.empty(6)
     to_ground(y, frame, absolute)
-    to_world(absolute, head)
+    to_world(p, absolute, head)
     for j in range(3):
         z[j], z[6 + j] = head[j], head[3 + j]
         z[3 + j], z[9 + j] = frame[j], frame[3 + j]
 
 
 @kernel()
-def to_body_both(z, y, frame) -> None:
+def to_body_both(p, z, y, frame) -> None:
     """Write the head's body coordinates as seen from the frame, and the frame's state; inverse of `to_world_both`."""
     head = np.empty(6)
     for j in range(3):
         head[j], head[3 + j] = z[j], z[6 + j]
         frame[j], frame[3 + j] = z[3 + j], z[9 + j]
-    to_body(head, y)
+    to_body(p, y, head, y)
     from_ground(y, frame, y)
 
 

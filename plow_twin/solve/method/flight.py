@@ -98,7 +98,7 @@ def _safe_time(p, harmonics, state, w, span) -> float:
         return 0.0
     gap = _smallest_gap(p, state)
     z = w.flight[0]
-    to_world(state.y, z)
+    to_world(p, state.y, z)
     _bounds(p, harmonics, state.step_start, z, w)
     # the walls' rows turn with the head: a place counts like a point of it
     leverage = p.leverage + math.hypot(z[0], z[1]) + max(gap, 0.0)
@@ -121,7 +121,7 @@ def fly(p, harmonics, flight, state, w, time, y) -> None:
             swing_rate, swing = _swing(p, harmonics, j, state.step_start, time)
             z[j] = start[j] + start[3 + j] * time + p.free[j] * (way + swing)
             z[3 + j] = start[3 + j] + p.free[j] * (rate + swing_rate)
-        to_body(z, y)
+        to_body(p, state.y, z, y)
 
 
 @kernel()

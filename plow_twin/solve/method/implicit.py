@@ -147,7 +147,7 @@ def decay_rate(p, state, slip, stick, support) -> float:
         decay += (faster - force) * mobility
         spring += slope * mobility
         if slip is not None:
-            sticking = 1.0 - math.tanh(row_rate(p.slip_rows, pair, c, s, om, x, yy, vx, vy) / p.slip_speed) ** 2
+            sticking = 1.0 - math.tanh(row_rate(p, p.slip_rows, pair, c, s, om, x, yy, vx, vy) / p.slip_speed) ** 2
             arm = row_value(p.slip_arm_rows, pair, c, s, x, yy)
             mobility = p.inverse_mass + arm * arm * p.inverse_inertia
             decay += p.friction * max(force, 0.0) / p.slip_speed * sticking * mobility
@@ -269,18 +269,18 @@ def _places(implicit, h) -> None:
 
 
 @kernel()
-def _bodies(support, implicit, i) -> None:
+def _bodies(p, support, state, implicit, i) -> None:
     """Write the body coordinates at the start (i = 0) or at a node, also as seen from a frame that gives way."""
     z, y = implicit.z[i], implicit.body[i]
     if support is not None:
         seen, frame = implicit.seen[i], implicit.frame[i]
-        to_body_both(z, seen, implicit.rate[0, :6])
+        to_body_both(p, z, seen, implicit.rate[0, :6])
         to_ground(seen, implicit.rate[0, :6], y)
         frame[FRAME_X], frame[FRAME_Y], frame[FRAME_THETA] = z[3], z[4], z[5]
         frame[FRAME_VX], frame[FRAME_VY], frame[SPIN] = z[9], z[10], z[11]
         frame[SEEN_COS], frame[SEEN_SIN] = seen[COS], seen[SIN]
     else:
-        to_body(z, y)
+        to_body(p, state.y, z, y)
 
 
 @kernel()
@@ -296,7 +296,7 @@ def _measure(p, support, state, implicit) -> None:
     """Write force, law's force (also of clipped pairs) and rate of penetration of each pair at the nodes."""
     pairs, seen = implicit.pairs, _seen(support, implicit)
     for i in range(implicit.nodes.size):
-        _bodies(support, implicit, i + 1)
+        _bodies(p, support, state, implicit, i + 1)
         y = seen[i + 1]
         for pair in range(PAIR_COUNT):
             r = rate_of(p, pair, y)
@@ -437,7 +437,7 @@ def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float
     at once, would bend the polynomials between the nodes. The size is infinite where that is more than may be left out.
     """
     s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
-    _bodies(support, implicit, 0)
+    _bodies(p, support, state, implicit, 0)
     _measure(p, support, state, implicit)
     _interpolate(body, implicit.from_values, h, w.series)
     _interpolate(body[1:], implicit.from_stages, h, scratch)
@@ -487,7 +487,7 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
     for i in range(s):
         y = seen[i + 1]
         for pair in range(PAIR_COUNT):
-            rates[i, pair] = row_rate(p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
+            rates[i, pair] = row_rate(p, p.slip_rows, pair, y[COS], y[SIN], y[OMEGA], y[X], y[Y], y[VX], y[VY])
     _interpolate(rates, implicit.from_stages, h, w.slip[0])
     for k in range(s):
         y = series[k]
@@ -585,12 +585,12 @@ def note_step(implicit, state, w, step_size, has_event) -> None:
 
 
 @kernel()
-def _start(support, state, implicit) -> None:
+def _start(p, support, state, implicit) -> None:
     """Write the state at the step's start to `implicit.z[0]`."""
     if support is not None:
-        to_world_both(state.y, state.frame, implicit.z[0])
+        to_world_both(p, state.y, state.frame, implicit.z[0])
     else:
-        to_world(state.y, implicit.z[0])
+        to_world(p, state.y, implicit.z[0])
 
 
 @kernel()
@@ -603,7 +603,7 @@ def _collocate(p, parts, support, state, w, span, decay, implicit, ramp, wear, s
     if span < least:
         return 0.0
     h = min(max(state.implicit_size, 10.0 * least), span)
-    _start(support, state, implicit)
+    _start(p, support, state, implicit)
     admissible = _admissible(p)
     while h >= least:
         for i in range(implicit.nodes.size + 1):

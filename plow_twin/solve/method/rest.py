@@ -39,7 +39,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
     way, fast = _SHARE * p.position_tolerance, _SHARE * p.velocity_tolerance
     if speed > 0.5 * fast or not held(p, state, y, max(_MARGIN * way, _DEEP)):
         return False
-    to_world(y, z)
+    to_world(p, y, z)
     z[3] = z[4] = z[5] = 0.0
     stiffness_at(p, acts, state, w, gyration)
     without_harmonics(p, harmonics, state.step_start, rate, w.rest[3, 3:])
@@ -58,7 +58,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
 def _still_as_before(p, acts, harmonics, state, w) -> bool:
     """Tell whether nothing has changed since the head was found at rest: neither its place nor its load."""
     z, rate = w.rest[0], w.rest[1]
-    to_world(state.y, z)
+    to_world(p, state.y, z)
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
     without_harmonics(p, harmonics, state.step_start, rate, w.rest[3, 3:])
     state.evaluations += 1
@@ -92,7 +92,7 @@ def _settle(p, acts, harmonics, state, w) -> bool:
     if not (state.at_rest == 1 and _still_as_before(p, acts, harmonics, state, w)):
         if not _still(p, acts, harmonics, state, w):
             return False
-        to_body(w.rest[0], state.y)
+        to_body(p, state.y, w.rest[0], state.y)
     return True
 
 

@@ -21,7 +21,7 @@ from plow_twin.model.contact import power_term, power_terms, ramp_terms, root_te
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.contact_force import law_terms
 from plow_twin.solve.grip import grip_terms
-from plow_twin.solve.kinematics import row_values
+from plow_twin.solve.kinematics import fixed_axes, row_values
 from plow_twin.solve.rubbing import time_per_way
 from plow_twin.solve.state import ACTS, BASE, COS, DAMPS, OMEGA, RAMPS, SIN, VX, VY, X, Y
 from plow_twin.solve.support import (
@@ -182,6 +182,8 @@ def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fract
 @kernel(fast=True)
 def _hold(p, w, k, fx, fy):
     """Return order k of the force per mass in head axes without what acts along a locked world axis."""
+    if fixed_axes(p) is not None:
+        return p.free[0] * fx, p.free[1] * fy
     w.world[0, k], w.world[1, k] = fx, fy
     right, world = w.right, w.world
     along_x = along_y = 0.0
@@ -202,6 +204,8 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
 
     c, s are the orders k of cosine and sine, c1, s1 and c2, s2 those one and two before; `product` has S1 c and S1 s.
     """
+    if fixed_axes(p) is not None:
+        return _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments)
     load, right, start, slope = w.load, w.right, w.wrench[0], w.wrench[1]
     fx, fy = start[0] * c + start[1] * s, start[1] * c - start[0] * s
     moment = start[2] if k == 0 else 0.0
@@ -225,6 +229,26 @@ def _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, harmonics, secon
                 along_s += load[1, j] * right[k - j, 7]
             fx += p.direction[1, 0] * along_c + p.direction[1, 1] * along_s
             fy += p.direction[1, 1] * along_c - p.direction[1, 0] * along_s
+    return fx, fy, moment
+
+
+@kernel(fast=True)
+def _loads_along_world(p, w, k, alpha, beta, harmonics, second, segments):
+    """Return order k of the load per mass in world axes and of its moment per inertia."""
+    load, start, slope = w.load, w.wrench[0], w.wrench[1]
+    held, rising = 1.0 if k == 0 else 0.0, 0.0
+    if segments is not None:
+        # t(sigma) has the terms alpha and beta / 2
+        rising = alpha if k == 1 else 0.5 * beta if k == 2 else 0.0
+    fx, fy = held * start[0] + rising * slope[0], held * start[1] + rising * slope[1]
+    moment = held * start[2] + rising * slope[2]
+    if harmonics is not None:
+        fx += p.direction[0, 0] * load[0, k]
+        fy += p.direction[0, 1] * load[0, k]
+        moment += load[2, k]
+        if second is not None:
+            fx += p.direction[1, 0] * load[1, k]
+            fy += p.direction[1, 1] * load[1, k]
     return fx, fy, moment
 
 
@@ -423,6 +447,14 @@ def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
     )
 
 
+@kernel(fast=True, inline="source")
+def _turn_of_axes(p):
+    """Return the signs of the products with omega in the rates: of place and velocity, where the axes turn."""
+    if fixed_axes(p) is not None:
+        return pack(0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0)
+    return pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
+
+
 @kernel(fast=True)
 def expand(
     p,
@@ -496,7 +528,7 @@ def expand(
         set_row(right, k, turned)
         set_row(left, k, turning_by)
         product = _join(left, right, k, turning_by, turned)
-        turning = product * pack(1.0, -1.0, 1.0, -1.0, 0.0, -1.0, 1.0, 0.0)
+        turning = product * _turn_of_axes(p)
         turning = turning + _rates_of(here) * pack(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
         fx, fy, moment = _loads(p, w, k, c, s, c1, s1, c2, s2, product, alpha, beta, *load_terms)
         if offset is not None:
