@@ -20,6 +20,7 @@ from plow_twin.solve.rubbing import rubbing
 from plow_twin.solve.state import OFF, ON, Status
 from plow_twin.solve.support import to_body_both, to_world_both
 from plow_twin.solve.totals import add_set_times, log_event
+from plow_twin.solve.tumbling import turn_corners
 
 _OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
 _LOG_FULL = int(Status.LOG_FULL)
@@ -101,6 +102,7 @@ def end_coarsely(p, parts, state, totals, target, bound) -> int:
             return _NON_FINITE
         state.steps += 1
         _to_body(p, parts.terms.support, state, z)
+        turn_corners(p, state, terms.stick, totals, None)
         _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
         for pair in range(PAIR_COUNT):
             before[pair] = now[pair]
@@ -172,6 +174,7 @@ def integrate_fixed(
             return _NON_FINITE
         state.steps += 1
         _to_body(p, support, state, z)
+        turn_corners(p, state, terms.stick, totals, log)
         _wear(p, terms.wear, terms.sliding, terms.running_in, state, now, dt)
         before[:] = now
         pair_outputs(p, state, state.wear_depth, y, pen, rate, now)

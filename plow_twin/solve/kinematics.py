@@ -33,6 +33,18 @@ def _fixed_axes(p):
     return lambda p: None
 
 
+def may_tumble(p):
+    """Tell whether the head may turn beyond 45 degrees (`model.geometry.tumbles`); compiled only, as `fixed_axes`."""
+    raise NotImplementedError(f"may_tumble: called with {p!r}, expected a call from a compiled function")
+
+
+@overload(may_tumble)
+def _may_tumble(p):
+    if "tumbles" in p.fields:
+        return lambda p: p.tumbles != 0.0
+    return lambda p: False
+
+
 @kernel(inline="code")
 def along(p, c, s):
     """Return cosine and sine of the angle of the axes along which the state is resolved; the head's are at (c, s)."""

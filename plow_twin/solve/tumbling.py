@@ -12,7 +12,7 @@ import math
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import first_root
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.solve.kinematics import QUARTER_TURN, fixed_axes, named_angle
+from plow_twin.solve.kinematics import QUARTER_TURN, may_tumble, named_angle
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
@@ -34,9 +34,7 @@ _THERE = 1e-12
 @kernel()
 def turn_at(p, state, w, order, best) -> float:
     """Return where in a step the block reaches 45 degrees before `best`, else `best`."""
-    if fixed_axes(p) is None:
-        return best
-    if p.tumbles == 0.0:
+    if not may_tumble(p):
         return best
     column, angle = w.column[0], named_angle(p, state.y, state.y[THETA])
     for side in range(2):
@@ -51,11 +49,11 @@ def turn_at(p, state, w, order, best) -> float:
 @kernel()
 def turn_corners(p, state, stick, totals, log) -> None:
     """Let the corners of a block that has reached 45 degrees take their next names."""
-    if fixed_axes(p) is None:
+    if not may_tumble(p):
         return
     y = state.y
     angle = math.atan2(y[SIN], y[COS])
-    if p.tumbles == 0.0 or abs(angle) < 0.5 * QUARTER_TURN - _THERE or angle * y[OMEGA] <= 0.0:
+    if abs(angle) < 0.5 * QUARTER_TURN - _THERE or angle * y[OMEGA] <= 0.0:
         return
     ahead = angle > 0.0
     for leading, following in _HANDED_OVER:

@@ -1,0 +1,206 @@
+"""A head that carries corners: a block in a fixed cavity, alone on one wall, tumbling, and beside a head with walls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from plow_twin import (
+    Clearance,
+    Constant,
+    Contact,
+    Frame,
+    Friction,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Scene,
+    SceneError,
+    Support,
+    Twin,
+    TwinBatch,
+    simulate,
+)
+from plow_twin.errors import ArgumentError
+from plow_twin.estimate.forward import Forward
+
+SIDE, MASS = 0.06, 1.0
+INERTIA = MASS * SIDE**2 / 6.0
+STIFFNESS, DAMPING, MU, SLIP_SPEED = 3e6, 0.8, 0.2, 0.05
+WALL = 1.0
+
+
+def block(**changes: object) -> Scene:
+    """Return a square block above a table 1 m below the cavity's centre; the other walls are never met."""
+    scene = Scene(
+        Head(MASS, INERTIA, carries="corners"),
+        Frame(SIDE, SIDE),
+        Clearance(2.0 * WALL - SIDE, 2.0 * WALL - SIDE),
+        Contact("hunt_crossley", stiffness=STIFFNESS, exponent=1.0, damping=DAMPING),
+        Gravity(),
+        initial=Initial(q=(0.0, -0.85, 0.3), v=(0.4, 0.0, 6.0)),
+        friction=Friction(MU, SLIP_SPEED),
+    )
+    return replace(scene, **changes)  # type: ignore[arg-type]
+
+
+def on_table(t: float, z: np.ndarray) -> list[float]:
+    """Return the rate of z = (x, y, theta, vx, vy, omega) of the block, its four corners as they are."""
+    x, y, theta, vx, vy, omega = z
+    c, s, half = math.cos(theta), math.sin(theta), 0.5 * SIDE
+    fx = fy = moment = 0.0
+    for cx, cy in ((-half, half), (half, half), (half, -half), (-half, -half)):
+        ax, ay = c * cx - s * cy, s * cx + c * cy
+        depth, rate = -WALL - (y + ay), -(vy + omega * ax)
+        if depth > 0.0:
+            normal = max(STIFFNESS * depth * (1.0 + DAMPING * rate), 0.0)
+            drag = -MU * normal * math.tanh((vx - omega * ay) / SLIP_SPEED)
+            fx, fy, moment = fx + drag, fy + normal, moment + ax * normal - ay * drag
+    return [vx, vy, omega, fx / MASS, fy / MASS - 9.81, moment / INERTIA]
+
+
+@pytest.fixture(scope="module")
+def falls() -> object:
+    """Return a block that falls on its table, rolls over two of its corners and comes to lie."""
+    return simulate(block(), t_end=0.8, output_dt=0.004, tol=1e-9, energy_balance=True)
+
+
+def test_corners_agree_with_an_independent_integration_of_a_tumbling_block(falls) -> None:
+    reference = solve_ivp(
+        on_table, (0.0, 0.4), [0.0, -0.85, 0.3, 0.4, 0.0, 6.0], "DOP853", falls.t[:101], rtol=1e-9, atol=1e-11,
+        max_step=2e-5,
+    )  # fmt: skip
+    assert np.abs(falls.q[:101] - reference.y[:3].T).max() < 1e-6
+    assert abs(falls.q[-1, 2] - math.pi) < 0.01
+    makes = {name: pair["makes"] for name, pair in falls.statistics.items() if pair["makes"]}
+    assert set(makes) == {"bottom_left_bottom", "bottom_right_bottom"}
+
+
+def test_corners_balance_energy_and_momentum(falls) -> None:
+    balance = falls.energy_balance
+    assert abs(balance.imbalance_j) < 1e-8
+    assert np.abs(balance.momentum_imbalance).max() < 1e-8
+
+
+def test_corners_pass_their_contact_on_at_45_degrees() -> None:
+    # pressed on the table by ten times its weight, rolled over its lower right corner
+    push = Constant("push", force_n=(0.0, -90.0), moment_n_m=-3.3)
+    lying = Initial(q=(0.0, -WALL + 0.5 * SIDE, 0.0), v=(0.0, 0.0, -0.3))
+    result = simulate(block(initial=lying, loads=(push,), friction=Friction(1.0, 0.01)), t_end=0.25, output_dt=1e-3)
+    turned = np.flatnonzero(result.q[:, 2] < -0.25 * math.pi)
+    assert turned.size > 0
+    at = result.t[turned[0]]
+    passed = [event for event in result.events if abs(event["time"] - at) < 1.1e-3]
+    # one event, two names, the same time and no touch
+    assert {(int(e["pair"]), int(e["mode_from"]), int(e["mode_to"])) for e in passed} == {(4, 1, 0), (6, 0, 1)}
+    assert passed[0]["time"] == passed[1]["time"]
+    force = result.force[:, [4, 6]].sum(axis=1)
+    assert np.abs(np.diff(force[turned[0] - 2 : turned[0] + 3])).max() < 0.2 * force[turned[0]]
+
+
+@pytest.mark.parametrize("spin", [40.0, -25.0])
+def test_corners_fly_and_turn_without_end(spin: float) -> None:
+    thrown = Initial(q=(0.0, 0.5, 1.0), v=(0.2, 1.0, spin))
+    result = simulate(block(initial=thrown), t_end=0.5, output_dt=0.01, tol=1e-9)
+    t = result.t
+    expected = np.stack([0.2 * t, 0.5 + t - 0.5 * 9.81 * t * t, 1.0 + spin * t], axis=1)
+    np.testing.assert_allclose(result.q, expected, atol=1e-11)
+    assert not result.force.any()
+
+
+def mirrored(scene: Scene) -> Scene:
+    """Return the head with walls whose motion is minus that of the block, while it does not turn."""
+    q, v = scene.initial.q, scene.initial.v
+    turned = tuple(replace(load, force_n=(-load.force_n[0], -load.force_n[1])) for load in scene.loads)
+    return replace(
+        scene,
+        head=replace(scene.head, carries="walls"),
+        gravity=Gravity(-9.81),
+        loads=turned,
+        initial=Initial(q=(-q[0], -q[1], -q[2]), v=(-v[0], -v[1], -v[2])),
+    )
+
+
+GUIDED = block(
+    frame=Frame(0.3, 0.2),
+    clearance=Clearance(0.01, 0.012),
+    contact=Contact("exact_restitution", stiffness=1e7, exponent=1.5, restitution=0.5),
+    loads=(Harmonic("push", force_n=(120.0, 40.0), omega_rad_s=9.0),),
+    initial=Initial(q=(0.001, 0.002, 0.0), v=(0.3, -0.2, 0.0)),
+    friction=Friction(0.2, stick_stiffness_n_m=1e6, stick_damping_n_s_m=20.0),
+    locked=("theta",),
+)
+
+
+@pytest.mark.parametrize("changes", [{}, {"friction": None}, {"loads": ()}], ids=["stick", "smooth", "free"])
+def test_corners_without_rotation_are_a_mirrored_head_with_walls(changes: dict[str, object]) -> None:
+    scene = replace(GUIDED, **changes)  # type: ignore[arg-type]
+    block_run = simulate(scene, t_end=0.5, output_dt=1e-3, tol=1e-9)
+    head_run = simulate(mirrored(scene), t_end=0.5, output_dt=1e-3, tol=1e-9)
+    np.testing.assert_allclose(block_run.q, -head_run.q, atol=1e-8)
+    assert {n: s["makes"] for n, s in block_run.statistics.items()} == {
+        n: s["makes"] for n, s in head_run.statistics.items()
+    }
+
+
+def test_corners_that_turn_little_are_nearly_a_mirrored_head_with_walls() -> None:
+    def difference(angle: float) -> float:
+        scene = replace(
+            GUIDED, locked=(), friction=None, loads=(), initial=Initial(q=(0.0, 0.0, angle), v=(0.4, -0.3, 0.0))
+        )
+        ends = [simulate(one, t_end=0.03, output_dt=1e-3, tol=1e-10).q for one in (scene, mirrored(scene))]
+        return float(np.abs(ends[0] + ends[1]).max())
+
+    # what the arms differ by is the clearance over the size, and a turn as large
+    assert difference(1e-3) < 0.1 * 0.03
+
+
+def test_corners_move_the_same_by_fixed_steps_and_by_a_live_twin(falls) -> None:
+    fixed = simulate(block(), t_end=0.2, output_dt=0.004, method="rk4", dt=1e-5)
+    np.testing.assert_allclose(fixed.q, falls.q[:51], atol=2e-4)
+    twin = Twin(block())
+    for t in falls.t[1:101]:
+        now = twin.advance(float(t))
+    np.testing.assert_allclose(now.q, falls.q[100], atol=1e-9)
+    assert TwinBatch([block(), block(friction=Friction(0.3, SLIP_SPEED))]).advance(0.1).q.shape == (2, 1, 3)
+
+
+def test_senses_of_corners_are_those_of_the_block() -> None:
+    # a moment turns the block counter-clockwise against its guide: these sets stop a counter-clockwise swing
+    scene = block(
+        frame=Frame(0.3, 0.2), clearance=Clearance(0.01, 0.01), friction=None, gravity=Gravity(0.0),
+        loads=(Constant("turn", moment_n_m=50.0),), initial=Initial(),
+    )  # fmt: skip
+    result = simulate(scene, t_end=0.2, output_dt=1e-2)
+    assert result.contact_sets["ccw"] and not result.contact_sets["cw"]
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: replace(block(), head=Head(1.0, 1.0, "consistent", (0.01, 0.0), "corners")), "head.com_offset_m"),
+        (lambda: block(support=Support(1.0, 1.0, 1e6, 1e6, 1e6)), "carries: corners"),
+        (lambda: block(head=Head(1.0, 1.0, carries="edges")), "walls, corners"),
+    ],
+)
+def test_what_corners_cannot_have_is_named(make: Callable[[], Scene], expected: str) -> None:
+    with pytest.raises(SceneError, match=expected):
+        make()
+
+
+def test_block_that_is_not_square_ends_at_45_degrees_with_a_named_error() -> None:
+    with pytest.raises(ArgumentError, match="carries"):
+        TwinBatch([block(), mirrored(block())])
+    with pytest.raises(Exception, match="45 degrees"):
+        simulate(block(frame=Frame(SIDE, 0.05)), t_end=0.5, output_dt=0.01)
+
+
+def test_estimate_refuses_a_block() -> None:
+    with pytest.raises(Exception, match=r"head\.carries"):
+        Forward(block(), None)  # type: ignore[arg-type]
