@@ -17,6 +17,7 @@ SAID = {
     "sweep": r"20\.0 mm( +\d+\.\d){5}",
     "calibration": r"stiffness 3\.1e\+07 N/m",
     "reading_a_recording": r"result +the same\b",
+    "measured_drop": r"mean distance of the simulated centre: \d+\.\d mm; measured inside the bands: \d+%",
     "a_year": r"the forecast narrowed from \d+ to \d+ days",
 }
 FOLDERS = sorted(path for path in (ROOT / "examples").iterdir() if path.is_dir())

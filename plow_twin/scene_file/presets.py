@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 #: Scenes that come with the package.
-PRESETS: Final = ("paper", "bench_kv", "bench_hc")
+PRESETS: Final = ("paper", "bench_kv", "bench_hc", "measured_square", "measured_ellipse")
 
 
 def config_folder() -> Path:
@@ -32,5 +32,5 @@ def config_folder() -> Path:
 
 
 def scene_path(name: str | Path) -> Path:
-    """Return the file of a preset (`paper`, `bench_kv`, `bench_hc`), or any other path unchanged."""
+    """Return the file of a preset (`PRESETS`), or any other path unchanged."""
     return config_folder() / f"{name}.yaml" if str(name) in PRESETS else Path(name)

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba.extending import overload
 
+from plow_twin.kernel.by_field import by_field
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
@@ -18,31 +18,10 @@ from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 QUARTER_TURN = 0.5 * math.pi
 
 
-def fixed_axes(p):
-    """Return 1 where the state is resolved along world axes (the head carries corners), else None; compiled only.
-
-    The type of the parameters tells, so the code of the other kind of scene is left out.
-    """
-    raise NotImplementedError(f"fixed_axes: called with {p!r}, expected a call from a compiled function")
-
-
-@overload(fixed_axes)
-def _fixed_axes(p):
-    if "tumbles" in p.fields:
-        return lambda p: 1
-    return lambda p: None
-
-
-def may_tumble(p):
-    """Tell whether the head may turn beyond 45 degrees (`model.geometry.tumbles`); compiled only, as `fixed_axes`."""
-    raise NotImplementedError(f"may_tumble: called with {p!r}, expected a call from a compiled function")
-
-
-@overload(may_tumble)
-def _may_tumble(p):
-    if "tumbles" in p.fields:
-        return lambda p: p.tumbles != 0.0
-    return lambda p: False
+#: 1 where the state is resolved along world axes (the head carries corners), else None.
+fixed_axes = by_field("tumbles", lambda p: 1, lambda p: None)
+#: Whether the head may turn beyond 45 degrees (`model.geometry.tumbles`).
+may_tumble = by_field("tumbles", lambda p: p.tumbles != 0.0, lambda p: False)
 
 
 @kernel(inline="code")

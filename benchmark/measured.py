@@ -1,0 +1,307 @@
+"""The contact model held against measured impacts of an ellipse and drops of a square (`benchmark/data/measured`).
+
+    python benchmark/measured.py            fits, errors, coverage: benchmark/results/measured.json
+    python benchmark/measured.py --only square
+    python benchmark/measured.py --plot     pictures of it in docs/images
+
+Parameters are fitted to one half of the data at a time, errors are those on the other half.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.study.measured.drops import Drops
+from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, EllipseContact, contact_arms, impact
+from plow_twin.study.measured.square import SCATTER, SQUARE, ensemble, fit_flight, toss
+
+FOLDER = Path(__file__).resolve().parent
+DATA = FOLDER / "data" / "measured"
+RESULTS = FOLDER / "results" / "measured.json"
+IMAGES = FOLDER.parent / "docs" / "images"
+#: Step of each unknown with which a fit begins.
+STEPS = {"tilt": 0.004, "fall": 0.1, "fall_along": 0.05, "slip_speed": 0.05, "restitution": 0.05, "friction": 0.03}
+PLAIN = replace(ELLIPSE, fall=0.0, fall_along=0.0, tilt=0.0, restitution=0.54)
+FRICTIONS = {
+    "regularised": (dict(slip_speed=0.05), ("slip_speed",)),
+    "spring": (dict(stick_stiffness=4.0, stick_damping=0.0), ("stick_stiffness",)),
+    "spring and damper": (dict(stick_stiffness=1.6, stick_damping=0.16), ("stick_stiffness", "stick_damping")),
+}
+FALLING = ("fall", "fall_along", "tilt")
+
+
+class Impacts:
+    """The measured impacts of the ellipse, in two halves."""
+
+    def __init__(self) -> None:
+        with np.load(DATA / "ellipse_impacts.npz") as data:
+            self.before, self.after = data["before"], data["after"]
+        self.half = np.random.default_rng(1).permutation(len(self.before)) % 2
+
+    def missed(self, found: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+        """Return the norm of what the velocities miss in m/s, omega by the radius of gyration."""
+        return np.asarray(np.linalg.norm((found - self.after[chosen])[:, 3:] * [1.0, 1.0, GYRATION], axis=1))
+
+    def fit(self, start: EllipseContact, names: tuple[str, ...], chosen: np.ndarray) -> EllipseContact:
+        """Fit the named numbers to the chosen impacts by the root of the mean square."""
+        first = np.array([getattr(start, name) for name in names])
+        steps = [STEPS.get(name, 0.2 * getattr(start, name) + 0.02) for name in names]
+
+        def contact(values: np.ndarray) -> EllipseContact:
+            return replace(start, **{name: float(value) for name, value in zip(names, values, strict=True)})
+
+        def cost(values: np.ndarray) -> float:
+            found = contact(values)
+            if min(found.restitution, found.friction, found.slip_speed, found.stick_stiffness) < 0.0:
+                return 9.0
+            return float((self.missed(impact(self.before[chosen], found), chosen) ** 2).mean())
+
+        simplex = np.vstack([first, first + np.diag(steps)])
+        options = dict(maxfev=40 * len(names), initial_simplex=simplex, xatol=1e-3, fatol=1e-6)
+        return contact(minimize(cost, first, method="Nelder-Mead", options=options).x)
+
+    def held_out(self, start: EllipseContact, names: tuple[str, ...]) -> dict[str, Any]:
+        """Fit to each half and return the errors on the other one."""
+        missed, fitted = [], []
+        for half in (0, 1):
+            contact = self.fit(start, names, np.flatnonzero(self.half != half))
+            chosen = np.flatnonzero(self.half == half)
+            missed.append(self.missed(impact(self.before[chosen], contact), chosen))
+            fitted.append({name: round(float(getattr(contact, name)), 4) for name in names})
+        return {**errors(np.concatenate(missed)), "fitted": fitted}
+
+    def rigid(self, model: Any) -> dict[str, Any]:
+        """Fit e and mu of a rigid impact to each half; return the errors on the other one."""
+        missed = []
+        for half in (0, 1):
+            fit, held = np.flatnonzero(self.half != half), np.flatnonzero(self.half == half)
+
+            def cost(x: np.ndarray, chosen: np.ndarray = fit) -> float:
+                return float((self.missed(rigid_impact(self.before[chosen], model, *x), chosen) ** 2).mean())
+
+            simplex = np.array([[0.54, 0.18], [0.6, 0.18], [0.54, 0.22]])
+            found = minimize(cost, simplex[0], method="Nelder-Mead", options=dict(initial_simplex=simplex, maxfev=40)).x
+            missed.append(self.missed(rigid_impact(self.before[held], model, *found), held))
+        return errors(np.concatenate(missed))
+
+    def floor(self) -> dict[str, Any]:
+        """Return what any impulse at the lowest point leaves."""
+        arm, up = contact_arms(self.before[:, 2])
+        change = (self.after - self.before)[:, 3:] * [-1.0, 1.0, GYRATION]
+        rows = np.zeros((len(change), 3, 2))
+        rows[:, 0, 0] = rows[:, 1, 1] = 1.0
+        rows[:, 2, 0], rows[:, 2, 1] = -up / GYRATION, arm / GYRATION
+        impulse = np.einsum("nij,nj->ni", np.linalg.pinv(rows), change)
+        return errors(np.linalg.norm(np.einsum("nij,nj->ni", rows, impulse) - change, axis=1))
+
+
+def errors(missed: np.ndarray) -> dict[str, Any]:
+    """Return the figures of errors in m/s."""
+    return {"rms": round(float(np.sqrt((missed**2).mean())), 4), "median": round(float(np.median(missed)), 4)}
+
+
+def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndarray:
+    """Return the states after rigid impacts at the lowest point; `model` gives the impulses (p_t, p_n)."""
+    arm, up = contact_arms(before[:, 2])
+    inertia, found = GYRATION**2, before.copy()
+    slip, rate = -before[:, 3] - before[:, 5] * up, before[:, 4] + before[:, 5] * arm
+    mobility = 1.0 + up**2 / inertia, 1.0 + arm**2 / inertia, -arm * up / inertia
+    along, away = model(slip, rate, *mobility, e, abs(mu))
+    found[:, 3] -= along
+    found[:, 4] += away
+    found[:, 5] += (arm * away - up * along) / inertia
+    return found
+
+
+def routh(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
+    """Return impulses after Routh with Poisson's restitution: Coulomb's friction at each bit of the normal impulse.
+
+    Routh, Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635.
+    """
+    along, away, end = np.zeros_like(slip), np.zeros_like(slip), np.full_like(slip, np.inf)
+    bit = 2e-3
+    for _ in range(4000):
+        now = slip + tt * along + tn * away
+        drag = np.clip(-(now + tn * bit) / tt, -mu * bit, mu * bit)
+        going = away < end
+        along, away = along + np.where(going, drag, 0.0), away + np.where(going, bit, 0.0)
+        turned = (rate + nn * away + tn * along >= 0.0) & np.isinf(end)
+        end = np.where(turned, (1.0 + e) * away, end)
+        if not going.any():
+            break
+    return along, away
+
+
+def newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
+    """Return impulses that stop the slip, or of Coulomb's cone, with Newton's restitution (Whittaker, 1904)."""
+    wanted = -(1.0 + e) * rate
+    determinant = tt * nn - tn**2
+    away, along = (tt * wanted + tn * slip) / determinant, (-nn * slip - tn * wanted) / determinant
+    slides = np.abs(along) > mu * away
+    side = np.sign(along)
+    limited = wanted / (nn + tn * mu * side)
+    return np.where(slides, mu * side * limited, along), np.where(slides, limited, away)
+
+
+def anitescu_potra(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
+    """Return impulses of a complementarity problem with Poisson's restitution of the normal one.
+
+    Anitescu and Potra, Nonlinear Dyn. 14 (1997) 231.
+    """
+    along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)
+    return along, (1.0 + e) * away
+
+
+RIGID = {"Routh, Poisson": routh, "Whittaker, Newton": newton, "Anitescu-Potra, Poisson": anitescu_potra}
+
+
+def by_law(impacts: Impacts) -> dict[str, Any]:
+    """Return the errors of each law with each friction, all numbers fitted, and of what was added to one of them."""
+    found: dict[str, Any] = {"any impulse at the point": impacts.floor()}
+    for name, model in RIGID.items():
+        found[f"rigid: {name}"] = impacts.rigid(model)
+        print(name, found[f"rigid: {name}"], flush=True)
+    for law, about in LAWS.items():
+        start = 0.25 if about.additive else 0.8 if about.number_of is None else 0.54
+        for friction, (numbers, names) in FRICTIONS.items():
+            contact = replace(PLAIN, law=law, exponent=about.exponent or 1.0, restitution=start, **numbers)  # type: ignore[arg-type]
+            name = f"{law}, {friction}"
+            found[name] = impacts.held_out(contact, ("restitution", "friction", *names))
+            print(name, found[name], flush=True)
+    for friction, (numbers, names) in FRICTIONS.items():
+        name = f"falling restitution, {friction}"
+        contact = replace(ELLIPSE, **numbers)  # type: ignore[arg-type]
+        found[name] = impacts.held_out(contact, ("restitution", "friction", *names, *FALLING))
+        print(name, found[name], flush=True)
+    return found
+
+
+def crps(members: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the continuous ranked probability score of an ensemble (m, ...) at each row."""
+    count = len(members)
+    weights = (2 * np.arange(1, count + 1) - count - 1).reshape(-1, *[1] * measured.ndim)
+    return np.asarray(
+        np.abs(members - measured).mean(axis=0) - (weights * np.sort(members, axis=0)).sum(axis=0) / count**2
+    )
+
+
+def sharp() -> np.ndarray:
+    """Return the square with sharp corners, one restitution and one friction, fitted in the same way."""
+    block = SQUARE.copy()
+    for name, value in dict(
+        half=0.03, radius=0.0, gyration=0.06 / 6**0.5, table=-5e-4, restitution=0.4362, restitution_fall=0.0,
+        friction=0.1014, friction_fall=0.0, tangential=1.0, tangential_damping=0.3,
+    ).items():  # fmt: skip
+        block[name] = value
+    return block
+
+
+def of_drops(drops: Drops) -> dict[str, Any]:
+    """Return distances over 1, 2, 3 bounces, coverage by bounce and score of the bands, for both blocks."""
+    found: dict[str, Any] = {}
+    for name, block in {"rounded corners, what falls": SQUARE, "sharp corners, nothing falls": sharp()}.items():
+        far: list[list[tuple[float, float]]] = [[], [], []]
+        inside: list[list[np.ndarray]] = [[], [], []]
+        scores = []
+        for index in drops.usable():
+            pose, given, lows = drops.pose[index], int(drops.flight_rows[index]), drops.bounces[index]
+            flight = fit_flight(pose[:given], block)
+            rows = toss(flight.state[None], len(pose), np.array([block], block.dtype))[0]
+            start = given - 1
+            until = drops.until(index, 2) + 1
+            members = ensemble(pose[:given], until, members=200, seed=index, block=block, scatter=SCATTER)
+            low, high = np.quantile(members, [0.05, 0.95], axis=0)
+            holds = (pose[:until] >= low) & (pose[:until] <= high)
+            scores.append(crps(members[:, given:], pose[given:until]).mean(axis=0))
+            edges = [start, *lows[1:3]]
+            for bounce, (first, last) in enumerate(pairwise(edges)):
+                off = rows[: last - start, :3] - pose[start:last]
+                # over all bounces so far
+                far[bounce].append((float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.abs(off[:, 2]).mean())))
+                inside[bounce].append(holds[first:last].mean(axis=0))
+            if len(lows) > 3:
+                off = rows[: lows[3] - start, :3] - pose[start : lows[3]]
+                far[2].append((float(np.hypot(off[:, 0], off[:, 1]).mean()), float(np.abs(off[:, 2]).mean())))
+        found[name] = {
+            "drops": [len(one) for one in far],
+            "distance_mm": [round(1e3 * float(np.median([d for d, _ in one])), 1) for one in far],
+            "angle_rad": [round(float(np.median([a for _, a in one])), 2) for one in far],
+            "coverage": [np.round(np.mean(one, axis=0), 3).tolist() for one in inside if one],
+            "crps_mm_mm_rad": np.round(np.mean(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
+            "crps_median": np.round(np.median(scores, axis=0) * [1e3, 1e3, 1.0], 2).tolist(),
+        }
+        print(name, found[name], flush=True)
+    return found
+
+
+def plot(results: dict[str, Any], drops: Drops) -> None:
+    """Draw errors by law, a drop with its band, and coverage by bounce."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(8, 0.24 * len(results["ellipse"]) + 1))
+    names = sorted(results["ellipse"], key=lambda name: -results["ellipse"][name]["rms"])
+    axis.barh(names, [results["ellipse"][name]["rms"] for name in names], color="tab:blue", label="RMS")
+    axis.plot([results["ellipse"][name]["median"] for name in names], names, "k|", label="median")
+    axis.set_xlabel("error of the velocity after the impact, held out [m/s]")
+    axis.legend()
+    figure.savefig(IMAGES / "measured_laws.png", dpi=110, bbox_inches="tight")
+    index = next(i for i in drops.usable() if len(drops.bounces[i]) > 2)
+    pose, given = drops.pose[index], int(drops.flight_rows[index])
+    rows = drops.until(index, 2) + 1
+    points = np.quantile(ensemble(pose[:given], rows), [0.05, 0.5, 0.95], axis=0)
+    figure, axes = plt.subplots(3, 1, figsize=(8, 7), sharex=True)
+    t = np.arange(rows) / 250.0
+    for j, (axis, name) in enumerate(zip(axes, ("x [m]", "z [m]", "theta [rad]"), strict=True)):
+        axis.fill_between(t, points[0, :, j], points[2, :, j], color="tab:blue", alpha=0.3, label="90 % band")
+        axis.plot(t, points[1, :, j], color="tab:blue", label="median")
+        axis.plot(t, pose[:rows, j], "k.", markersize=3, label="measured")
+        axis.axvline((given - 1) / 250.0, color="0.6")
+        axis.set_ylabel(name)
+    axes[0].legend()
+    axes[2].set_xlabel("t [s]")
+    figure.savefig(IMAGES / "measured_drop.png", dpi=110, bbox_inches="tight")
+    figure, axis = plt.subplots(figsize=(6, 3))
+    for name, one in results["square"].items():
+        for j, (what, style) in enumerate((("x", "-"), ("z", "--"), ("theta", ":"))):
+            color = "tab:blue" if name.startswith("rounded") else "tab:orange"
+            cover = [row[j] for row in one["coverage"]]
+            axis.plot(range(1, len(cover) + 1), cover, style, marker="o", color=color, label=f"{what}, {name}")
+    axis.axhspan(0.85, 0.95, color="0.9")
+    axis.set_xticks([1, 2])
+    axis.set_xlabel("after bounce")
+    axis.set_ylabel("share of rows inside")
+    axis.legend(fontsize=7)
+    figure.savefig(IMAGES / "measured_coverage.png", dpi=110, bbox_inches="tight")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--plot", action="store_true", help="draw the stored results")
+    parser.add_argument("--only", choices=("square", "ellipse"), help="compute one part, keep the other")
+    chosen = parser.parse_args()
+    drops = Drops.load(DATA / "square_drops.npz")
+    results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
+    if chosen.plot:
+        plot(results, drops)
+        return
+    if chosen.only != "ellipse":
+        results["square"] = of_drops(drops)
+    if chosen.only != "square":
+        results["ellipse"] = by_law(Impacts())
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""One measured drop of a square, the block of the preset over it, and the band that its first flight leaves open."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+
+from plow_twin import Initial, load_scene, simulate
+from plow_twin.study.measured import bands
+from plow_twin.study.measured.drops import Drops
+from plow_twin.study.measured.square import RATE_HZ, fit_flight
+
+FOLDER = Path(__file__).resolve().parent
+DATA = FOLDER.parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
+DROP = 4
+
+
+def main() -> None:
+    """Simulate the drop, draw it in its band, and say how far off it is."""
+    out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/examples/measured_drop")
+    drops = Drops.load(DATA)
+    pose, given = drops.pose[DROP], int(drops.flight_rows[DROP])
+    until = drops.until(DROP, 1) + 1
+    found = bands(pose[:given], until)
+    # the preset's cavity has its centre 1 m above the table
+    x, z, theta, *rates = fit_flight(pose[:given]).state
+    start = Initial(q=(x, z - 1.0, theta), v=(rates[0], rates[1], rates[2]))
+    scene = replace(load_scene("measured_square"), initial=start)
+    result = simulate(scene, t_end=(until - given) / RATE_HZ, output_dt=1.0 / RATE_HZ)
+    simulated = result.q + np.array([0.0, 1.0, 0.0])
+    off = np.hypot(*(simulated[:, :2] - pose[given - 1 : until, :2]).T)
+    inside = ((pose[:until] >= found[:, 0]) & (pose[:until] <= found[:, 2])).mean()
+    print(f"first flight: {given} rows; up to the second bounce: {until} rows")
+    print(f"mean distance of the simulated centre: {1e3 * off.mean():.1f} mm; measured inside the bands: {inside:.0%}")
+    out.mkdir(parents=True, exist_ok=True)
+    t = np.arange(until) / RATE_HZ
+    figure, axes = plt.subplots(3, 1, sharex=True, figsize=(8, 7))
+    for j, (axis, name) in enumerate(zip(axes, ("x [m]", "z [m]", "theta [rad]"), strict=True)):
+        axis.fill_between(t, found[:, 0, j], found[:, 2, j], alpha=0.3, label="90 % band")
+        axis.plot(t, pose[:until, j], "k.", label="measured")
+        axis.plot(t[given - 1 :], simulated[:, j], label="measured_square")
+        axis.set_ylabel(name)
+    axes[0].legend()
+    axes[2].set_xlabel("t [s]")
+    figure.savefig(out / "drop.png", dpi=110)
+    print(f"picture: {out / 'drop.png'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""Single impacts of bodies that touch a wall at one point, many at once: place and arms stay, velocities change.
+
+The contact is that of `model.contact`, friction is regularised (`model.friction`) or the spring of `solve.grip`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.model.contact import normal_force
+from plow_twin.model.friction import friction_force
+
+#: Numbers of the contact, per mass: stiffness K, exponent n, C, ramp [m]; mu, regularisation speed [m/s] (0: a spring),
+#: tangential stiffness and damping.
+POINT = np.dtype(
+    [
+        (name, "f8")
+        for name in (
+            "stiffness", "exponent", "viscous", "ramp", "friction", "slip_speed", "stick_stiffness", "stick_damping",
+        )
+    ]
+)  # fmt: skip
+#: Steps in the time that the undamped impact takes, and how many of these times an impact may last.
+_STEPS, _LONGEST = 800, 20
+
+
+@kernel()
+def _strike(point, damping, normal_arm, tangential_arm, inertia, speed, slip, out) -> None:
+    normal = 1.0 + normal_arm * normal_arm / inertia
+    along = 1.0 + tangential_arm * tangential_arm / inertia
+    coupling = -normal_arm * tangential_arm / inertia
+    # how deep and how long without damping, but for a factor near 1
+    power = point.exponent + 1.0
+    deepest = (power * speed * speed / (2.0 * point.stiffness * normal)) ** (1.0 / power)
+    h = math.pi * deepest / (speed * _STEPS)
+    depth, place, anchor, rate, rate_along = 0.0, 0.0, 0.0, speed, slip
+    pushed = dragged = 0.0
+    for _ in range(_LONGEST * _STEPS):
+        force = normal_force(depth, rate, point.stiffness, point.exponent, damping, point.viscous, point.ramp)
+        if point.slip_speed > 0.0:
+            drag = friction_force(force, rate_along, point.friction, point.slip_speed)
+        else:
+            drag = point.stick_stiffness * (place - anchor) + point.stick_damping * rate_along
+            limit = point.friction * force
+            if abs(drag) > limit:
+                drag = limit if drag > 0.0 else -limit
+                anchor = place - (drag - point.stick_damping * rate_along) / point.stick_stiffness
+        pushed += h * force
+        dragged -= h * drag
+        rate = speed - normal * pushed - coupling * dragged
+        rate_along = slip + along * dragged + coupling * pushed
+        depth += h * rate
+        place += h * rate_along
+        if depth <= 0.0:
+            break
+    out[0], out[1] = dragged, pushed
+
+
+@kernel(entry=True)
+def strike_points(point, damping, normal_arm, tangential_arm, inertia, speed, slip, impulse) -> None:
+    """Write the impulses of impacts along the wall and away from it, per mass, to `impulse`.
+
+    Parameters
+    ----------
+    point : ndarray of POINT, shape (1,)
+    damping : ndarray, shape (m,)
+        lambda of each impact in s/m.
+    normal_arm, tangential_arm : ndarray, shape (m,)
+        Place of the point that touches from the centre of mass, along the wall and away from it, in m.
+    inertia : float
+        Square of the radius of gyration in m^2.
+    speed, slip : ndarray, shape (m,)
+        Rates at which the point approaches the wall (> 0) and moves along it, in m/s.
+    impulse : ndarray, shape (m, 2)
+        Receives the impulses in m/s.
+    """
+    for i in range(speed.size):
+        _strike(point[0], damping[i], normal_arm[i], tangential_arm[i], inertia, speed[i], slip[i], impulse[i])

@@ -1,0 +1,143 @@
+"""Many square blocks with rounded corners tossed on a table, each with numbers of its own: batches of short motions.
+
+The contact is that of `model.contact` and the spring friction of `solve.grip`, with two things that a scene has not: a
+restitution and a friction that fall with the impact, and a radius of the corners. Flight has linear drag. Steps are
+fixed, a fraction of the contact time in contact, and as long as no corner can reach the table in flight.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.model.contact import normal_force
+
+#: Numbers of a block, per mass: half the distance between the centres of its corners' arcs [m], their radius [m],
+#: radius of gyration [m], height of the table [m], stiffness K [1/s^2], tangential stiffness over K [1], tangential
+#: damping over the critical one [1], restitution and friction at 1 m/s, by which power of the impact they fall, which
+#: power of the moving mass counts in it, gravity [m/s^2], drag of place and of angle [1/s].
+BLOCK = np.dtype(
+    [
+        (name, "f8")
+        for name in (
+            "half", "radius", "gyration", "table", "stiffness", "tangential", "tangential_damping", "restitution",
+            "restitution_fall", "friction", "friction_fall", "mass_power", "gravity", "drag", "spin_drag",
+        )
+    ]
+)  # fmt: skip
+CORNERS = 4
+#: Steps in half a period of the stiffest contact.
+_STEPS = 70.0
+#: Slowest touch in m/s that a restitution is read at, least and largest restitution.
+_SLOWEST, _LEAST, _LARGEST = 0.01, 0.05, 0.9
+#: Impact in m/s below which restitution and friction fall no more.
+_SMALLEST_IMPACT = 0.05
+#: Mobility of a corner on a mass of 1 about which the powers of the moving mass count: that of a uniform square that
+#: lands on an edge's end.
+_USUAL_MOBILITY = 1.5
+
+
+@kernel(inline="code")
+def _number(table, restitution):
+    """Return the damping number D of a restitution from its values on a grid from 0 to 1."""
+    at = restitution * (table.size - 1)
+    index = min(int(at), table.size - 2)
+    return table[index] + (at - index) * (table[index + 1] - table[index])
+
+
+@kernel()
+def _fly(block, z, h) -> None:
+    """Let a block fly for h seconds, z = (x, z, theta, vx, vz, omega)."""
+    for j in range(3):
+        drag = block.spin_drag if j == 2 else block.drag
+        rate = -drag * z[3 + j] - (block.gravity if j == 1 else 0.0)
+        z[j] += (z[3 + j] + 0.5 * rate * h) * h
+        z[3 + j] += rate * h
+
+
+@kernel()
+def _toss(block, numbers, scatter, dt, rows) -> None:
+    z = np.empty(6)
+    for j in range(6):
+        z[j] = rows[0, j]
+    touching, damping = np.zeros(CORNERS, np.int64), np.zeros(CORNERS)
+    anchor, friction, shift = np.zeros(CORNERS), np.zeros(CORNERS), np.zeros(CORNERS)
+    inertia, touches, time = block.gyration * block.gyration, 0, 0.0
+    longest = math.pi / (_STEPS * math.sqrt(block.stiffness))
+    spring = block.tangential * block.stiffness
+    damper = 2.0 * block.tangential_damping * math.sqrt(spring)
+    for row in range(1, len(rows)):
+        until = row * dt
+        while time < until - 1e-12:
+            c, s = math.cos(z[2]), math.sin(z[2])
+            gap = z[1] - block.table - block.radius - block.half * (abs(c) + abs(s))
+            if gap > 1e-9:
+                speed = max(-z[4], 0.0) + math.sqrt(2.0) * block.half * abs(z[5]) + 1e-3
+                h = min(until - time, 0.9 * gap / speed + 1e-6)
+                _fly(block, z, h)
+                touching[:] = 0
+                time += h
+                continue
+            h, along, up, moment = min(until - time, longest), 0.0, 0.0, 0.0
+            for corner in range(CORNERS):
+                cx = block.half if corner == 0 or corner == 3 else -block.half
+                cz = block.half if corner < 2 else -block.half
+                ax, az = c * cx - s * cz, s * cx + c * cz
+                depth = block.table + block.radius - z[1] - az
+                if depth <= 0.0:
+                    touching[corner] = 0
+                    continue
+                # the arc rolls: the point that touches lies below its centre
+                arm = az - block.radius
+                slip, rate = z[3] - z[5] * arm, -z[4] - z[5] * ax
+                place = z[0] + ax + block.radius * z[2]
+                if touching[corner] == 0:
+                    touching[corner], anchor[corner] = 1, place
+                    v0 = max(rate, _SLOWEST)
+                    mass = _USUAL_MOBILITY / (1.0 + ax * ax / inertia)
+                    impact = max(v0 * mass**block.mass_power, _SMALLEST_IMPACT)
+                    draw = scatter[min(touches, len(scatter) - 1)]
+                    touches += 1
+                    e = block.restitution * impact ** (-block.restitution_fall) + draw[0]
+                    damping[corner] = _number(numbers, min(max(e, _LEAST), _LARGEST)) / v0
+                    shift[corner] = draw[2]
+                    friction[corner] = block.friction * impact ** (-block.friction_fall) * math.exp(draw[1])
+                force = normal_force(depth, rate, block.stiffness, 1.0, damping[corner], 0.0, 0.0)
+                drag = spring * (place - anchor[corner]) + damper * slip
+                limit = friction[corner] * force
+                if abs(drag) > limit:
+                    drag = limit if drag > 0.0 else -limit
+                    anchor[corner] = place - (drag - damper * slip) / spring
+                along -= drag
+                up += force
+                moment += (ax + shift[corner]) * force + arm * drag
+            z[3] += h * (along - block.drag * z[3])
+            z[4] += h * (up - block.gravity - block.drag * z[4])
+            z[5] += h * (moment / inertia - block.spin_drag * z[5])
+            for j in range(3):
+                z[j] += h * z[3 + j]
+            time += h
+        for j in range(6):
+            rows[row, j] = z[j]
+
+
+@kernel(entry=True)
+def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
+    """Write the motions of blocks, one row every `dt` seconds.
+
+    Parameters
+    ----------
+    blocks : ndarray of BLOCK, shape (m,)
+    numbers : ndarray, shape (k,)
+        Damping number D of restitutions from 0 to 1, evenly spaced.
+    scatter : ndarray, shape (m, touches, 3)
+        What each touch has more of restitution, of the friction's logarithm, and by how much [m] its force acts beside
+        the lowest point; later touches have the last one's.
+    dt : float
+    rows : ndarray, shape (m, n, 6)
+        x, z, theta and their rates; the first row of each block is given.
+    """
+    for member in range(len(blocks)):
+        _toss(blocks[member], numbers, scatter[member], dt, rows[member])

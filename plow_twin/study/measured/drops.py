@@ -1,0 +1,96 @@
+"""Measured drops: where the first flight ends, where the bounces are, and how bands and motions do on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.study.measured.square import LEAST_ROWS, RATE_HZ, bands
+
+Array = NDArray[np.float64]
+
+#: Half the side of the square in m.
+_HALF: Final = 0.03
+#: An impact: how far the acceleration of z [m/s^2] and of theta [rad/s^2] leaves that of a flight, below which gap [m].
+_FALL, _JERK, _TWIST, _NEAR = 9.0, 9.0, 300.0, 0.03
+#: Rise in m between two bounces that are told apart.
+_RISE: Final = 0.003
+
+
+@dataclass(frozen=True)
+class Drops:
+    """Measured drops of the square.
+
+    Attributes
+    ----------
+    pose : ndarray, shape (n, rows, 3)
+        x, z [m] and unwrapped theta [rad] at 250 Hz.
+    flight_rows : ndarray, shape (n,)
+        Rows before the first impact.
+    bounces : tuple of tuple of int
+        Rows at which each drop is lowest, between rises of 3 mm.
+    """
+
+    pose: Array
+    flight_rows: NDArray[np.intp]
+    bounces: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def load(cls, path: Path) -> Drops:
+        """Read the file of drops (`benchmark/data/measured/square_drops.npz`).
+
+        Parameters
+        ----------
+        path : Path
+        """
+        with np.load(path) as data:
+            pose = data["pose"] * data["scale"]
+        pose[:, :, 2] = np.unwrap(pose[:, :, 2], axis=1)
+        flights = np.array([_flight_rows(one) for one in pose])
+        return cls(pose, flights, tuple(_bounces(one[:, 1]) for one in pose))
+
+    def usable(self) -> list[int]:
+        """Return the drops whose flight can be fitted and that bounce at least twice."""
+        enough = [i for i, given in enumerate(self.flight_rows) if given > LEAST_ROWS and len(self.bounces[i]) > 1]
+        return enough
+
+    def until(self, index: int, bounce: int) -> int:
+        """Return the row before the bounce of that number (from 0), or before the last one there is."""
+        return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
+
+    def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:
+        """Tell which measured x, z, theta lie in their 90 % bands, shape (rows, 3), up to a bounce."""
+        rows = self.until(index, bounce) + 1
+        points = bands(self.pose[index, : self.flight_rows[index]], rows)
+        found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])
+        return found
+
+
+def _flight_rows(pose: Array) -> int:
+    """Return the number of rows before the first impact."""
+    z, theta = pose[:, 1], pose[:, 2]
+    gap = z - _HALF * (np.abs(np.cos(theta)) + np.abs(np.sin(theta)))
+    pushed = np.abs(np.diff(z, 2) * RATE_HZ**2 + _FALL) > _JERK
+    pushed |= np.abs(np.diff(theta, 2) * RATE_HZ**2) > _TWIST
+    hits = np.flatnonzero(pushed & (gap[2:] < _NEAR))
+    return int(hits[0]) + 2 if hits.size else len(pose)
+
+
+def _bounces(z: Array) -> tuple[int, ...]:
+    """Return the rows of the lowest places between rises."""
+    found, falling, low, high = [], True, 0, 0
+    for row, height in enumerate(z):
+        if falling:
+            low = row if height < z[low] else low
+            if height > z[low] + _RISE:
+                found.append(low)
+                falling, high = False, row
+        else:
+            high = row if height > z[high] else high
+            if height < z[high] - _RISE:
+                falling, low = True, row
+    return tuple(found)

@@ -1,0 +1,149 @@
+"""Single impacts of an ellipse on a flat surface, by the project's contact model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.errors import ArgumentError
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.solve.point_impact import POINT, strike_points
+
+Array = NDArray[np.float64]
+
+#: Semi-axes and radius of gyration in m.
+SEMI_AXES: Final = (0.035, 0.025)
+GYRATION: Final = 0.0192
+#: Stiffness per mass in 1/s^2: place and arms stay during an impact, so it sets the time only.
+_STIFFNESS: Final = 1e9
+#: Speed in m/s of approach at which restitutions are given: the middle of the measured ones.
+USUAL_SPEED: Final = 2.5
+_LEAST, _LARGEST = 0.05, 0.98
+
+
+@dataclass(frozen=True)
+class EllipseContact:
+    """What an impact of the ellipse is computed with.
+
+    Attributes
+    ----------
+    law : str
+        Contact law, a key of `model.contact_laws.LAWS`.
+    exponent : float
+        n in F = K d^n.
+    restitution : float
+        Of an impact at 2.5 m/s without motion along the surface; of a law that has no restitution form its damping
+        number lambda v0, or C over the critical one.
+    fall : float
+        Power q by which it falls with the speed of approach v, (v / 2.5 m/s)^-q.
+    fall_along : float
+        By how much it falls with the speed of the centre of mass along the surface, in s/m.
+    friction : float
+        mu.
+    slip_speed : float
+        Regularisation speed in m/s; 0 for a tangential spring.
+    stick_stiffness : float
+        Tangential stiffness over the normal one.
+    stick_damping : float
+        Tangential damping over the critical one.
+    tilt : float
+        Angle in rad by which the surface is turned against the axes of the data.
+    """
+
+    law: str = "exact_restitution"
+    exponent: float = 1.0
+    restitution: float = 0.703
+    fall: float = 0.2523
+    fall_along: float = 0.2786
+    friction: float = 0.1907
+    slip_speed: float = 0.0
+    stick_stiffness: float = 1.584
+    stick_damping: float = 0.1597
+    tilt: float = -0.0131
+
+
+#: Fitted to the impacts with odd numbers.
+ELLIPSE: Final = EllipseContact()
+
+
+def contact_arms(theta: Array) -> tuple[Array, Array]:
+    """Return the place of the lowest point from the centre along and away from the surface in m, shape (n,) each.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (n,)
+        Angle of the ellipse, counter-clockwise.
+    """
+    a, b = SEMI_AXES
+    c, s = np.cos(theta), np.sin(theta)
+    height = np.hypot(a * s, b * c)
+    return -(a * a - b * b) * s * c / height, -height
+
+
+def impact(before: ArrayLike, contact: EllipseContact = ELLIPSE) -> Array:
+    """Return the state of the ellipse after an impact from the one before.
+
+    Parameters
+    ----------
+    before : array_like, shape (n, 6)
+        x, y [m], theta [rad], vx, vy [m/s], omega [rad/s] as measured: y away from the surface; theta and x as they
+        are in the data, where a positive theta turns y towards x.
+    contact : EllipseContact
+        Numbers of the contact; the fitted ones unless given.
+
+    Returns
+    -------
+    ndarray, shape (n, 6)
+        x, y, theta as before, and the velocities after the impact. A point that does not approach the surface is left
+        as it is.
+
+    Raises
+    ------
+    ArgumentError
+        For another shape, numbers that are not finite, or a law that is not known.
+    """
+    states = np.array(before, dtype=np.float64)
+    if states.ndim != 2 or states.shape[1] != 6 or not np.isfinite(states).all():
+        raise ArgumentError(f"before: got shape {states.shape}, expected finite numbers of shape (n, 6)")
+    if contact.law not in LAWS:
+        raise ArgumentError(f"contact.law: got {contact.law!r}, expected one of {', '.join(LAWS)}")
+    c, s = np.cos(contact.tilt), np.sin(contact.tilt)
+    # the data's x runs against the sense in which theta is counter-clockwise
+    along, up = -c * states[:, 3] + s * states[:, 4], s * states[:, 3] + c * states[:, 4]
+    normal_arm, tangential_arm = contact_arms(states[:, 2] - contact.tilt)
+    slip, speed = along - states[:, 5] * tangential_arm, -(up + states[:, 5] * normal_arm)
+    hits = speed > 0.0
+    damping, point = _numbers(contact, speed[hits], along[hits], normal_arm[hits])
+    impulse = np.zeros((len(states), 2))
+    struck = np.zeros((int(hits.sum()), 2))
+    strike_points(point, damping, normal_arm[hits], tangential_arm[hits], GYRATION**2, speed[hits], slip[hits], struck)
+    impulse[hits] = struck
+    states[:, 3] -= c * impulse[:, 0] - s * impulse[:, 1]
+    states[:, 4] += s * impulse[:, 0] + c * impulse[:, 1]
+    states[:, 5] += (normal_arm * impulse[:, 1] - tangential_arm * impulse[:, 0]) / GYRATION**2
+    return states
+
+
+def _numbers(contact: EllipseContact, speed: Array, along: Array, normal_arm: Array) -> tuple[Array, NDArray[np.void]]:
+    """Return lambda of each impact in s/m, and what all have in common."""
+    law, wanted = LAWS[contact.law], contact.restitution
+    e = np.clip(wanted * (speed / USUAL_SPEED) ** -contact.fall - contact.fall_along * np.abs(along), _LEAST, _LARGEST)
+    viscous, damping = 0.0, np.zeros_like(speed)
+    if law.additive:
+        mobility = 1.0 + float(np.mean(normal_arm**2)) / GYRATION**2
+        viscous = 2.0 * wanted * (_STIFFNESS / mobility) ** 0.5
+    elif law.number_of is not None:
+        grid = np.linspace(_LEAST, _LARGEST, 500)
+        damping = np.interp(e, grid, [law.damping_number(one) for one in grid]) / speed
+    else:
+        damping[:] = wanted / USUAL_SPEED
+    spring = contact.stick_stiffness * _STIFFNESS
+    ramp = 0.1 * USUAL_SPEED / _STIFFNESS**0.5 if law.ramped else 0.0
+    numbers = (
+        _STIFFNESS, contact.exponent, viscous, ramp, contact.friction, contact.slip_speed, spring,
+        2.0 * contact.stick_damping * spring**0.5,
+    )  # fmt: skip
+    return damping, np.array([numbers], POINT)

@@ -1,0 +1,272 @@
+"""Drops of a square block: its first flight fitted, and bands of what follows from a batch of blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.errors import ArgumentError
+from plow_twin.model.contact_laws import LAWS
+from plow_twin.solve.rounded_block import BLOCK, toss_blocks
+
+Array = NDArray[np.float64]
+
+#: Rate of the rows in Hz.
+RATE_HZ: Final = 250.0
+_DT: Final = 1.0 / RATE_HZ
+#: Steps of the table of damping numbers.
+_NUMBERS: Final = 1000
+#: Touches of a motion that have a scatter of their own.
+_TOUCHES: Final = 64
+#: Turn in rad beside that of the flight within a row which only an impact makes.
+_TURN_IN_A_ROW: Final = 0.1
+#: Rows of a first flight: fewer do not tell its speeds.
+LEAST_ROWS: Final = 4
+
+#: Fitted to drops with odd numbers.
+SQUARE: Final = np.array(
+    (0.02546, 0.005644, 0.0215, -0.0002387, 1e8, 0.661, 0.02, 0.59, 0.2, 0.15, 0.2245, 1.094, 9.81, 0.43, 0.7), BLOCK
+)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """What no parameter explains, as standard deviations.
+
+    Attributes
+    ----------
+    restitution, friction : float
+        Of the restitution of each touch [1]; of the logarithm of its friction.
+    table, spin : float
+        Of the table's height from drop to drop [m]; of the rate of turning that the flight shows [rad/s].
+    speed : float
+        Of the speed that the flight shows [m/s].
+    place, angle : float
+        Of a measured row [m], [rad].
+    shift : float
+        Of the place where the force of a touch acts, along the table [m].
+    drag : float
+        Of the logarithm of a drop's drag.
+    """
+
+    restitution: float = 0.065
+    friction: float = 0.5
+    table: float = 3e-4
+    spin: float = 0.05
+    speed: float = 0.005
+    place: float = 6e-5
+    angle: float = 1e-3
+    shift: float = 2.6e-3
+    drag: float = 0.2
+
+
+SCATTER: Final = Scatter()
+
+
+@cache
+def damping_numbers() -> Array:
+    """Return D of `exact_restitution` for restitutions from 0 to 1, shape (1001,)."""
+    law = LAWS["exact_restitution"]
+    return np.array([law.damping_number(i / _NUMBERS) for i in range(_NUMBERS + 1)])
+
+
+def toss(initial: Array, n_rows: int, blocks: NDArray[np.void], scatter: Array | None = None) -> Array:
+    """Return the motions of blocks tossed from initial states.
+
+    Parameters
+    ----------
+    initial : ndarray, shape (m, 6)
+        x, z [m], theta [rad] and their rates.
+    n_rows : int
+        Rows at 250 Hz, the first at the start.
+    blocks : ndarray of `solve.rounded_block.BLOCK`, shape (m,)
+        Numbers of each block.
+    scatter : ndarray, shape (m, touches, 3), optional
+        Of each touch (`solve.rounded_block.toss_blocks`); nothing unless given.
+
+    Returns
+    -------
+    ndarray, shape (m, n_rows, 6)
+    """
+    rows = np.zeros((len(initial), n_rows, 6))
+    rows[:, 0] = initial
+    more = np.zeros((len(initial), 1, 3)) if scatter is None else scatter
+    toss_blocks(blocks, damping_numbers(), more, _DT, rows)
+    return rows
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A fitted first flight: state at its last row and how well it is known.
+
+    Attributes
+    ----------
+    state : ndarray, shape (6,)
+        x, z, theta and their rates at the last row.
+    covariance : ndarray, shape (3, 2, 2)
+        Of place and rate of x, z, theta there.
+    times : ndarray, shape (k,)
+        Times of the rows from the last one on, in s: whole rows that were lost are told by the way made.
+    """
+
+    state: Array
+    covariance: Array
+    times: Array
+
+
+def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatter: Scatter = SCATTER) -> Flight:
+    """Fit a flight with drag to rows at 250 Hz, robustly.
+
+    Parameters
+    ----------
+    first_flight : array_like, shape (k, 3)
+        Rows of x, z [m] and theta [rad] before the first impact.
+    block : ndarray of BLOCK, shape ()
+        Gravity and drag are read.
+    scatter : Scatter
+        Errors of a row.
+
+    Raises
+    ------
+    ArgumentError
+        For fewer than four rows, or numbers that are not finite.
+    """
+    rows = np.array(first_flight, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) < LEAST_ROWS or not np.isfinite(rows).all():
+        raise ArgumentError(
+            f"first_flight: got shape {rows.shape}, expected finite rows x, z, theta, at least {LEAST_ROWS} of them"
+        )
+    rows[:, 2] = np.unwrap(rows[:, 2])
+    while len(rows) > LEAST_ROWS and _leaves_flight(rows):
+        rows = rows[:-1]
+    times = _row_times(rows, float(block["gravity"]))
+    state, covariance = np.zeros(6), np.zeros((3, 2, 2))
+    noise = (scatter.place, scatter.place, scatter.angle)
+    for j, drag in enumerate((block["drag"], block["drag"], block["spin_drag"])):
+        way = (1.0 - np.exp(-drag * times)) / drag
+        fall = -block["gravity"] / drag * (times - way) if j == 1 else 0.0
+        fitted, covariance[j] = _fit_line(way, rows[:, j] - fall, noise[j])
+        state[[j, 3 + j]] = fitted
+    return Flight(state, covariance, times)
+
+
+def _leaves_flight(rows: Array) -> bool:
+    """Tell whether the last row comes after an impact: the block turns otherwise, or rises again."""
+    t = np.arange(-3.0, 1.0)
+    turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
+    return bool(
+        abs(rows[-1, 2] - turn) > _TURN_IN_A_ROW or (rows[-1, 1] - rows[-2, 1] > 0.0 > rows[-2, 1] - rows[-3, 1])
+    )
+
+
+def _row_times(rows: Array, gravity: float) -> Array:
+    """Return the times of the rows, 0 at the last one: a row that was lost doubles the way to the next."""
+    way = np.hypot(*np.diff(rows[:, :2], axis=0).T)
+    steps = np.ones(len(way))
+    for _ in range(3):
+        at = np.concatenate([[0.0], np.cumsum(steps)])
+        middle = 0.5 * (at[1:] + at[:-1]) * gravity * _DT * _DT
+        expected = np.median(way / steps - middle) + middle
+        steps = np.maximum(np.round(way / np.maximum(expected, 1e-6)), 1.0)
+    at = np.concatenate([[0.0], np.cumsum(steps)])
+    times: Array = (at - at[-1]) * _DT
+    return times
+
+
+def _fit_line(way: Array, values: Array, noise: float) -> tuple[Array, Array]:
+    """Fit place and rate by least squares with Cauchy weights; return them and their covariance."""
+    rows, weight = np.stack([np.ones_like(way), way], axis=1), np.ones_like(way)
+    found = np.zeros(2)
+    for _ in range(6):
+        found = np.linalg.lstsq(rows * weight[:, None], values * weight, rcond=None)[0]
+        weight = 1.0 / np.sqrt(1.0 + ((values - rows @ found) / (3.0 * noise)) ** 2)
+    return found, noise**2 * np.linalg.inv((rows * weight[:, None] ** 2).T @ rows)
+
+
+def draw(flight: Flight, members: int, seed: int, block: NDArray[np.void], scatter: Scatter) -> tuple[Array, ...]:
+    """Draw initial states (m, 6), blocks (m,) and the scatter of their touches (m, touches, 3)."""
+    rng = np.random.default_rng(seed)
+    states = np.tile(flight.state, (members, 1))
+    for j, more in enumerate((scatter.speed, scatter.speed, scatter.spin)):
+        covariance = flight.covariance[j] + np.diag([0.0, more**2])
+        states[:, [j, 3 + j]] += rng.multivariate_normal(np.zeros(2), covariance, members)
+    blocks = np.tile(block, members)
+    blocks["table"] += scatter.table * rng.standard_normal(members)
+    blocks["drag"] *= np.exp(scatter.drag * rng.standard_normal(members))
+    touches = rng.standard_normal((members, _TOUCHES, 3)) * [scatter.restitution, scatter.friction, scatter.shift]
+    return states, blocks, touches
+
+
+def ensemble(
+    first_flight: ArrayLike,
+    n_rows: int,
+    *,
+    members: int = 400,
+    seed: int = 0,
+    block: NDArray[np.void] = SQUARE,
+    scatter: Scatter = SCATTER,
+) -> Array:
+    """Return motions that the first flight leaves open, shape (members, n_rows, 3): x, z, theta as they are measured.
+
+    Parameters
+    ----------
+    first_flight : array_like, shape (k, 3)
+        Rows of x, z [m] and theta [rad] at 250 Hz before the first impact.
+    n_rows : int
+        Rows from the first of these on.
+    members, seed : int
+        How many motions; of the draws.
+    block : ndarray of BLOCK, shape ()
+        Numbers of the block.
+    scatter : Scatter
+        What they leave open.
+
+    Raises
+    ------
+    ArgumentError
+        As `fit_flight`.
+    """
+    flight = fit_flight(first_flight, block, scatter)
+    given = len(flight.times)
+    ahead = max(n_rows - given + 1, 1)
+    states, blocks, touches = draw(flight, members, seed, block, scatter)
+    tossed = toss(states, ahead, blocks, touches)[:, :, :3]
+    found = np.empty((members, max(n_rows, given), 3))
+    found[:, given - 1 : given - 1 + ahead] = tossed
+    for j, drag in enumerate((block["drag"], block["drag"], block["spin_drag"])):
+        way = (1.0 - np.exp(-drag * flight.times[:-1])) / drag
+        fall = -block["gravity"] / drag * (flight.times[:-1] - way) if j == 1 else 0.0
+        found[:, : given - 1, j] = states[:, j, None] + states[:, 3 + j, None] * way + fall
+    noise = np.random.default_rng([seed, 1]).standard_normal(found.shape)
+    found += noise * [scatter.place, scatter.place, scatter.angle]
+    return found[:, :n_rows]
+
+
+def bands(first_flight: ArrayLike, n_rows: int) -> Array:
+    """Return 90 % bands of a drop of the square from its first flight.
+
+    Parameters
+    ----------
+    first_flight : array_like, shape (k, 3)
+        Rows of x, z [m] and theta [rad] at 250 Hz before the first impact.
+    n_rows : int
+        Rows from the first of these on.
+
+    Returns
+    -------
+    ndarray, shape (n_rows, 3, 3)
+        For each row the 5 %, 50 % and 95 % points (second axis) of x, z and theta (last axis), theta unwrapped.
+
+    Raises
+    ------
+    ArgumentError
+        For fewer than four rows of flight, numbers that are not finite, or no row asked for.
+    """
+    if n_rows < 1:
+        raise ArgumentError(f"n_rows: got {n_rows!r}, expected at least 1")
+    points: Array = np.quantile(ensemble(first_flight, n_rows), [0.05, 0.5, 0.95], axis=0).swapaxes(0, 1)
+    return points
