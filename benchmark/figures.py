@@ -11,6 +11,7 @@ from typing import Any
 import estimate_pages
 import follow
 import lives
+import measured_pages
 import month
 import targets
 from bench_scenes import ROOT
@@ -156,7 +157,7 @@ def _in_unit(row: dict[str, str], key: str) -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "speed": speed, "located": located, "work": work, "missed": missed,
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "month": month_table,
-    "follow": follow_table, **estimate_pages.FIGURES,
+    "follow": follow_table, **estimate_pages.FIGURES, **measured_pages.FIGURES,
     **{name: stored(name) for name in ("live_node", "replay", "estimate_forces", "estimate_scales", "estimate_live")},
 }  # fmt: skip
 

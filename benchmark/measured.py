@@ -31,7 +31,7 @@ IMAGES = FOLDER.parent / "docs" / "images"
 #: Step of each unknown with which a fit begins.
 STEPS = {"tilt": 0.004, "fall": 0.1, "fall_along": 0.05, "slip_speed": 0.05, "restitution": 0.05, "friction": 0.03}
 PLAIN = replace(ELLIPSE, fall=0.0, fall_along=0.0, tilt=0.0, restitution=0.54)
-FRICTIONS = {
+FRICTIONS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "regularised": (dict(slip_speed=0.05), ("slip_speed",)),
     "spring": (dict(stick_stiffness=4.0, stick_damping=0.0), ("stick_stiffness",)),
     "spring and damper": (dict(stick_stiffness=1.6, stick_damping=0.16), ("stick_stiffness", "stick_damping")),
@@ -57,7 +57,8 @@ class Impacts:
         steps = [STEPS.get(name, 0.2 * getattr(start, name) + 0.02) for name in names]
 
         def contact(values: np.ndarray) -> EllipseContact:
-            return replace(start, **{name: float(value) for name, value in zip(names, values, strict=True)})
+            numbers: dict[str, Any] = {name: float(value) for name, value in zip(names, values, strict=True)}
+            return replace(start, **numbers)
 
         def cost(values: np.ndarray) -> float:
             found = contact(values)
@@ -66,7 +67,7 @@ class Impacts:
             return float((self.missed(impact(self.before[chosen], found), chosen) ** 2).mean())
 
         simplex = np.vstack([first, first + np.diag(steps)])
-        options = dict(maxfev=40 * len(names), initial_simplex=simplex, xatol=1e-3, fatol=1e-6)
+        options = dict(maxfev=20 * len(names), initial_simplex=simplex, xatol=1e-3, fatol=1e-6)
         return contact(minimize(cost, first, method="Nelder-Mead", options=options).x)
 
     def held_out(self, start: EllipseContact, names: tuple[str, ...]) -> dict[str, Any]:
@@ -157,7 +158,7 @@ def anitescu_potra(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-de
 
     Anitescu and Potra, Nonlinear Dyn. 14 (1997) 231.
     """
-    along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)
+    along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)  # type: ignore[no-untyped-call]
     return along, (1.0 + e) * away
 
 
@@ -173,13 +174,13 @@ def by_law(impacts: Impacts) -> dict[str, Any]:
     for law, about in LAWS.items():
         start = 0.25 if about.additive else 0.8 if about.number_of is None else 0.54
         for friction, (numbers, names) in FRICTIONS.items():
-            contact = replace(PLAIN, law=law, exponent=about.exponent or 1.0, restitution=start, **numbers)  # type: ignore[arg-type]
+            contact = replace(PLAIN, law=law, exponent=about.exponent or 1.0, restitution=start, **numbers)
             name = f"{law}, {friction}"
             found[name] = impacts.held_out(contact, ("restitution", "friction", *names))
             print(name, found[name], flush=True)
     for friction, (numbers, names) in FRICTIONS.items():
         name = f"falling restitution, {friction}"
-        contact = replace(ELLIPSE, **numbers)  # type: ignore[arg-type]
+        contact = replace(ELLIPSE, **numbers)
         found[name] = impacts.held_out(contact, ("restitution", "friction", *names, *FALLING))
         print(name, found[name], flush=True)
     return found

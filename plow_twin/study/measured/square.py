@@ -179,15 +179,21 @@ def _row_times(rows: Array, gravity: float) -> Array:
 
 def _fit_line(way: Array, values: Array, noise: float) -> tuple[Array, Array]:
     """Fit place and rate by least squares with Cauchy weights; return them and their covariance."""
-    rows, weight = np.stack([np.ones_like(way), way], axis=1), np.ones_like(way)
-    found = np.zeros(2)
+    rows: Array = np.stack([np.ones_like(way), way], axis=1)
+    weight: Array = np.ones_like(way)
+    found: Array = np.zeros(2)
     for _ in range(6):
-        found = np.linalg.lstsq(rows * weight[:, None], values * weight, rcond=None)[0]
+        solved = np.linalg.lstsq(rows * weight[:, None], values * weight, rcond=None)[0]
+        found = np.asarray(solved, dtype=np.float64)
         weight = 1.0 / np.sqrt(1.0 + ((values - rows @ found) / (3.0 * noise)) ** 2)
-    return found, noise**2 * np.linalg.inv((rows * weight[:, None] ** 2).T @ rows)
+    spread = np.linalg.inv((rows * weight[:, None] ** 2).T @ rows)
+    covariance = np.asarray(noise**2 * spread, dtype=np.float64)
+    return found, covariance
 
 
-def draw(flight: Flight, members: int, seed: int, block: NDArray[np.void], scatter: Scatter) -> tuple[Array, ...]:
+def draw(
+    flight: Flight, members: int, seed: int, block: NDArray[np.void], scatter: Scatter
+) -> tuple[Array, NDArray[np.void], Array]:
     """Draw initial states (m, 6), blocks (m,) and the scatter of their touches (m, touches, 3)."""
     rng = np.random.default_rng(seed)
     states = np.tile(flight.state, (members, 1))

@@ -1,0 +1,50 @@
+"""The tables of `docs/measured.md`, from `benchmark/results/measured.json`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from bench_scenes import ROOT
+
+RESULTS = ROOT / "benchmark" / "results" / "measured.json"
+_FRICTIONS = ("regularised", "spring", "spring and damper")
+
+
+def _part(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(RESULTS.read_text(encoding="utf-8"))[name]
+    return found
+
+
+def _lines(head: list[str], rows: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows))
+
+
+def measured_laws() -> str:
+    """Return RMS and median of the errors of each law with each friction, in m/s."""
+    found = _part("ellipse")
+
+    def figures(name: str) -> str:
+        return f"{found[name]['rms']:.3f} / {found[name]['median']:.3f}" if name in found else ""
+
+    laws = [name.removesuffix(", regularised") for name in found if name.endswith(", regularised")]
+    rows = [[f"`{law}`" if " " not in law else law, *(figures(f"{law}, {one}") for one in _FRICTIONS)] for law in laws]
+    single = [name for name in found if not name.endswith(_FRICTIONS)]
+    return _lines(["RMS / median [m/s]", *_FRICTIONS], rows + [[name, figures(name), "", ""] for name in single])
+
+
+def measured_drops() -> str:
+    """Return distances, angles, coverage and scores of the drops."""
+    rows = []
+    for name, one in _part("square").items():
+        coverage = ["x {:.2f}, z {:.2f}, theta {:.2f}".format(*each) for each in one["coverage"]]
+        score = "{:.1f} mm, {:.1f} mm, {:.2f} rad".format(*one["crps_median"])
+        distance = [f"{mm:.1f} mm, {rad:.2f} rad" for mm, rad in zip(one["distance_mm"], one["angle_rad"], strict=True)]
+        rows.append([name, *distance, *coverage, score])
+    counts = next(iter(_part("square").values()))["drops"]
+    head = ["block", *(f"off over {n} ({count} drops)" for n, count in zip((1, 2, 3), counts, strict=True))]
+    return _lines([*head, "inside after bounce 1", "after bounce 2", "median CRPS of x, z, theta"], rows)
+
+
+FIGURES: dict[str, Callable[[], str]] = {"measured_laws": measured_laws, "measured_drops": measured_drops}
