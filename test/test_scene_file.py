@@ -66,7 +66,8 @@ def test_presets_state_where_each_number_comes_from(name: str) -> None:
         if "unit" in spec.metadata and spec.name != "com_offset_m" and f"{part}.{spec.name}" not in scene.marks
     ]
     assert not unmarked
-    assert {"contact.stiffness", "contact.exponent", "contact.damping"} <= scene.marks.keys()
+    damping = "contact.damping" if scene.contact.restitution is None else "contact.restitution"
+    assert {"contact.stiffness", "contact.exponent", damping} <= scene.marks.keys()
     for index, load in enumerate(scene.loads):
         for key in ("force_n", "omega_rad_s", "phase_rad", "moment_n_m", "at_m"):
             path = f"loads[{index}].{key}"
