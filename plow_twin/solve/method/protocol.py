@@ -36,7 +36,5 @@ class Method(Protocol):
     def own(self, parts: Parts) -> Any:
         """Return the parts of a scene that the method is compiled for, None for a part that the scene lacks."""
 
-    def lay_out(
-        self, p: Params, parts: Parts, own: Any, state: State, w: Work, span: float, penetrating: bool
-    ) -> bool:
+    def lay_out(self, p: Params, parts: Parts, own: Any, state: State, w: Work, span: float, penetrating: bool) -> bool:
         """Lay out the next step, at most `span` s long; return False to leave it to the next method."""
