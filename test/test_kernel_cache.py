@@ -53,12 +53,12 @@ def test_a_kernel_that_only_kernels_call_has_no_machine_code(tmp_path: Path) -> 
     assert run(tmp_path, LINKED) == "0"
 
 
-def test_what_an_entry_calls_is_its_own(tmp_path: Path) -> None:
+def test_an_entry_holds_its_own_copy_of_every_kernel_it_calls(tmp_path: Path) -> None:
     """Bits would depend on which entry a process loads first, and on whether it compiles or finds them compiled."""
     assert run(tmp_path, ENTRY) == "True False"
 
 
-def test_a_call_from_python_of_what_has_no_machine_code_says_so() -> None:
+def test_a_call_from_python_of_a_kernel_without_machine_code_is_an_error() -> None:
     assert normal_force(1e-3, 0.0, 1e7, 1.0, 0.0, 0.0, 0.0) == 1e4  # compiles it for its caller
     with pytest.raises(TypeError, match="normal_force is for kernels to call"):
         contact.normal_force(1e-3, 0.0, 1e7, 1.0, 0.0, 0.0, 0.0)
@@ -70,7 +70,7 @@ def normal_force(*numbers: float) -> float:
     return contact.normal_force(*numbers)
 
 
-def test_a_disk_that_takes_no_cache_is_said_and_the_run_goes_on(tmp_path: Path) -> None:
+def test_a_disk_that_takes_no_cache_is_one_warning_and_the_run_goes_on(tmp_path: Path) -> None:
     full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)); "
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", full + LINKED], env=environment, capture_output=True, text=True)

@@ -41,7 +41,7 @@ restitution = load_benchmark("restitution")
 
 @pytest.mark.parametrize("n", [1.0, 1.5, 2.2, 3.0])
 @pytest.mark.parametrize("e", [0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
-def test_exact_restitution_is_returned_whatever_the_law_s_numbers(n: float, e: float) -> None:
+def test_exact_restitution_is_returned_for_any_stiffness_exponent_and_mass(n: float, e: float) -> None:
     """D (1 + e) = ln((1 + D) / (1 - D e)) holds for every exponent, stiffness, mass and speed."""
     for stiffness, mass, speed in ((1e7, 2.0, 1.0), (1e9, 300.0, 0.2)):
         contact = Contact("exact_restitution", stiffness * 1e3 ** (n - 1.0), n, restitution=e)
@@ -61,13 +61,13 @@ def test_a_constant_factor_of_the_published_d_returns_its_restitution(e: float, 
 
 
 @pytest.mark.parametrize("law", DELIVERED)
-def test_the_other_laws_deliver_what_is_known_of_them(law: str) -> None:
+def test_the_other_laws_deliver_their_published_restitution(law: str) -> None:
     for asked, known in zip(ASKED, DELIVERED[law], strict=True):
         assert restitution.measure(law, [asked])[0].delivered == pytest.approx(known, abs=6e-5)
 
 
 @pytest.mark.parametrize("law", restitution.restitution_laws())
-def test_every_law_delivers_what_the_identity_makes_of_its_damping(law: str) -> None:
+def test_every_law_delivers_the_restitution_that_the_identity_gives(law: str) -> None:
     for asked in (0.15, 0.55, 0.85):
         delivered = restitution.measure(law, [asked])[0].delivered
         assert exact_damping_number(delivered) == pytest.approx(LAWS[law].damping_number(asked), rel=1e-7)
@@ -112,7 +112,7 @@ def test_ramped_damping_is_that_of_another_integrator(z: float, ramp: float) -> 
         assert restitution.free_impact(contact, mass, speed) == pytest.approx(expected, abs=1e-7)
 
 
-def test_the_page_is_what_the_solver_makes() -> None:
+def test_the_page_shows_the_results_of_the_solver() -> None:
     page = restitution.PAGE.read_text(encoding="utf-8")
     with restitution.TABLE.open(newline="", encoding="utf-8") as file:
         rows = [

@@ -117,7 +117,7 @@ def test_imports_point_one_way(path: Path) -> None:
     assert libraries <= allowed, f"{subpackage} must not import {sorted(libraries - allowed)}"
 
 
-def test_the_study_of_the_paper_imports_the_library_and_is_imported_by_none_of_it() -> None:
+def test_the_study_of_the_paper_imports_the_library_and_the_library_does_not_import_it() -> None:
     for path in sorted(PAPER_STUDY.glob("*.py")):
         used = {name.split(".")[1] for name in _imports(path) if name.startswith("plow_twin.")}
         assert used <= PAPER_MAY_IMPORT, path
@@ -203,7 +203,7 @@ def test_heavy_libraries_are_imported_where_they_are_used(statement: str, unwant
     assert not unwanted & loaded
 
 
-def test_every_public_name_is_found_and_none_is_imported_before_it_is_used() -> None:
+def test_every_public_name_is_found_and_imported_on_first_use() -> None:
     tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
     typed = next(node for node in tree.body if isinstance(node, ast.If))
     names = {alias.name for node in typed.body if isinstance(node, ast.ImportFrom) for alias in node.names}

@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +48,8 @@ from plow_twin.stream.session import Session
 HEADER = RunHeader("version: 1")
 TOPIC = "/contact_forces"
 
-#: A process that journals at 1 kHz and reports each receipt once the recorder has it.
+#: A process that journals at 1 kHz and reports each receipt once the recorder has it. Arguments: folder, limit of a
+#: file's size, number of samples, options of the recorder as JSON.
 WRITER = """
     import json, os, sys, time
     import numpy as np
@@ -62,7 +64,7 @@ WRITER = """
         import resource
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
     errors = []
-    recorder = Recorder(folder, RunHeader("version: 1"), on_error=errors.append)
+    recorder = Recorder(folder, RunHeader("version: 1"), on_error=errors.append, **json.loads(sys.argv[4]))
     rng = np.random.default_rng(0)
     refused = 0
     for index in range(count):
@@ -75,9 +77,16 @@ WRITER = """
 """
 
 
+def writer_command(
+    folder: Path, *, limit: int = 0, count: int = 10**9, begin: str = "", end: str = "", **options: Any
+) -> list[str]:
+    """Return the command of a writer, with code before and after its own."""
+    code = "".join(map(textwrap.dedent, (begin, WRITER, end)))
+    return [sys.executable, "-c", code, str(folder), str(limit), str(count), json.dumps(options)]
+
+
 def start_writer(folder: Path, *, limit: int = 0, count: int = 10**9, end: str = "") -> subprocess.Popen[str]:
-    code = textwrap.dedent(WRITER) + textwrap.dedent(end)
-    command = [sys.executable, "-c", code, str(folder), str(limit), str(count)]
+    command = writer_command(folder, limit=limit, count=count, end=end)
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
 
 
@@ -88,8 +97,7 @@ def joint_state(index: int) -> JointState:
 
 #: Forks a writer for each line `folder flush_period` that it reads, says its number, and when it has ended.
 FORKS = """
-    import os, sys
-    sys.argv[1:] = ["", "0", "0"]
+    import json, os, sys
     import plow_twin.record.writer, mcap.writer, rosbags.typesys, lz4.frame, zstandard
     from plow_twin.record.header import RunHeader
     from plow_twin.record.writer import warm_up_writer
@@ -98,6 +106,7 @@ FORKS = """
         folder, period = line.split()
         child = os.fork()
         if child == 0:
+            sys.argv[1:] = [folder, "0", str(10**9), json.dumps({"flush_period_s": float(period)})]
             break
         print("child", child, flush=True)
         os.waitpid(child, 0)
@@ -109,13 +118,7 @@ FORKS = """
 
 def kill_writers(folders: Iterable[Path], rng: random.Random, flush_s: float, longest_s: float) -> None:
     """Kill writers at random moments: nothing is lost but what came in since the last flush."""
-    writer = (
-        textwrap.dedent(WRITER)
-        .replace("sys.argv[1]", "folder")
-        .replace("on_error=errors.append", "on_error=errors.append, flush_period_s=float(period)")
-    )
-    writer = writer.replace("int(sys.argv[2]), int(sys.argv[3])", "0, 10**9")
-    command = [sys.executable, "-c", textwrap.dedent(FORKS) + writer]
+    command = [sys.executable, "-c", textwrap.dedent(FORKS) + textwrap.dedent(WRITER)]
     with started(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdin is not None and process.stdout is not None
         for folder in folders:
@@ -464,8 +467,7 @@ SYNCS = """
 
 def test_with_sync_what_was_flushed_survives_a_loss_of_power(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    writer = WRITER.replace("on_error=errors.append", "on_error=errors.append, sync=True, flush_period_s=0.2")
-    command = [sys.executable, "-c", textwrap.dedent(SYNCS) + textwrap.dedent(writer), str(folder), "0", str(10**9)]
+    command = writer_command(folder, begin=SYNCS, sync=True, flush_period_s=0.2)
     file = folder / "run_0.mcap"
     synced: list[tuple[str, int]] = []
     index, before, flushes = -1, -1, 0
@@ -492,11 +494,9 @@ def test_with_sync_what_was_flushed_survives_a_loss_of_power(tmp_path: Path) -> 
 
 def test_without_sync_the_disk_is_not_waited_for_and_with_it_a_closed_run_is_whole_there(tmp_path: Path) -> None:
     waited = []
-    for sync in ("False", "True"):
-        folder = tmp_path / sync
-        writer = WRITER.replace("on_error=errors.append", f"on_error=errors.append, sync={sync}")
-        code = textwrap.dedent(SYNCS) + textwrap.dedent(writer) + "recorder.close()"
-        done = subprocess.run([sys.executable, "-c", code, str(folder), "0", "20"], capture_output=True, text=True)
+    for sync in (False, True):
+        command = writer_command(tmp_path / str(sync), count=20, begin=SYNCS, end="recorder.close()", sync=sync)
+        done = subprocess.run(command, capture_output=True, text=True)
         lines = [line.split() for line in done.stdout.splitlines() if line.startswith("synced")]
         waited.append({path: int(size) for _, size, path in lines})
     assert not waited[0]

@@ -65,7 +65,7 @@ def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> No
     assert np.array_equal(one.advance_samples(TIMES, wrench).q, whole.q)
 
 
-def test_members_may_lack_what_others_have() -> None:
+def test_members_may_lack_terms_that_others_have() -> None:
     """Friction and wear of one member are zero for the other."""
     plain = preset("bench_kv")
     scenes = [plain, dataclasses.replace(plain, friction=Friction(0.2, 0.02), wear=Wear(1e-9, 0.015, 2.0))]

@@ -84,7 +84,7 @@ def test_looking_at_a_run_does_not_change_it() -> None:
 
 
 @pytest.mark.parametrize("fixed", [{}, {"method": "rk4", "dt": 1e-4}], ids=["events", "rk4"])
-def test_ctrl_c_ends_a_run_with_what_has_been_computed(fixed: dict[str, object]) -> None:
+def test_ctrl_c_ends_a_run_with_the_rows_computed_so_far(fixed: dict[str, object]) -> None:
     def press(share: float) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
@@ -95,7 +95,7 @@ def test_ctrl_c_ends_a_run_with_what_has_been_computed(fixed: dict[str, object])
     assert isinstance(stop.value, KeyboardInterrupt) and len(stop.value.result.t) > 1
 
 
-def test_the_command_line_writes_what_has_been_computed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_writes_the_rows_computed_so_far(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "part.npz"
     code = run(["simulate", "paper", "--t-end", "10", "--max-steps", "100", "--out", str(out), "--json"])
     told = capsys.readouterr()
@@ -244,7 +244,7 @@ sys.exit(run(["simulate", "paper", "--t-end", "1e7", "--output-dt", "1e3", "--js
 """
 
 
-def test_the_command_that_gets_sigint_writes_what_has_been_computed(tmp_path: Path) -> None:
+def test_the_command_that_gets_sigint_writes_the_rows_computed_so_far(tmp_path: Path) -> None:
     out = tmp_path / "part.npz"
     command = [sys.executable, "-c", COMMAND, str(out)]
     with started(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:

@@ -152,7 +152,7 @@ def test_a_live_twin_has_the_derivative_by_restitution_also_where_nothing_damps(
     assert followed.t > 0.2 and found == pytest.approx(expected, abs=3e-3 * np.abs(expected).max())
 
 
-def test_a_scene_that_amplifies_is_told() -> None:
+def test_a_scene_that_amplifies_gives_a_warning() -> None:
     hard = replace(preset("bench_kv"), contact=Contact("kelvin_voigt", 1e9, damping=1e4))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times, largest Lyapunov exponent"):
         found = simulate(hard, 2.0, tol=1e-9, sensitivity=True).sensitivity

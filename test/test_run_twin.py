@@ -137,7 +137,7 @@ def test_a_failed_advance_keeps_the_last_good_state_and_the_next_one_goes_on(wre
 
 
 @pytest.mark.parametrize("depth", [0.2, 1.3])
-def test_a_failed_advance_leaves_no_trace_in_what_follows(depth: float) -> None:
+def test_a_failed_advance_leaves_no_trace_in_later_ones(depth: float) -> None:
     """It has crossed the end of the ramp; the impact goes on as if there had been none."""
     ramp, idle = 1e-3, (0.0, 0.0, 0.0)
     contact = Contact("ramped_damping", 1e6, exponent=1.5, damping=2e3, ramp_m=ramp)

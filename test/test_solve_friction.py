@@ -47,7 +47,7 @@ def test_a_push_below_the_limit_makes_it_creep(share: float) -> None:
     assert result.v[-1, 0] == pytest.approx(SPEED * math.atanh(share), rel=1e-9)
 
 
-def test_a_push_above_the_limit_accelerates_it_by_what_is_left() -> None:
+def test_a_push_above_the_limit_accelerates_the_head_by_the_excess() -> None:
     result = simulate(block(1.5 * MU * MASS * G, 0.0), 0.2, output_dt=0.1)
     assert (result.v[-1, 0] - result.v[-2, 0]) / 0.1 == pytest.approx(0.5 * MU * G, rel=1e-6)
 
@@ -64,6 +64,6 @@ def test_both_solvers_agree_and_the_energy_balances(name: str) -> None:
     assert pose_error(scene, without.q, events.q) > 1e-3
 
 
-def test_without_friction_none_of_its_code_is_compiled() -> None:
+def test_a_scene_without_friction_compiles_no_friction() -> None:
     for friction in (None, Friction(0.0)):
         assert compiled_scene.compile_scene(replace(preset("paper"), friction=friction), 1e-9).parts.terms.slip is None

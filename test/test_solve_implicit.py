@@ -115,7 +115,7 @@ def test_the_tolerance_holds_however_loose_it_is(damping: float) -> None:
         assert_within_the_gate(replace(other, contact=scene.contact), (1e-4,))
 
 
-def test_growth_while_dampers_hold_the_head_is_told() -> None:
+def test_growth_while_dampers_hold_the_head_is_reported() -> None:
     """A rest on two corners 1e-8 m deep amplifies what rounding leaves, for less time than the rest lasts."""
     scene = replace(BENCH, contact=overdamped("kelvin_voigt", 1e11), friction=Friction(0.2, 0.02))
     with pytest.warns(ToleranceWarning, match=r"an error grows \S+ times"):
@@ -144,7 +144,7 @@ def test_every_law_keeps_to_the_tolerance_and_to_bounded_work(start: Scene, law:
 
 
 @pytest.mark.parametrize("damping", [10.0**k for k in range(10, 14)])
-def test_damping_beyond_what_double_precision_or_the_model_can_tell_is_refused(damping: float) -> None:
+def test_damping_beyond_double_precision_or_the_model_is_refused(damping: float) -> None:
     """The gate's other scenes: a factor of the force, and damping beside a wear that is faster than the head."""
     with pytest.raises(SceneError, match=r"contact.damping: got \S+, expected at most 1e\+09 s/m for hunt_crossley"):
         replace(BENCH, contact=overdamped("hunt_crossley", damping))

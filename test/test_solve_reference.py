@@ -29,7 +29,7 @@ def test_trajectory_and_every_event_match_the_reference(name: str, tol: float, b
 
 
 @pytest.mark.parametrize("name", ["paper", "bench_kv"])
-def test_a_tighter_tolerance_gives_a_smaller_error_within_what_was_asked(name: str) -> None:
+def test_a_tighter_tolerance_gives_a_smaller_error_within_the_tolerance(name: str) -> None:
     scene, expected = preset(name), reference("paper_r1" if name == "paper" else name)
     for tol in (1e-4, 1e-6, 1e-8, 1e-10):
         assert pose_error(scene, simulate(scene, 20.0, output_dt=0.1, tol=tol).q, expected["q"][::10]) < tol

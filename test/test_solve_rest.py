@@ -79,7 +79,7 @@ def test_a_load_that_changes_wakes_the_head() -> None:
     assert np.ptp(rows[0].q[50:], axis=0).max() > 1e-3 and twins[0]._state.at_rest == 0
 
 
-def test_what_slides_is_not_at_rest() -> None:
+def test_a_sliding_head_is_not_at_rest() -> None:
     sliding = dataclasses.replace(
         fallen(), locked=("theta",), gravity=Gravity(9.81), pairs=("top_left_top", "top_right_top"),
         initial=Initial((0.0, 0.0, 0.0), (1e-9, 0.0, 0.0)),

@@ -263,13 +263,13 @@ def test_a_restored_twin_a_batch_and_a_bounded_twin_go_on_alike(most: int | None
         TwinBatch([scene, preset("paper")])
 
 
-def test_without_stick_none_of_its_code_is_compiled() -> None:
+def test_a_scene_without_stick_compiles_no_stick() -> None:
     for friction in (None, Friction(0.2), Friction(0.0, stick_stiffness_n_m=1e8)):
         compiled = compiled_scene.compile_scene(replace(preset("paper"), friction=friction), 1e-9)
         assert compiled.parts.terms.stick is None and compiled.initial_state().dtype == STATE
 
 
-def test_what_makes_no_friction_is_refused() -> None:
+def test_contradictory_friction_is_refused() -> None:
     for friction, problem in (
         (Friction(0.3, stick_damping_n_s_m=1.0), "stick_damping_n_s_m: got 1.0, expected nothing without"),
         (Friction(0.3, stick_stiffness_n_m=1e8, static_coefficient=0.2), "at least the coefficient 0.3"),
@@ -330,7 +330,7 @@ def furthest_off(scene: Scene, tolerances: tuple[float, ...]) -> float:
     ("law", "seed"),
     [("hertz", 8), pytest.param("hertz", 47, marks=pytest.mark.stress), ("hertz", 81), ("exact_restitution", 237)],
 )
-def test_a_force_too_small_to_move_the_head_still_tells_whether_its_corner_holds(law: str, seed: int) -> None:
+def test_a_force_too_small_to_move_the_head_still_decides_whether_its_corner_holds(law: str, seed: int) -> None:
     """Steps that follow the motion well enough had let corners go that hold, and moved where they are held."""
     assert furthest_off(held_scene(law, seed), (1e-3, 1e-4, 1e-6, 1e-7, 1e-8)) < 10.0
 

@@ -50,7 +50,7 @@ def test_extreme_scenes_are_solved(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("scene", REFUSED.values(), ids=REFUSED.keys())
-def test_what_leaves_the_model_is_named(scene: Scene) -> None:
+def test_a_motion_outside_the_model_is_named(scene: Scene) -> None:
     with pytest.raises(PlowTwinError, match="left the model's range"):
         simulate(scene, 2.0)
 

@@ -163,7 +163,7 @@ def test_a_restored_twin_and_a_batch_go_on_alike() -> None:
         TwinBatch([scene, replace(scene, support=None)])
 
 
-def test_without_a_support_none_of_its_code_is_compiled() -> None:
+def test_a_scene_without_a_support_compiles_no_support() -> None:
     compiled = compiled_scene.compile_scene(preset("paper"), 1e-9)
     assert compiled.parts.terms.support is None and compiled.initial_state().dtype == STATE
     assert Twin(preset("paper")).frame is None

@@ -166,7 +166,7 @@ def test_a_run_is_predicted_with_all_that_was_done_to_the_model_while_it_ran(tmp
     assert [item.start_s for item in mine.loads.passes] == pytest.approx([0.0, 0.301], abs=1e-9)
 
 
-def test_late_samples_of_a_run_take_their_places_among_whatever_stands_between(tmp_path: Path) -> None:
+def test_late_samples_of_a_run_take_their_places_among_other_entries(tmp_path: Path) -> None:
     samples = [*map(paper_sample, range(1000))]
     entries: list[Entry] = sorted(samples, key=lambda one: (n := one.stamp_ns - BASE_NS) + 5.5 * STEP_NS * (n % 7 == 3))
     entries[500:500] = [Pose(BASE_NS, (0.0, 0.0, 0.0))] * 3
@@ -177,7 +177,7 @@ def test_late_samples_of_a_run_take_their_places_among_whatever_stands_between(t
     assert found.predictions[0].loads.impulse == pytest.approx(series.impulse.sum(axis=0), rel=1e-9)
 
 
-def test_a_gap_is_compared_with_what_is_left_to_the_wall(tmp_path: Path) -> None:
+def test_a_measured_gap_is_compared_with_the_distance_to_the_wall(tmp_path: Path) -> None:
     load = np.column_stack(motion()[:2])[:1000]
     pair = PAIR_NAMES.index("top_right_right")
     penetration = Twin(load_scene(PAPER), excitation="sampled").advance_samples(load[:, 0], load[:, 1:]).penetration
@@ -203,7 +203,7 @@ def test_messages_beside_a_run_that_do_not_fit_are_counted_by_topic(tmp_path: Pa
     assert found.lost == {"unfit, head_pose: /pose has no number at 'pose.x' for x": 10} and found.lossy
 
 
-def test_what_a_recorder_beside_a_run_has_left_is_read_as_far_as_it_goes_and_its_loss_counted(tmp_path: Path) -> None:
+def test_a_partial_recording_beside_a_run_is_read_as_far_as_it_goes_and_its_loss_counted(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(1000)))
     for name, data in (("beside", b""), ("beside_2", b"no such file")):
         (run.folder / name).mkdir()
@@ -295,7 +295,7 @@ def test_the_lag_is_found_at_any_rate_of_the_sensor(rate_hz: int, times_each: in
     assert found.rms_aligned == pytest.approx(0.0, abs=1e-3)
 
 
-def test_no_lag_beyond_the_largest_and_no_correlation_beyond_1_is_told() -> None:
+def test_lag_and_correlation_stay_within_their_bounds() -> None:
     t = np.arange(0.0, 40.0, 0.01)
     predicted = np.sin(2.0 * np.pi * t / 2.06)
     for factor in (-1.0, 1.1, 1.3):
@@ -349,7 +349,7 @@ def test_measured_values_are_compared_with_the_stretch_they_belong_to(clock_s: f
 
 
 @pytest.mark.parametrize("rotation", ["paper", "consistent"])
-def test_what_contacts_take_under_gravity_alone_is_the_height_lost(rotation: str, tmp_path: Path) -> None:
+def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotation: str, tmp_path: Path) -> None:
     """In flight that is nothing; of a head that lies still m g times the drop of its centre less what is stored."""
     scene = load_scene(PAPER)
     arm, height = scene.gravity.arm_m, 0.1
@@ -376,7 +376,7 @@ def test_what_contacts_take_under_gravity_alone_is_the_height_lost(rotation: str
         assert loads.impulse.any() == (end > 1.0)
 
 
-def test_what_is_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
+def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
     """Contacts without damping take nothing, whatever they hold where it begins, 66 J, and where it ends."""
     scene = load_scene(PAPER)
     scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=0.0))

@@ -129,7 +129,7 @@ def test_known_parameters_are_recovered_from_published_figures() -> None:
     assert found.best.objective < 1e-6 and all(abs(r) < 1e-3 for r in objective.unweighted(found.best.values))
 
 
-def test_the_command_fits_a_recording_and_marks_what_it_fitted(
+def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rec = recording(2.0)

@@ -59,7 +59,7 @@ def test_a_bag_without_its_metadata_and_with_an_open_log_is_read_to_its_end(tmp_
     assert found == [BASE_NS + index * STEP_NS for index in range(COUNT)]
 
 
-def test_a_bag_is_read_with_messages_compressed_one_by_one_and_said_where_it_is_as_a_whole(tmp_path: Path) -> None:
+def test_a_bag_compressed_by_message_is_read_and_one_compressed_as_a_whole_is_named(tmp_path: Path) -> None:
     for mode in (CompressionMode.MESSAGE, CompressionMode.FILE):
         bag = BagWriter(tmp_path / mode.name, version=9, storage_plugin=StoragePlugin.SQLITE3)
         bag.set_compression(mode, CompressionFormat.ZSTD)
@@ -104,7 +104,7 @@ def mcap(path: Path, encoding: str, schema: tuple[str, str, bytes], messages: li
         ("cdr", ("other_msgs/msg/Thing", "ros2msg", b"\xff\xfe no text")),
     ],
 )
-def test_what_is_not_ros_2_is_named_and_not_guessed_at(
+def test_a_recording_that_is_not_of_ros_2_is_named_and_not_guessed_at(
     encoding: str, schema: tuple[str, str, bytes], tmp_path: Path
 ) -> None:
     file = mcap(tmp_path / "odd.mcap", encoding, schema, [(BASE_NS, json.dumps({"fx": 1.0}).encode())])
@@ -170,7 +170,7 @@ def test_columns_that_are_missing_or_there_twice_are_named(tmp_path: Path) -> No
         analyse(short, scene=PAPER, mapping=tmp_path / "map.yaml")
 
 
-def test_a_mapping_of_a_bag_that_names_no_field_or_stamp_is_told_by_name(tmp_path: Path) -> None:
+def test_a_mapping_without_a_field_or_stamp_is_named(tmp_path: Path) -> None:
     """A typo of `header` was taken for it; of a field `malformed 300` was all that was said."""
     schema = STORE.generate_msgdef(TYPE, ros_version=2)[0].encode()
     times = [BASE_NS + i * STEP_NS for i in range(COUNT)]
@@ -220,7 +220,7 @@ def test_the_estimate_reads_csv_as_the_analysis_does(tmp_path: Path) -> None:
         read_measured(tmp_path, scene)
 
 
-def test_a_full_disk_is_named_by_what_was_written(tmp_path: Path) -> None:
+def test_a_full_disk_is_named_with_the_file_being_written(tmp_path: Path) -> None:
     found = analyse(sheet(tmp_path / "load.csv", ",", comma=False, mark=False), scene=PAPER)
     out = tmp_path / "out"
     out.mkdir()

@@ -63,7 +63,7 @@ def is_running(pid: str) -> bool:
         return False
 
 
-def test_a_killed_worker_loses_nothing_and_a_second_call_takes_what_is_there(runs: Path, tmp_path: Path) -> None:
+def test_a_killed_worker_loses_nothing_and_a_second_call_uses_finished_chunks(runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "plow_twin", "analyse", str(runs), "--scene", "paper", "--out", str(out)]
     with started([*command, "--workers", "2", "--json"], stdout=subprocess.PIPE) as process:
@@ -190,7 +190,7 @@ def test_a_run_is_analysed_while_it_is_recorded(tmp_path: Path) -> None:
     assert 0 < first["input"]["samples_used"] <= 2000 and last["input"]["samples_used"] == 4000
 
 
-def test_whatever_one_of_many_fails_by_is_its_row(tmp_path: Path) -> None:
+def test_the_failure_of_one_of_many_recordings_is_its_row(tmp_path: Path) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(10)))
     (tmp_path / "taken").write_text("no folder")
     found = run_task(Task(run.folder, None, None, (), tmp_path / "taken"))
@@ -265,9 +265,9 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     Task(runs / "r0", PAPER, None, (narrow,), out).run()
     assert (out / "predicted_1.parquet").exists()
     for path in (out / "run", out / "run" / "run_0.mcap"):  # its own input, and that of another task
-        with pytest.raises(RecordingError, match="lies in what --out"):
+        with pytest.raises(RecordingError, match="would replace it"):
             Task(path, None, None, (), out).run()
-        with pytest.raises(RecordingError, match="lies in what --out"):
+        with pytest.raises(RecordingError, match="would replace it"):
             Task(runs / "r1", PAPER, None, (), out).check([path])
     assert (out / "run" / "run_0.mcap").exists() and (out / "report.html").exists()
     (broken := tmp_path / "broken").mkdir()
@@ -284,7 +284,7 @@ def test_no_input_is_removed_and_results_of_two_recordings_never_stand_side_by_s
     assert Task(runs / "r0", PAPER, None, (narrow,), out).stored() is None
 
 
-def test_what_lies_beside_the_data_is_part_of_the_question(runs: Path, tmp_path: Path) -> None:
+def test_files_beside_the_data_are_part_of_the_question(runs: Path, tmp_path: Path) -> None:
     (data := tmp_path / "data").mkdir()
     load = data / "load.csv"
     load.write_text((runs / "r0" / "load.csv").read_text())

@@ -116,7 +116,7 @@ def test_trends_are_those_of_the_reconstruction(study: PaperStudy) -> None:
         assert row(study, f"point {corner}: largest force against {along} clearance").verdict.value == verdict
 
 
-def test_what_disagrees_is_said(study: PaperStudy) -> None:
+def test_disagreements_are_listed(study: PaperStudy) -> None:
     for sense, share in (("counter-clockwise", 67.0), ("clockwise", 76.0)):
         four = row(study, f"{sense}: one, two and three points; four are not mentioned")
         assert four.verdict is Verdict.DISAGREES
@@ -209,7 +209,7 @@ def test_a_set_counts_from_five_milliseconds_on() -> None:
         ([3.0, 2.0, 1.0], False, False),
     ],
 )
-def test_what_counts_as_a_trend(values: list[float], up: bool, up_and_down: bool) -> None:
+def test_trends_rise_and_fall_by_the_stated_rule(values: list[float], up: bool, up_and_down: bool) -> None:
     assert (rises(np.array(values)), rises_then_falls(np.array(values))) == (up, up_and_down)
 
 

@@ -1,4 +1,4 @@
-"""The main job, live: a publisher process and a node process with its recorder, watched and summed up."""
+"""A live run: publisher and node with its recorder as processes, watched, then summarised."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DONE, FAILED, DONE_WITH_LOSS = 0, 1, 3
 _START_TIMEOUT_S: Final = 300.0
 _STOP_TIMEOUT_S: Final = 10.0
 _RATE_HZ: Final = 1000.0
-#: How much wider than the scene says the guide of the synthetic sensor's head is [mm].
+#: Clearance of the head with the synthetic sensor beyond that of the scene [mm].
 _SENSOR_MM: Final = 1.5
 #: Shortest demo that has an estimate [s], its window and its interval [s].
 _ESTIMATED_S, _WINDOW_S, _INTERVAL_S = 15.0, 14.0, 3.0
@@ -41,7 +41,7 @@ _STUCK_S: Final = 30.0
 
 
 class DemoError(PlowTwinError):
-    """A process of the demo failed; the message says which one and what it said."""
+    """A process of the demo failed; the message has its name and its output."""
 
 
 @dataclass
@@ -63,12 +63,12 @@ class Watch:
         return self.parts.get(part, {}).get(key, "")
 
     def number(self, part: str, key: str) -> float:
-        """Return one figure as a number, 0 when there is none."""
+        """Return one figure as a number, 0 where it is missing."""
         return float(self.text(part, key) or 0.0)
 
 
 def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
-    """Run the twin on the paper's load and print what happened.
+    """Run the twin on the paper's load and print a summary.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
     seconds
         Machine time to run [s].
     out
-        Folder in which a new one is made for this run: recording, view, logs.
+        Folder in which the run gets a new folder: recording, view, logs.
     quiet
         No progress and no table.
 
@@ -105,7 +105,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
 
 
 def _set_environment(folder: Path) -> None:
-    """Keep the demo's processes to themselves: this machine only, a domain of their own."""
+    """Keep the demo's processes on this machine and in a domain of their own."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # domains above 101 share their ports with outgoing connections
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
@@ -172,7 +172,7 @@ def _follow(source: Child, twin: Child, watch: Watch, spin: Any, bar: Progress, 
         now = watch.number("state", "model_time_s")
         if now > reached:
             moved, reached = time.monotonic(), now
-        # before the first sample the publisher starts, which a busy machine takes its time over
+        # before the first sample the publisher starts, slowly on a busy machine
         elif time.monotonic() - moved > (patience := _STUCK_S if reached else _START_TIMEOUT_S):
             raise DemoError(f"no progress for {patience:g} s at model time {reached:g} s\n{twin.output()}")
         bar.update(task, completed=reached)
@@ -209,17 +209,17 @@ class Child:
         return self._process.poll() is None
 
     def output(self) -> str:
-        """Return what the process has said so far."""
+        """Return the output of the process so far."""
         return self._log.read_text(errors="replace").strip()
 
     def check(self, allowed: tuple[int, ...] = ()) -> None:
-        """Raise when the process has ended with another code than those allowed."""
+        """Raise `DemoError` when the process has ended with a code that is not allowed."""
         code = self._process.poll()
         if code is not None and code not in allowed:
             raise DemoError(f"{self._name} ended with code {code}\n{self.output()}")
 
     def stop(self) -> None:
-        """Ask for a clean stop and insist on one."""
+        """Ask for a clean stop; raise `DemoError` without one."""
         if self.running:
             self._process.send_signal(signal.SIGINT)
         try:
@@ -229,7 +229,7 @@ class Child:
         self.check(allowed=(0,))
 
     def end(self) -> None:
-        """End the process whatever it does."""
+        """Terminate the process, and kill it if it goes on."""
         if self.running:
             self._process.terminate()
             try:
@@ -293,7 +293,7 @@ def _view(folder: Path) -> Path | None:
 
 
 def _losses(watch: Watch, sent: int, summary: RunSummary) -> dict[str, int]:
-    """Return all counted loss of the run: nothing of it is forgiven."""
+    """Return all counted loss of the run."""
     published = int(watch.number("output", "published"))
     return {
         "sent, not used": sent - int(watch.number("input", "samples_used")),
@@ -326,7 +326,7 @@ def _print(console: Console, watch: Watch, summary: RunSummary, sent: int, lost:
 
 
 def _print_clearances(console: Console, summary: RunSummary) -> None:
-    """Print what is estimated from the synthetic sensor, or what the model and its prior say where nothing is."""
+    """Print the clearances estimated from the synthetic sensor, else those of the model with its prior."""
     for name, (value, low, high) in summary.clearance.items():
         found = None if summary.estimate is None else summary.estimate[name]
         if found is None:

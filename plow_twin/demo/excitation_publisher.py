@@ -1,12 +1,12 @@
-"""The program `excitation_publisher`: a scene's load as samples on `excitation`, by the clock or as fast as it goes.
+"""The program `excitation_publisher`: a scene's load as samples on `excitation`, in real time or as fast as possible.
 
-With `--sensor` the pose of a head in a wider guide goes out on `head_pose`, as a noisy sensor would measure it: a
-synthetic one, whose truth is known.
+With `--sensor` it publishes on `head_pose` the pose of a head in a wider guide with the noise of a sensor: a synthetic
+measurement of known truth.
 
-With `--cutting` a stochastic cutting load is added, and the speed along the face goes out on `travel`.
+With `--cutting` it adds a stochastic cutting load and publishes the speed along the face on `travel`.
 
-`real` keeps a grid on the steady clock: each sample leaves at its own time, a late one at once, none is left out.
-`fast` is the source of `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
+`real` keeps a grid on the steady clock: each sample leaves at its time, a late sample at once, and no sample is left
+out. `fast` publishes `/clock`, and runs ahead of the twin's `contact_peaks` by a bounded number of samples.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ _STAMP: Final = struct.Struct("<4xiI")
 
 @dataclass(frozen=True)
 class Plan:
-    """What to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`; `speed` (n,) [m/s] of travel.
+    """Samples to send: `wrench` (n, 3) Fx, Fy [N], M [N m], one row each `period_ns`; `speed` (n,) [m/s] of travel.
 
-    `pose` (m, 3) x, y [m], theta [rad] is what a synthetic sensor measures, one row with every `pose_every`-th sample.
+    `pose` (m, 3) x, y [m], theta [rad] is the output of a synthetic sensor, one row with every `pose_every`-th sample.
     """
 
     wrench: NDArray[np.float64]
@@ -109,7 +109,7 @@ class ExcitationPublisher(WithoutEvents):
         )
 
     def wait_for_twin(self, timeout_s: float) -> bool:
-        """Wait until a twin is active and reads `excitation`; False when none was found in time or on a stop."""
+        """Wait until a twin is active and reads `excitation`; return False after the time limit or on a stop."""
         give_up = time.monotonic() + timeout_s
         while not self._connected():
             if self._stop.stopped or time.monotonic() > give_up:
@@ -152,7 +152,7 @@ class ExcitationPublisher(WithoutEvents):
         self._wait_for_answer(FIRST_STAMP_NS + (self.sent - 1) * self._plan.period_ns)
 
     def flush(self) -> None:
-        """Wait until every reliable reader has what was sent."""
+        """Wait until every reliable reader has received every message."""
         self._samples.wait_for_all_acked(Duration(nanoseconds=round(_STALL_S * NS_PER_S)))
 
     def _wait_for_answer(self, stamp_ns: int) -> None:
@@ -195,7 +195,7 @@ def plan(
 ) -> Plan:
     """Sample the loads of a scene, gravity not included, with a cutting load on top.
 
-    With `sensor_mm` the plan has the pose of a head whose guide is wider by that than the scene says, seen with noise.
+    With `sensor_mm` the plan has the noisy pose of a head whose clearances exceed those of the scene by that.
 
     Raises
     ------
@@ -217,7 +217,7 @@ def plan(
 def _measured(
     scene: Scene, times: NDArray[np.float64], wrench: NDArray[np.float64], wider_mm: float
 ) -> NDArray[np.float64]:
-    """Return what a noisy sensor measures of a head in a wider guide, shape (n, 3)."""
+    """Return the noisy pose of a head in a wider guide, shape (n, 3)."""
     clearance = Clearance(scene.clearance.horizontal_m + 1e-3 * wider_mm, scene.clearance.vertical_m + 1e-3 * wider_mm)
     twin = Twin(replace(scene, clearance=clearance), excitation="sampled")
     noise = np.random.default_rng(0).standard_normal((len(times), 3)) * _POSE_NOISE

@@ -1,4 +1,4 @@
-"""What a recorded run shows: forces per corner and sense, contact sets, clearance and wear; all from its messages."""
+"""Summary of a recorded run from its messages: forces per corner and sense, contact sets, clearance and wear."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class RunSummary:
 
 
 def corner_letters(scene: Scene) -> dict[str, str]:
-    """Return the letter of each corner, or its name where the scene gives none."""
+    """Return the letter of each corner, or its name where the scene has no letter."""
     letters = {corner: letter for letter, corner in scene.frame.labels.items()}
     return {corner: letters.get(corner, corner) for corner in CORNER_NAMES}
 

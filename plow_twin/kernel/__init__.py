@@ -1,1 +1,1 @@
-"""What every compiled function stands on: the compiler, SIMD lanes, polynomials. Knows nothing of the machine."""
+"""The compiler, SIMD lanes and polynomials that every compiled function uses. Knows nothing of the machine."""

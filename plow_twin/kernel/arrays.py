@@ -1,4 +1,4 @@
-"""Arrays inside kernels without an owner: nothing counts who holds them."""
+"""Arrays inside kernels that are not reference counted."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from numba.extending import intrinsic
 
 
 def _unowned(typingctx: Any, array: Any) -> Any:
-    """Return an array that does not keep its memory alive: its caller does. None stays None.
+    """Return the same array without a reference count; its caller keeps the memory alive. None stays None.
 
-    Each kernel that an array is passed to counts it in and out, atomically: a seventh of the time of a run.
+    Otherwise every call with an array counts it up and down, atomically: a seventh of the time of a run.
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

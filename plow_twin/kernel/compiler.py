@@ -25,7 +25,7 @@ _said: set[str] = set()
 
 
 def _load_numba() -> None:
-    """Load what numba types and lowers with, without SciPy's linear algebra: 0.15 s, a third of a start.
+    """Load numba's tables of types and of code without SciPy's linear algebra, which takes 0.15 s, a third of a start.
 
     Numba imports it only to learn whether a BLAS is there; compiled functions that use one import it themselves.
     """

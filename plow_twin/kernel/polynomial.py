@@ -1,4 +1,4 @@
-"""Polynomials on an interval: sure statements on sign, first root and maximum, from the Bernstein form.
+"""Polynomials on an interval: guaranteed sign, first root and maximum, from the Bernstein form.
 
 A polynomial lies within the hull of its Bernstein coefficients, and has no more roots than they have sign changes;
 halving the interval sharpens both (Farouki, Comput. Aided Geom. Des. 29 (2012) 379).
@@ -78,10 +78,10 @@ def first_root(g: Array, n: int, h: float, w) -> float:
 
 @kernel()
 def first_root_within(g: Array, n: int, h: float, w) -> float:
-    """Do the work of `first_root` from the Bernstein coefficients in `w.halves[0]`.
+    """Return the same as `first_root` from the Bernstein coefficients in `w.halves[0]`.
 
-    Intervals whose Bernstein coefficients show no negative value are left out, one sign change is one root, the rest is
-    halved, left part first.
+    An interval without a negative Bernstein coefficient has no root; one sign change means one root; every other
+    interval is halved, and its left half searched first.
     """
     b, bounds = w.halves, w.bounds
     bounds[0, 0], bounds[0, 1] = 0.0, h

@@ -1,8 +1,8 @@
 """Eight numbers side by side: one SIMD vector as a value inside kernels.
 
-A loop over eight columns leaves it to the compiler whether a vector comes of it. Here the vector is a type: `row`,
-`set_row`, `splat` and `total` are single operations, and + - * act on all eight. Where the processor's vectors are
-shorter, the compiler splits them.
+The compiler may or may not vectorise a loop over eight columns. Here the vector is a type: `row`, `set_row`, `splat`
+and `total` are single operations, and + - * act on all eight. Where the processor's vectors are shorter, the compiler
+splits them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FLAGS = ("contract", "reassoc", "nsz", "arcp")
 
 
 def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a function that emits code an operation of kernels; its first parameter is not one of the caller's."""
+    """Make an operation of kernels from a function that emits its code; callers omit the first parameter."""
     operation: Callable[..., Any] = intrinsic(function)
     return operation
 
@@ -82,7 +82,7 @@ def _splatted(builder: Any, value: Any) -> Any:
 
 @_operation
 def splat(typingctx: Any, value: Any) -> Any:
-    """Return eight times the same number."""
+    """Return a vector of eight equal numbers."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _splatted(builder, context.cast(builder, arguments[0], signature.args[0], types.float64))
@@ -120,7 +120,7 @@ def permutation(*places: int) -> Callable[..., Any]:
 
 @_operation
 def lane(typingctx: Any, value: Any, index: Any) -> Any:
-    """Return one of the eight."""
+    """Return the number in lane `index`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         position = context.cast(builder, arguments[1], signature.args[1], types.int32)
@@ -143,7 +143,7 @@ def total(typingctx: Any, value: Any) -> Any:
 
 @_operation
 def spread_total(typingctx: Any, value: Any) -> Any:
-    """Return the sum of the eight in each lane: sooner there than `total` and a way back."""
+    """Return the sum of the eight in each lane, faster than `splat(total(...))`."""
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         value = arguments[0]

@@ -2,8 +2,8 @@
 
 Most laws have the form  F = K d^n (1 + lambda d'),  with penetration d and its rate d', positive inward. They differ
 in the damping number  D = lambda v0  that they derive from the restitution e; v0 is the speed of the touch. The others
-add C d' to K d^n, at once (Kelvin-Voigt) or ramped in. A law is added by one entry in `_LAWS`, by `add_law` from
-outside; what it takes and the number it makes are all that solvers read of it.
+add C d' to K d^n, at once (Kelvin-Voigt) or ramped in. One entry in `_LAWS` adds a law, `add_law` one from outside;
+solvers read only its options and its damping number.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Final
 
 from plow_twin.errors import ArgumentError
 
-#: 1 - e below which the residual of the exact law is little but rounding, and two terms of D's series are better.
+#: 1 - e below which rounding dominates the residual of the exact law, and two terms of D's series are better.
 _NEARLY_ELASTIC: Final = 1e-5
 #: Largest D = lambda v0 used: a restitution below about 1/1000 would need an unbounded damping.
 DAMPING_NUMBER_CAP: Final = 1e3
@@ -54,12 +54,12 @@ def exact_damping_number(restitution: float) -> float:
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """One law: what it takes, and how the restitution becomes damping.
+    """One law: its options, and how a restitution becomes damping.
 
     Attributes
     ----------
     title, source : str
-        What people call it; its equation and where it was published.
+        Its usual name; its equation and where it was published.
     number_of : callable, optional
         D(e) of the law: the damping number lambda v0 [1] for a restitution e; None where it has no restitution form.
     takes_damping : bool
@@ -74,8 +74,8 @@ class ContactLaw:
     Raises
     ------
     ArgumentError
-        For a combination that is no law: a ramp or a restitution beside the wrong kind of damping, or an additive law
-        without a ramp whose exponent is not 1.
+        For contradictory options: a ramp or a restitution with the wrong kind of damping, or an additive law without a
+        ramp whose exponent is not 1.
     """
 
     title: str
@@ -186,14 +186,14 @@ def add_law(name: str, law: ContactLaw) -> None:
     Parameters
     ----------
     name : str
-        What scenes call it: letters, digits and _.
+        The name in scenes: letters, digits and _.
     law : ContactLaw
-        What it takes, and how the restitution becomes damping.
+        Its options, and how a restitution becomes damping.
 
     Raises
     ------
     ArgumentError
-        The name is taken, or not one that a scene file can hold.
+        The name is taken, or a scene file cannot hold it.
     """
     if name in LAWS or not name.isidentifier():
         raise ArgumentError(f"contact law: got {name!r}, expected a new name of letters, digits and _")

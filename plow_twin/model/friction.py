@@ -2,8 +2,8 @@
 
 s' is the rate at which the frame's corner slides along the head's wall; the corner drags the wall with it. Below the
 regularisation speed v_s friction is viscous: a body held by friction creeps with v_s atanh(T / (mu N)). Source:
-Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5. Friction with stick needs
-the corner's memory: `solve.grip`.
+Andersson, Soederberg and Bjoerklund, Tribol. Int. 40 (2007) 580, eq. 5. Friction with stick has a state of its own:
+`solve.grip`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def friction_force(normal: float, slip_rate: float, coefficient: float, speed: f
 
 
 def painleve_coefficients(scene: Scene) -> NDArray[np.float64]:
-    """Return for each pair the mu above which its sliding corner can be Painleve's case, shape (8,); inf for never.
+    """Return for each pair the mu above which its sliding corner can be Painleve's case, shape (8,); inf if it cannot.
 
     A sliding corner is pressed into the wall by its own friction where d'' = -p N with
     p = 1/m + a^2/I - mu |a b|/I < 0, a and b the arms of N and T about the centre of mass, here at q = 0. Rigid bodies

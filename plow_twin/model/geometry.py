@@ -5,7 +5,7 @@ The head's state is kept in *body coordinates* of its centre of mass G:
     X, Y     position of G, VX, VY its velocity, both resolved in head axes,
     omega    angular velocity,  c, s = cos(theta), sin(theta),  theta.
 
-With them every penetration is linear, and so is every arm. A frame corner C = (Cx, Cy) is seen from the cavity's
+In these coordinates every penetration and every arm is linear. A frame corner C = (Cx, Cy) is seen from the cavity's
 centre at p = R(theta)^T (C - (x, y)) (paper, eq. 1, inverted), that is
 
     p_x =  c Cx + s Cy - X + rx        p_y = -s Cx + c Cy - Y + ry

@@ -31,7 +31,7 @@ class Pieces:
 
     @staticmethod
     def through(t: Array, wrench: Array) -> Pieces:
-        """Join samples by straight lines; the last one is held."""
+        """Join samples by straight lines; the last value is held."""
         slope = np.zeros_like(wrench)
         slope[:-1] = np.diff(wrench, axis=0) / np.diff(t)[:, None]
         return Pieces(t, wrench, slope)

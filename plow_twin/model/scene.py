@@ -1,4 +1,4 @@
-"""What the machine is: the constants of one head in one guide, as plain frozen dataclasses in SI units.
+"""The constants of one head in one guide, as plain frozen dataclasses in SI units.
 
 The field names are the keys of the scene file. `metadata` of each number holds its unit, its meaning and its admissible
 range; the checks here, the file's schema and the documentation all come from it.
@@ -105,7 +105,7 @@ class Frame:
     Attributes
     ----------
     labels : mapping of str to str
-        Letters for corners, e.g. a: bottom_right; none unless given.
+        Letters for corners, e.g. a: bottom_right; empty unless given.
     """
 
     width_m: float = _quantity("m", "horizontal side", gt=0.0)
@@ -177,7 +177,7 @@ class Support:
     carried there. q is the head's displacement as seen from the frame, as it is without a support.
     """
 
-    mass_kg: float = _quantity("kg", "mass of the frame and of what moves with it", gt=0.0)
+    mass_kg: float = _quantity("kg", "mass of the frame and of the parts that move with it", gt=0.0)
     inertia_kg_m2: float = _quantity("kg m^2", "its moment of inertia about the frame's centre", gt=0.0)
     horizontal_stiffness_n_m: float = _quantity("N/m", "horizontal spring, 0 for none", ge=0.0)
     vertical_stiffness_n_m: float = _quantity("N/m", "vertical spring, 0 for none", ge=0.0)
@@ -281,10 +281,12 @@ class Wear:
     travel_speed_m_s: float = _quantity("m/s", "speed v along the face", ge=0.0)
     initial_depth_m: tuple[float, ...] = _quantity("m", "wear depth of the eight pads at t = 0", (0.0,) * 8, ge=0.0)
     prior_m2_n: tuple[float, float] = _quantity(
-        "m^2/N", "5 % and 95 % points of what k_s may be", (1e-15, 1e-13), gt=0.0
+        "m^2/N", "5 % and 95 % points of the prior of k_s", (1e-15, 1e-13), gt=0.0
     )
-    pad_length_m: float | None = _quantity("m", "length of a pad along the face: what the slide wears by", None, gt=0.0)
-    sliding: str = _choice("what wears: the travel, or the sliding in the plane too", ("travel", "total"), "travel")
+    pad_length_m: float | None = _quantity(
+        "m", "length of a pad along the face, by which the slide wears", None, gt=0.0
+    )
+    sliding: str = _choice("motion that wears: travel, or sliding in the plane too", ("travel", "total"), "travel")
     running_in_ratio: float = _quantity("1", "coefficient of a new pad over k_s", 1.0, ge=1.0)
     running_in_depth_m: float | None = _quantity("m", "wear depth over which that falls by e", None, gt=0.0)
 
@@ -361,7 +363,7 @@ OPTIONAL_PARTS: Final[Mapping[str, type]] = {"wear": Wear, "friction": Friction,
 
 
 def check(scene: Scene) -> Iterator[Problem]:
-    """Yield every problem of a scene: types, ranges, choices, then what only shows across fields."""
+    """Yield every problem of a scene: types, ranges, choices, then conditions across fields."""
     found = list(_check_fields(scene, ""))
     yield from found
     if not found:
@@ -454,7 +456,7 @@ def must_be_given(spec: Field[Any]) -> bool:
 
 
 def describe(spec: Field[Any]) -> str:
-    """Say in words what a number must be, e.g. `a finite number > 0 [kg]`."""
+    """Return the admissible numbers in words, e.g. `a finite number > 0 [kg]`."""
     signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
     bounds = [f"{sign} {spec.metadata[name]:g}" for name, sign in signs.items() if name in spec.metadata]
     return f"a finite number {' and '.join(bounds)}".rstrip() + f" [{spec.metadata['unit']}]"

@@ -59,5 +59,5 @@ def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future
             now = time.monotonic()
             manned = now if client.scheduler_info()["workers"] else manned
             if now - manned > WORKER_TIMEOUT_S:
-                what = f"got no worker for {WORKER_TIMEOUT_S:g} s, expected some"
-                raise StudyError(f"dask: {what}; what is stored stays, the same call does the rest") from None
+                got = f"got no worker for {WORKER_TIMEOUT_S:g} s, expected at least one"
+                raise StudyError(f"dask: {got}; stored chunks stay, the same call computes the rest") from None

@@ -1,4 +1,4 @@
-"""Runs of many scenes, and what of each motion a study can ask for."""
+"""Runs of many scenes, and the figures of each motion that a study can ask for."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Numbers and words of a scene by path, as they stand in its messages: `contact.stiffness`, `head.com_offset_m[0]`.
 
-Loads are called by name: `loads.fx1.phase_rad`. Four paths are not fields but say what a study asks for:
+Loads are called by name: `loads.fx1.phase_rad`. Four paths are no fields of a scene but settings of a study:
 
     loads.<name>.sign       sign of the load's force (its first component that is not zero); -1 turns the whole force
     loads.<name>.arm_sign   the same for its point of action
@@ -39,7 +39,7 @@ _INDEX: Final = re.compile(r"(.+)\[(\d+)\]")
 
 
 class StudyError(PlowTwinError, ValueError):
-    """A study cannot be made or continued as asked; the message says why."""
+    """A study cannot be made or continued as asked; the message has the reason."""
 
 
 def parameter_paths(scene: Scene) -> tuple[str, ...]:
@@ -93,7 +93,7 @@ def nearest_of(path: str, known: Iterable[str]) -> str:
 
 
 def parameter_of(scene: Scene, path: str) -> Value | None:
-    """Return what stands at a path; None for a damping or restitution that is not given."""
+    """Return the value at a path; None for a damping or restitution that is not given."""
     check_path(scene, path)
     if path == "frame.labels":
         return next((word for word, labels in label_words().items() if labels == dict(scene.frame.labels)), None)
@@ -111,7 +111,7 @@ def parameter_of(scene: Scene, path: str) -> Value | None:
 
 
 def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
-    """Return the scene with new values; marks of what is set are taken off.
+    """Return the scene with new values, which lose their marks.
 
     Raises
     ------
@@ -129,7 +129,7 @@ def with_parameters(scene: Scene, values: Mapping[str, Value]) -> Scene:
             raise StudyError(f"{path}: got {value!r}, expected a {'word' if words else 'number'}")
     parts: dict[str, Any] = {name: getattr(scene, name) for name in _PARTS}
     loads = {load.name: load for load in scene.loads}
-    # fields first: sign and scale act on what they have become
+    # fields first: sign and scale act on the new values
     for path, value in sorted(values.items(), key=lambda item: item[0].rsplit(".", 1)[1] in _DERIVED):
         owner, field_name = path.rsplit(".", 1)
         if path == "frame.labels":
@@ -270,7 +270,7 @@ def parse_settings(scene: Scene, texts: Sequence[str]) -> dict[str, Value]:
     Raises
     ------
     StudyError
-        Naming the setting, what was got and what is expected.
+        Names the setting, the value got and the value expected.
     """
     values: dict[str, Value] = {}
     for text in texts:

@@ -1,4 +1,4 @@
-"""The folder of a sweep: what was asked, and what is computed of it so far.
+"""The folder of a sweep: the question, and the part computed so far.
 
     sweep.json          the arguments, and the number of members in a chunk
     chunks/00007.npz    status and statistics of the members of one chunk, and the build that computed them
@@ -24,7 +24,7 @@ from plow_twin.study.sweep.table import Sweep, Table, chunks_of
 Array = NDArray[np.float64]
 
 FORMAT: Final = 1
-#: A chunk, or what a process killed while it wrote one has left.
+#: A chunk, or the remainder of one whose process was killed while writing.
 _CHUNK_NAME: Final = re.compile(r"\d{5,}\.npz|\.\d{5,}\.npz\.\d+")
 
 
@@ -39,12 +39,12 @@ class Store:
     chunk : int
         Members in a chunk; the stored number counts when the folder holds this sweep already.
     fresh : bool
-        Discard what the folder holds of any sweep.
+        Discard every sweep in the folder.
 
     Raises
     ------
     StudyError
-        When the folder holds another sweep, or something that is none; says what differs.
+        When the folder holds another sweep, with the difference, or something else.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, chunk: int, fresh: bool = False) -> None:
@@ -52,7 +52,7 @@ class Store:
         self._chunks = folder / "chunks"
         if fresh:
             for path in [*self._chunks.glob("*.npz*"), *self._chunks.glob(".*.npz.*")]:
-                if _CHUNK_NAME.fullmatch(path.name):  # what is not a sweep's stays
+                if _CHUNK_NAME.fullmatch(path.name):  # other files stay
                     path.unlink()
             (folder / "sweep.json").unlink(missing_ok=True)
         if (folder / "sweep.json").exists():

@@ -1,1 +1,1 @@
-"""Recordings analysed: predicted against measured, what the contacts bore, other scenes beside it."""
+"""Recordings analysed: predicted against measured, loads of the contacts, other scenes beside it."""

@@ -148,11 +148,11 @@ class Measured:
     signals: dict[str, ThinnedSignal] = field(default_factory=dict)
     #: the latest of each role: its stretch and its stamp [ns]
     _latest: dict[str, tuple[int, int]] = field(default_factory=dict)
-    #: values that are none, however large the units
+    #: values that are impossible in any unit
     implausible: int = 0
 
     def add(self, role: str, stamp_ns: int, numbers: Mapping[str, float], stretch: int = 0) -> None:
-        """Take in the numbers of one message that came in that stretch; what is not finite was not measured."""
+        """Add the numbers of one message of that stretch; a number that is not finite was not measured."""
         before, newest = self._latest.get(role, (0, stamp_ns))
         back = newest - stamp_ns > _STEP_NS
         # its clock has stepped before that of the load
@@ -178,7 +178,7 @@ class Analysis:
     losses: dict[str, int]
     unknown_types: dict[str, str]
     wall_s: float = 0.0
-    #: folders beside what was read that hold recordings of their own, or nothing
+    #: other folders there: empty, or with recordings of their own
     left_out: tuple[Path, ...] = ()
 
     @property
@@ -195,7 +195,7 @@ class Analysis:
         return self.losses | {name: count for name, count in found.items() if count}
 
     def comparisons(self, prediction: Prediction) -> dict[str, Comparison]:
-        """Return the signals that were measured, compared with what one scene predicts."""
+        """Return the measured signals compared with the prediction of one scene."""
         stamps, columns = prediction.series()
         if not len(stamps):
             return {}
@@ -213,7 +213,7 @@ class Analysis:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """Return everything for JSON: what the scene predicts at the top, other scenes under `with`."""
+        """Return everything for JSON: the prediction of the scene at the top, other scenes under `with`."""
         first, *others = self.predictions
         return {
             "run": str(self.path),
@@ -290,7 +290,7 @@ def analyse(
     scene
         Scene file or preset; needed for other recordings (or `scene.yaml` beside them), else that of the run.
     mapping
-        YAML that says which topic is what.
+        YAML that maps topics to roles.
     units
         Units by name (fx, x, ..., t) that are not those of the mapping; for another recording only.
     others
@@ -327,7 +327,7 @@ def analyse(
     measured = Measured()
     if reader is not None:
         if units:
-            raise RecordingError(f"{path}: got units, expected none: a run of plow_twin is in SI")
+            raise RecordingError(f"{path}: got units, expected no units: a run of plow_twin is in SI")
         found = _walk_own(reader, path, mapping, predictions, on_progress, on_caught_up)
     else:
         found = _walk_other(path, mapping, units, predictions, measured, out)
@@ -388,7 +388,7 @@ def _walk_own(
 
 
 def _measured_beside(path: Path, mapping: Path | None, node: str) -> tuple[Measured, dict[str, str], dict[str, int]]:
-    """Return what was measured beside a run, the topics whose type is unknown, and what could not be used, by reason.
+    """Return the measurements beside a run, the topics of unknown type, and the counts of unusable messages by reason.
 
     Its loads are in the journal.
     """
@@ -425,7 +425,7 @@ def _walk_other(
     if "excitation" not in roles:
         found = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(source.topics().items())) or "no topic"
         raise RecordingError(
-            f"{path}: excitation: got {found}, expected a topic with the load, or a mapping that says it"
+            f"{path}: excitation: got {found}, expected a topic with the load, or a mapping that names it"
         )
     check_units(messages_of(open_source(path), roles), roles, predictions[0].scene, path)
     writer = _writer(out, predictions[0].scene, roles) if out is not None else None
@@ -474,7 +474,7 @@ def _holds_recording(folder: Path) -> bool:
 
 
 def left_out(path: Path) -> list[Path]:
-    """Return what is in a folder and no part of what `expand` makes of it: empty folders, runs beside or in others."""
+    """Return the folders in a folder that `expand` leaves out: empty ones, runs beside or inside others."""
     if not path.is_dir():
         return []
     folders = [item for item in sorted(path.iterdir()) if item.is_dir()]
@@ -485,12 +485,12 @@ def left_out(path: Path) -> list[Path]:
 
 
 def expand(paths: Sequence[Path]) -> list[Path]:
-    """Return the recordings in some places: a folder that is none itself stands for those in it.
+    """Return the recordings in some places: a folder that is not a recording stands for those in it.
 
     Raises
     ------
     RecordingError
-        A folder holds none.
+        A folder holds no recording.
     """
     found: list[Path] = []
     for path in paths:
@@ -500,7 +500,7 @@ def expand(paths: Sequence[Path]) -> list[Path]:
         inside = [
             item
             for item in sorted(path.iterdir())
-            # one whose parts have gone is a recording all the same: its analysis says so
+            # a recording whose parts are missing counts too: its analysis names them
             if item.suffix in (".mcap", ".db3") or _holds_recording(item) or (item / "metadata.yaml").is_file()
         ]
         if not inside:

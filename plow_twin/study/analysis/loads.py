@@ -95,7 +95,7 @@ class LoadTotals:
     _reversals: list[Series] = field(default_factory=lambda: [Series() for _ in range(PAIR_COUNT)])
 
     def restart(self) -> None:
-        """Go on after a reset: what happened between two stamps across it counts for nothing."""
+        """Go on after a reset; the interval across it is not counted."""
         self._last = self._worn = None
 
     def add(self, walked: Walked) -> None:
@@ -126,9 +126,9 @@ class LoadTotals:
         self._last = (int(stamps[-1]), *(column[-1].copy() for column in last))
 
     def _contact_loss(self, walked: Walked, steps: Array) -> Array:
-        """Return the energy that the contacts took between two rows [J]: work of load and gravity less what is gained.
+        """Return the energy taken by the contacts between two rows [J]: work of load and gravity less energy gained.
 
-        The load's work is its mean times the way; gained is kinetic energy and what is stored in the contacts.
+        The load's work is its mean times the way; the energy gained is kinetic or stored in the contacts.
         """
         now = walked.wrench, walked.rows.q, walked.rows.v, walked.rows.penetration
         first = (column[0] for column in now) if self._last is None else self._last[1:]

@@ -74,7 +74,7 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
                 done(futures[future], future.result())
             except BrokenProcessPool:
                 left.append(futures[future])
-    except BaseException:  # an interrupt: what has not ended is made anew by the next call
+    except BaseException:  # an interrupt: the next call makes unfinished analyses anew
         for worker in set(active_children()).difference(others):
             worker.kill()
         raise

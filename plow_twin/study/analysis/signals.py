@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Largest lag that is looked for [s]; longer ones cannot be told from a period of the load.
+#: Largest lag searched [s]; a longer lag cannot be distinguished from a period of the load.
 LARGEST_LAG_S: Final = 1.0
 #: Fewest measured values for a comparison.
 _FEWEST: Final = 8
@@ -33,7 +33,7 @@ class Comparison:
     lag_s : float or None
         Lag of the measurement in s, positive where it is late: the one at which the correlation is largest.
     rms_aligned : float or None
-        Standard deviation of what is left at that lag.
+        Standard deviation of the difference at that lag.
     coherence : float or None
         Magnitude-squared coherence at the strongest frequency of the prediction.
     """
@@ -91,12 +91,12 @@ def _at(times: Array, t: Array, predicted: Array) -> Array:
 
 
 def _step(times: Array, span: float) -> float:
-    """Return the usual distance of two stamps [s], not below what gives too many points; equal stamps count once."""
+    """Return the usual distance of two stamps [s], not so small as to give too many points; equal stamps count once."""
     return max(float(np.median(np.diff(np.unique(times)))), span / _MOST_POINTS, 1e-6)
 
 
 def _correlations(longer: Array, shorter: Array) -> Array:
-    """Return Pearson's correlation of a series with each piece of a longer one, over what is known of the piece.
+    """Return Pearson's correlation of a series with each piece of a longer one, over the known part of the piece.
 
     What is known of the longer one, that is not NaN, is one piece itself. -1 where there is too little.
     """
@@ -120,7 +120,7 @@ def _correlations(longer: Array, shorter: Array) -> Array:
     square_one = sums(one**2, low + begin, high + begin) - count * mean_one**2
     square_other = sums(other**2, low, high) - count * mean_other**2
     product = correlate(one, other, mode="valid", method="fft") - count * mean_one * mean_other
-    # a piece without any change has no correlation: what is left of it is rounding
+    # a constant piece has no correlation: its deviation from the mean is rounding
     enough = (high - low >= _FEWEST) & (square_one > 1e-12 * (one @ one)) & (square_other > 1e-12 * (other @ other))
     size = np.sqrt(np.where(enough, square_one * square_other, 1.0))
     return np.where(enough, product / size, -1.0)

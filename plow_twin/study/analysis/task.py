@@ -23,7 +23,7 @@ from plow_twin.scene_file.presets import scene_path
 from plow_twin.study.analysis.analyse import MAPPED_LOAD, analyse
 from plow_twin.study.analysis.report import write_report
 
-#: Written last: what the other files of an analysis were made of.
+#: Written last: the inputs of the other files of an analysis.
 _ASKED: Final = "asked.json"
 _FILES: Final = (_ASKED, "analysis.json", "report.html", "measured.parquet")
 #: Tables, one for each scene that predicts.
@@ -31,7 +31,7 @@ _TABLE: Final = re.compile(r"(predicted|clearance|face|slide_wear)(_\d+)?\.parqu
 
 
 def names_apart(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each recording: as much of its path as tells it from the others."""
+    """Return a short name for each recording: as much of its path as distinguishes it from the others."""
     whole = [path.absolute() for path in paths]
     stems = Counter(path if path.is_dir() else path.with_suffix("") for path in whole)
     parts = [
@@ -69,7 +69,7 @@ class Task:
     mapping: Path | None
     others: tuple[Path, ...]
     out: Path | None
-    #: what the recording's folder holds besides, which is said in the results
+    #: other contents of the recording's folder, named in the results
     left_out: tuple[Path, ...] = ()
     #: units of measured numbers by name, beside those of the mapping
     units: Mapping[str, str] = field(default_factory=dict)
@@ -86,7 +86,7 @@ class Task:
         return {**facts, "lossy": bool(facts["lost"])} if asked == self._asked() else None
 
     def clear(self, inputs: Sequence[Path] = ()) -> None:
-        """Remove what an analysis before has left, all of it; a run that a twin has recorded stays.
+        """Remove all files of an earlier analysis; a run that a twin has recorded stays.
 
         Raises
         ------
@@ -106,7 +106,7 @@ class Task:
         self._keep(self._old(), inputs)
 
     def _old(self) -> list[Path]:
-        """Return what an analysis before has left, first what says that it is whole."""
+        """Return the files of an earlier analysis, first the file that marks it as complete."""
         if self.out is None or not self.out.is_dir():
             return []
         found = sorted(path for path in self.out.iterdir() if path.name in _FILES or _TABLE.fullmatch(path.name))
@@ -120,7 +120,7 @@ class Task:
             real = path.resolve()
             for one in old:
                 if real.is_relative_to(one.resolve()):
-                    raise RecordingError(f"{path}: lies in what --out {self.out} replaces, expected another folder")
+                    raise RecordingError(f"{path}: --out {self.out} would replace it, expected another folder")
 
     def _inputs(self) -> list[Path]:
         return [self.path, *(path for path in (self.scene, self.mapping, *self.others) if path is not None)]
@@ -134,7 +134,7 @@ class Task:
             It cannot be made.
         """
         self.clear()
-        asked = self._asked()  # of what is read from now on, not of what it has become by the end
+        asked = self._asked()  # state of the inputs at the start, not at the end
         found = analyse(
             self.path,
             scene=self.scene,
@@ -151,12 +151,12 @@ class Task:
         return {**found.facts(), "lossy": found.lossy}
 
     def _asked(self) -> dict[str, Any]:
-        """Return what the result depends on: the recording, what lies beside it, and what says how to read it."""
+        """Return the inputs of the result: the recording, the files beside it, mapping and units."""
         folder = self.path if self.path.is_dir() else self.path.parent
         beside = folder / "scene.yaml" if self.scene is None else None
         return {
             "run": _state(self.path, self.out),
-            # what was measured beside a part, in other parts too
+            # measurements beside a part, in other parts too
             "parts": [] if self.path.is_dir() else [_state(path, self.out) for path in _measured_near(folder)],
             "scene": _scene_state(self.scene),
             "scene_beside": _scene_state(beside) if beside is not None and beside.is_file() else None,
@@ -205,7 +205,7 @@ def _measured_near(folder: Path) -> list[Path]:
 
 
 def _scene_state(scene: Path | None) -> list[str] | None:
-    """Return the name of a scene and the digest of all that it says, its tables too."""
+    """Return the name of a scene and the digest of its contents, tables included."""
     if scene is None:
         return None
     try:

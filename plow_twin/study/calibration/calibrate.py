@@ -27,7 +27,7 @@ OnProgress = Callable[[float, float], None]
 
 @dataclass(frozen=True)
 class Search:
-    """Effort of one start: points screened, population, generations, evaluations of the simplex (0: none)."""
+    """Effort of one start: points screened, population, generations, evaluations of the simplex (0: no simplex)."""
 
     screen: int = 200
     population: int = 30
@@ -58,7 +58,7 @@ class Calibration:
     starts: tuple[Start, ...]
     seed: int
     runs: int
-    #: every point of a last population, with its objective: what else fits almost as well
+    #: every point of a last population with its objective, for points that fit almost as well
     population: Array = field(repr=False)
     population_objective: Array = field(repr=False)
 

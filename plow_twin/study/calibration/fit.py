@@ -1,4 +1,4 @@
-"""A calibration's result for people and files: the fitted scene with its marks, what it meets, how unique it is."""
+"""A calibration's result for people and files: the fitted scene with its marks, the targets met, the uniqueness."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _mark(before: Any, after: Any, old: Provenance | None, source: str) -> Prove
 
 
 def _number_at(scene: Scene, key: str) -> Any:
-    """Return what stands at a key of `Scene.marks`, such as `loads[0].force_n[1]`."""
+    """Return the number at a key of `Scene.marks`, such as `loads[0].force_n[1]`."""
     value: Any = scene
     for name, place in re.findall(r"(\w+)|\[(\d+)\]", key):
         value = getattr(value, name) if name else value[int(place)]
@@ -76,7 +76,7 @@ def _number_at(scene: Scene, key: str) -> Any:
 
 
 def target_rows(objective: TargetObjective, values: Mapping[str, Value]) -> list[TargetRow]:
-    """Return every target with what the candidate has of it."""
+    """Return every target with the value of the candidate."""
     numbers, paths = objective.table(values)
     settings = list(objective.targets.settings)
     rows = []

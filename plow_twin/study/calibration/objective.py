@@ -1,4 +1,4 @@
-"""Objectives of a calibration: what a candidate misses of targets or of a recorded motion, as one row of residuals."""
+"""Objectives of a calibration: residuals of a candidate against targets or a recorded motion, as one row."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class TargetObjective:
     runs: int = 0
 
     def __post_init__(self) -> None:
-        # nobody reads the marks of a candidate: without them it is made in a third of the time
+        # marks of a candidate are never read: without them it is made in a third of the time
         self.scene = replace(self.scene, marks={})
 
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:

@@ -41,7 +41,7 @@ _KEYS: Final = {
 
 @dataclass(frozen=True)
 class Target:
-    """One fact to meet; see the module for what each kind asks."""
+    """One fact to meet; the module explains each kind."""
 
     name: str
     kind: str
@@ -94,7 +94,7 @@ class Target:
 
 
 def _wrong_way(s: Array, least: Array) -> Array:
-    """Return the sum of the steps down of a sequence that should rise, and what it lacks of the least rise."""
+    """Return the sum of the steps down of a sequence that should rise, and how far it is below the least rise."""
     down = np.maximum(0.0, -np.diff(s, axis=1)).sum(axis=1)
     return np.asarray(down + np.maximum(0.0, least - (s[:, -1] - s[:, 0])))
 
@@ -126,7 +126,7 @@ class TargetSet:
         Raises
         ------
         StudyError
-            When a pattern matches none, or nothing is left.
+            When a pattern matches nothing, or no target is left.
         """
         names = [target.name for target in self.targets]
         for pattern in patterns:

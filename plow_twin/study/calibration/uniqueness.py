@@ -1,4 +1,4 @@
-"""How well a fit is determined: singular values of the Jacobian, and what else fits almost as well."""
+"""How well a fit is determined: singular values of the Jacobian, and points that fit almost as well."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def parse_unknown(text: str, scene: Scene) -> Unknown:
     Raises
     ------
     StudyError
-        Naming the unknown, what was got and what is expected.
+        Names the unknown, the value got and the value expected.
     """
     path, equals, rest = text.partition("=")
     check_path(scene, path)
@@ -144,7 +144,7 @@ class Space:
 
 
 def check_usable(space: Space, scene: Scene, trials: int = 100) -> None:
-    """Raise what is wrong with the scene at the first of some random points, `SceneError`, when none can be run."""
+    """Raise the `SceneError` of the first of some random points when no point can be run."""
     points = np.random.default_rng(0).random((trials, space.size))
     if not any(is_usable(scene, values) for values in space.values_of(points)):
         with_parameters(scene, space.values(points[0]))

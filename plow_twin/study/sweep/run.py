@@ -1,4 +1,4 @@
-"""Compute what a sweep's folder lacks: on this machine, or on a Dask cluster; the same code for each chunk."""
+"""Compute the chunks that a sweep's folder lacks, on this machine or a Dask cluster, by the same code."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def parse_axis(text: str, scene: Scene) -> Axis:
     Raises
     ------
     StudyError
-        Naming the axis, what was got and what is expected.
+        Names the axis, the value got and the value expected.
     """
     path, _, rest = text.partition("=")
     check_path(scene, path)
