@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from scenes import preset, wall_and_point
 from test_solve_flight import swaying
-from test_solve_rest import fallen
 
-from plow_twin import Contact, Initial, Scene, simulate
+from plow_twin import Contact, Initial, Scene
 from plow_twin.kernel.compiler import kernel
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.method import flight, implicit, rest, taylor
@@ -67,22 +66,22 @@ ASK: dict[Any, Callable[..., bool]] = {
 }  # fmt: skip
 
 
-def after(scene: Scene, seconds: float) -> Scene:
-    """Return the scene with the state that its motion has after some seconds."""
-    run = simulate(scene, seconds, seconds, TOLERANCE)
-    return replace(scene, initial=Initial(tuple(run.q[-1]), tuple(run.v[-1])))
+def pressed(damping: float, share: float) -> Scene:
+    """Return a head pressed by gravity on two corners, at a share of the equilibrium depth, with its slow rate there.
 
-
-def sliding() -> Scene:
-    """A head that sinks slowly into a damper a hundred times stronger than its spring."""
-    contact = Contact("kelvin_voigt", 1e7, damping=1e9)
-    return wall_and_point(contact, speed=0.0, gravity=9.81, gap=0.0, pairs=("top_left_top", "top_right_top"))
+    Far above the mass's own time C d' + K d = m g / 2 at each corner.
+    """
+    stiffness, mass, g = 1e7, 2.0, 9.81
+    contact = Contact("kelvin_voigt", stiffness, damping=damping)
+    scene = wall_and_point(contact, speed=0.0, mass=mass, gravity=g, gap=0.0, pairs=("top_left_top", "top_right_top"))
+    depth, rate = share * 0.5 * mass * g / stiffness, (1.0 - share) * 0.5 * mass * g / damping
+    return replace(scene, initial=Initial((0.0, -depth, 0.0), (0.0, -rate, 0.0)))
 
 
 SCENES: dict[str, Callable[[], Scene]] = {
     "free": swaying,
-    "at rest": lambda: after(fallen(), 30.0),
-    "overdamped": lambda: after(sliding(), 10.0),
+    "at rest": lambda: pressed(1e4, 1.0),
+    "overdamped": lambda: pressed(1e9, 0.5),
     "moving": lambda: preset("paper"),
 }
 
