@@ -175,7 +175,7 @@ class Follower:
 
         One that is withdrawn lets the prior hold again.
         """
-        told = [found.horizontal_state is State.ESTIMATED, found.vertical_state is State.ESTIMATED]
+        told = [found.horizontal_state.known, found.vertical_state.known]
         if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
             if self.estimate is None:
                 return False
