@@ -12,10 +12,11 @@ from plow_twin import Clearance, Gravity, Harmonic, Scene, Status, Table, simula
 
 
 def members() -> list[Scene]:
-    scene = preset("bench_kv")
+    """Scenes that the lanes do not take (`test_solve_lanes`)."""
+    scene = preset("bench_hc")
     pairs = [(gx, gy) for gx in (0.020, 0.025, 0.030) for gy in (0.021, 0.028)]
     scenes = [dataclasses.replace(scene, clearance=Clearance(gx, gy)) for gx, gy in pairs]
-    soft = dataclasses.replace(scene.contact, stiffness=1e7)
+    soft = dataclasses.replace(scene.contact, stiffness=3e7)
     return [*scenes, dataclasses.replace(scene, contact=soft), preset("paper")]
 
 
@@ -39,7 +40,7 @@ def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
 
 def test_members_with_other_terms_leave_nothing_behind() -> None:
     """The thread's scratch space goes from one to the next: a sampled load, a flight, a rest."""
-    scene = preset("bench_kv")
+    scene = preset("bench_hc")
     table = Table("ramp", np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0], [4e4, -1e4, 2e3]]))
     swing = Harmonic("swing", (200.0, 50.0), 20.0)
     swinging = dataclasses.replace(scene, gravity=Gravity(0.0), loads=(swing,))

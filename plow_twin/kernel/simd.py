@@ -31,14 +31,28 @@ def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
 class Lanes(types.Type):
     """Numba's type of eight float64."""
 
+    #: what LLVM may do to sums
+    flags: tuple[str, ...] = _FLAGS
+
+    def __init__(self, name: str = "Lanes") -> None:
+        super().__init__(name=name)
+
+
+class ExactLanes(Lanes):
+    """The same, but each operation is rounded as it is written: what surrounds it moves no bit."""
+
+    flags = ()
+
     def __init__(self) -> None:
-        super().__init__(name="Lanes")
+        super().__init__(name="ExactLanes")
 
 
 lanes = Lanes()
+exact_lanes = ExactLanes()
 
 
 @register_model(Lanes)
+@register_model(ExactLanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
         super().__init__(dmm, fe_type, _VECTOR)
@@ -51,15 +65,21 @@ def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any
     return builder.bitcast(first, _VECTOR.as_pointer())
 
 
+def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    place = context.cast(builder, arguments[1], signature.args[1], types.intp)
+    return builder.load(_pointer(context, builder, signature.args[0], arguments[0], place), align=8)
+
+
 @_operation
 def row(typingctx: Any, array: Any, index: Any) -> Any:
     """Return row `index` of a contiguous array of shape (n, 8), or row 0 of one of shape (8,)."""
+    return lanes(array, index), _load
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        place = context.cast(builder, arguments[1], signature.args[1], types.intp)
-        return builder.load(_pointer(context, builder, signature.args[0], arguments[0], place), align=8)
 
-    return lanes(array, index), codegen
+@_operation
+def exact_row(typingctx: Any, array: Any, index: Any) -> Any:
+    """Return the same as `ExactLanes`."""
+    return exact_lanes(array, index), _load
 
 
 @_operation
@@ -71,7 +91,7 @@ def set_row(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
         builder.store(arguments[2], _pointer(context, builder, signature.args[0], arguments[0], place), align=8)
         return context.get_dummy_value()
 
-    return types.void(array, index, lanes), codegen
+    return types.void(array, index, value), codegen
 
 
 def _splatted(builder: Any, value: Any) -> Any:
@@ -80,14 +100,20 @@ def _splatted(builder: Any, value: Any) -> Any:
     return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), zeros)
 
 
+def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return _splatted(builder, context.cast(builder, arguments[0], signature.args[0], types.float64))
+
+
 @_operation
 def splat(typingctx: Any, value: Any) -> Any:
     """Return a vector of eight equal numbers."""
+    return lanes(value), _splat
 
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _splatted(builder, context.cast(builder, arguments[0], signature.args[0], types.float64))
 
-    return lanes(value), codegen
+@_operation
+def exact_splat(typingctx: Any, value: Any) -> Any:
+    """Return the same as `ExactLanes`."""
+    return exact_lanes(value), _splat
 
 
 @_operation
@@ -164,7 +190,30 @@ def below(typingctx: Any, left: Any, right: Any) -> Any:
         found = builder.fcmp_ordered("<", *arguments)
         return builder.zext(builder.bitcast(found, ir.IntType(_WIDTH)), ir.IntType(64))
 
-    return types.int64(lanes, lanes), codegen
+    return types.int64(left, right), codegen
+
+
+@_operation
+def choose(typingctx: Any, bits: Any, there: Any, elsewhere: Any) -> Any:
+    """Return the lanes of `there` whose bit is set, else those of `elsewhere`."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = context.cast(builder, arguments[0], signature.args[0], types.int64)
+        mask = builder.bitcast(builder.trunc(number, ir.IntType(_WIDTH)), ir.VectorType(ir.IntType(1), _WIDTH))
+        return builder.select(mask, arguments[1], arguments[2])
+
+    return there(bits, there, elsewhere), codegen
+
+
+@_operation
+def fused(typingctx: Any, factor: Any, other: Any, term: Any) -> Any:
+    """Return factor * other + term of each, rounded once where the processor can."""
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, "llvm.fmuladd.v8f64"), arguments)
+
+    return factor(factor, other, term), codegen
 
 
 @_operation
@@ -176,7 +225,7 @@ def magnitude(typingctx: Any, value: Any) -> Any:
         fabs = cgutils.get_or_insert_function(builder.module, kind, "llvm.fabs.v8f64")
         return builder.call(fabs, [arguments[0]])
 
-    return lanes(lanes), codegen
+    return value(value), codegen
 
 
 def _elementwise(operation: Callable[..., Any], emit: str) -> None:
@@ -186,20 +235,23 @@ def _elementwise(operation: Callable[..., Any], emit: str) -> None:
     class _Typing(AbstractTemplate):
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
             known = all(isinstance(kind, (Lanes, types.Float, types.Integer)) for kind in args)
-            if len(args) == 2 and known and any(isinstance(kind, Lanes) for kind in args):
-                return signature(lanes, *args)
+            found = {kind for kind in args if isinstance(kind, Lanes)}
+            if len(args) == 2 and known and len(found) == 1:
+                return signature(*found, *args)
             return None
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         sides = [
-            value if kind == lanes else _splatted(builder, context.cast(builder, value, kind, types.float64))
+            value if isinstance(kind, Lanes) else _splatted(builder, context.cast(builder, value, kind, types.float64))
             for kind, value in zip(signature.args, arguments, strict=True)
         ]
-        return getattr(builder, emit)(*sides, flags=_FLAGS)
+        return getattr(builder, emit)(*sides, flags=signature.return_type.flags)
 
     for left, right in ((Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
         lower_builtin(operation, left, right)(codegen)
 
 
-for _sign, _emit in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
+for _sign, _emit in (
+    (operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul"), (operator.truediv, "fdiv"),
+):  # fmt: skip
     _elementwise(_sign, _emit)

@@ -1,4 +1,7 @@
-"""Many scenes at once on all cores: clearance, stiffness, load or initial state differ from member to member."""
+"""Many scenes at once on all cores: clearance, stiffness, load or initial state differ from member to member.
+
+Scenes whose contact force is linear share SIMD vectors (`solve.lanes`), the others run one after the other.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,13 @@ from numpy.typing import NDArray
 from plow_twin.errors import LimitError, RunInterrupted
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import Scene
+from plow_twin.run.lane_run import LaneRun
 from plow_twin.run.motion import BUDGET, Motion, run_events
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, check_limits
 from plow_twin.run.simulate import check_times, output_times
-from plow_twin.solve.compiled_scene import compile_scene
-from plow_twin.solve.state import Status, Work, new_work
+from plow_twin.solve.compiled_scene import compile_scenes
+from plow_twin.solve.lanes.record import fits_lanes
+from plow_twin.solve.state import Status, Totals, Work, new_work
 
 Array = NDArray[np.float64]
 
@@ -73,7 +78,10 @@ def simulate_many(
     max_steps: int = BUDGET,
     max_wall_s: float = MOST_SECONDS,
 ) -> Ensemble:
-    """Simulate every scene from t = 0 to `t_end`; each member has the same bits as `simulate` gives it alone.
+    """Simulate every scene from t = 0 to `t_end`; the bits of a member depend on its scene alone.
+
+    Scenes with a linear contact force (exponent 1, undamped or Kelvin-Voigt) and without other terms run eight at a
+    time in the lanes of a SIMD vector: the motion is that of `simulate` to the tolerance. All others have its bits.
 
     Parameters
     ----------
@@ -104,67 +112,117 @@ def simulate_many(
     """
     check_times(t_end, output_dt)
     check_limits(max_steps, max_wall_s)
-    times = output_times(t_end, output_dt)
-    ensemble = _empty(times, len(scenes))
-    local, lock = threading.local(), threading.Lock()
-    done, stopped = 0, threading.Event()
     end = _time.perf_counter() + max_wall_s
-
-    def look(motion: Motion | None = None) -> None:
-        if stopped.is_set() or _time.perf_counter() > end:
-            raise OutOfTimeError
-
-    def run(index: int) -> None:
-        nonlocal done
-        if not hasattr(local, "work"):
-            local.work = new_work()
-        look()
-        _run_member(scenes[index], index, t_end, tol, local.work, ensemble, max_steps, look)
-        with lock:
-            done += 1
-            if on_progress is not None:
-                on_progress(done)
-
-    with ThreadPoolExecutor(workers or os.cpu_count() or 1) as pool:
+    ensemble = _empty(output_times(t_end, output_dt), len(scenes))
+    run = _Run(scenes, t_end, tol, ensemble, on_progress, max_steps, end)
+    threads = workers or os.cpu_count() or 1
+    first, others = run.tasks(threads)
+    with ThreadPoolExecutor(threads) as pool:
         try:
-            # the first member alone: it compiles what all need
-            for index in range(min(1, len(scenes))):
-                run(index)
-            list(pool.map(run, range(1, len(scenes))))
+            # alone: it compiles what all need
+            for task in first:
+                task()
+            for done in [pool.submit(task) for task in others]:
+                done.result()
         except (OutOfTimeError, KeyboardInterrupt) as stop:
-            stopped.set()
+            run.stopped.set()
             pool.shutdown(cancel_futures=True)
             late = isinstance(stop, OutOfTimeError)
             what = f"max_wall_s = {max_wall_s:g} reached" if late else "interrupted"
-            message = f"{what} after {done} of {len(scenes)} members"
+            message = f"{what} after {run.done} of {len(scenes)} members"
             raise (LimitError if late else RunInterrupted)(message, ensemble, 0.0) from None
     return ensemble
 
 
-def _run_member(
-    scene: Scene,
-    index: int,
-    t_end: float,
-    tol: float,
-    work: Work,
-    ensemble: Ensemble,
-    max_steps: int,
-    look: Callable[[Motion], None],
-) -> None:
-    compiled = compile_scene(scene, tol)
-    motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
-    try:
-        status, rows = run_events(compiled, motion, ensemble.t, t_end, work, max_steps, look)
-    except OutOfTimeError:
-        ensemble.q[index, motion.rows :] = ensemble.v[index, motion.rows :] = np.nan
-        raise
-    ensemble.q[index, rows:] = ensemble.v[index, rows:] = np.nan
-    totals = motion.totals
-    ensemble.peak[index], ensemble.impulse[index] = totals.peak, totals.impulse
-    ensemble.time_in_contact[index], ensemble.makes[index] = totals.time_in_contact, totals.makes
-    ensemble.set_time[index], ensemble.events[index] = totals.set_time, totals.logged
-    ensemble.wear_depth[index] = motion.state.wear_depth
-    ensemble.steps[index], ensemble.status[index] = motion.state.steps, Status(status)
+#: Members in lanes that a thread takes at a time, at least: lanes stand empty while the last ones end.
+_LEAST_SHARE = 64
+#: Shares a thread, so that all threads end at about the same time.
+_SHARES = 4
+
+
+class _Run:
+    """The run of an ensemble: what its threads share."""
+
+    def __init__(
+        self,
+        scenes: Sequence[Scene],
+        t_end: float,
+        tol: float,
+        ensemble: Ensemble,
+        on_progress: Callable[[int], None] | None,
+        max_steps: int,
+        end: float,
+    ) -> None:
+        self._params, self._compiled = compile_scenes(scenes, tol)
+        self._t_end, self._ensemble, self._on_progress, self._max_steps = t_end, ensemble, on_progress, max_steps
+        self._end, self._local, self._lock = end, threading.local(), threading.Lock()
+        self.stopped, self.done = threading.Event(), 0
+
+    def tasks(self, threads: int) -> tuple[list[Callable[[], None]], list[Callable[[], None]]]:
+        """Return what is done first, alone, and what threads then share."""
+        groups: dict[object, list[int]] = {}
+        alone: list[Callable[[], None]] = []
+        for index, one in enumerate(self._compiled):
+            if fits_lanes(one):
+                groups.setdefault((one.parts.terms, int(self._params["order"][index])), []).append(index)
+            else:
+                alone.append(lambda index=index: self._run_alone(index))  # type: ignore[misc]
+        shares: list[Callable[[], None]] = []
+        members = sorted(index for group in groups.values() for index in group)
+        if members:
+            rows = self._ensemble.t, self._ensemble.q, self._ensemble.v
+            run = LaneRun(self._params, self._compiled, members, *rows, self._t_end, self._max_steps)
+            for group in groups.values():
+                size = max(_LEAST_SHARE, -(-len(group) // (_SHARES * threads)))
+                for start in range(0, len(group), size):
+                    share = np.array(group[start : start + size])
+                    shares.append(lambda share=share: self._run_lanes(run, share))  # type: ignore[misc]
+        return alone[:1], shares + alone[1:]
+
+    def _work(self) -> Work:
+        if not hasattr(self._local, "work"):
+            self._local.work = new_work()
+        work: Work = self._local.work
+        return work
+
+    def _look(self, motion: Motion | None = None) -> None:
+        if self.stopped.is_set() or _time.perf_counter() > self._end:
+            raise OutOfTimeError
+
+    def _tell(self, count: int) -> None:
+        with self._lock:
+            self.done += count
+            if self._on_progress is not None and count > 0:
+                self._on_progress(self.done)
+
+    def _run_lanes(self, run: LaneRun, share: NDArray[np.int64]) -> None:
+        """Run some members that fit the lanes."""
+        waiting = share
+        while len(waiting):
+            self._look()
+            left = run.go_on(waiting, self._work())
+            for index in np.setdiff1d(waiting, left, assume_unique=True).tolist():
+                self._take(index, run.totals[index], run.states[index], int(run.status[index]))
+            self._tell(len(waiting) - len(left))
+            waiting = left
+
+    def _run_alone(self, index: int) -> None:
+        """Run a member that takes a whole vector for its pairs."""
+        self._look()
+        compiled, ensemble = self._compiled[index], self._ensemble
+        motion = Motion.start(compiled, ensemble.q[index], ensemble.v[index])
+        status, _ = run_events(compiled, motion, ensemble.t, self._t_end, self._work(), self._max_steps, self._look)
+        self._take(index, motion.totals, motion.state, status)
+        self._tell(1)
+
+    def _take(self, index: int, totals: Totals, state: np.record | np.void, status: int) -> None:
+        """Take over what is told of a member that is done."""
+        ensemble = self._ensemble
+        ensemble.peak[index], ensemble.impulse[index] = totals["peak"], totals["impulse"]
+        ensemble.time_in_contact[index], ensemble.makes[index] = totals["time_in_contact"], totals["makes"]
+        ensemble.set_time[index], ensemble.events[index] = totals["set_time"], totals["logged"]
+        ensemble.wear_depth[index] = state["wear_depth"]
+        ensemble.steps[index], ensemble.status[index] = state["steps"], Status(status)
 
 
 def _empty(times: Array, members: int) -> Ensemble:

@@ -90,12 +90,13 @@ def run_events(
             motion.log = _grown(motion.log)
         elif code == Status.BUDGET and allowed < budget and look is not None:
             look(motion)
-            size = _next_slice(size, _time.perf_counter() - begin)
+            size = next_slice(size, _time.perf_counter() - begin)
         else:
             return code, motion.rows
 
 
-def _next_slice(size: int, took_s: float) -> int:
+def next_slice(size: int, took_s: float) -> int:
+    """Return the steps of the next slice of a run, from those of the last one and the time that it took."""
     return max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6)))))
 
 
@@ -128,7 +129,7 @@ def run_fixed(
                 return int(Status.BUDGET)
             if look is not None:
                 look(motion)
-            size = _next_slice(size, _time.perf_counter() - begin)
+            size = next_slice(size, _time.perf_counter() - begin)
         else:
             return code
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.errors import ArgumentError
 from plow_twin.model import geometry
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.model.loads import LoadSet, Pieces, compile_loads
-from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.model.scene import DOF_NAMES, Contact, Scene, Wear
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.model.scene import DOF_NAMES, Contact, Head, Scene, Wear
 from plow_twin.solve.method.implicit import OVERDAMPED_RATIO, new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
@@ -36,6 +38,7 @@ from plow_twin.solve.state import (
     X,
     Y,
     new_record,
+    new_records,
     state_type,
 )
 
@@ -52,6 +55,8 @@ MAX_EVENTS_AT_ONCE = 64
 #: Harmonics up to this share of what presses the head against its walls may let it rest (`method.small_harmonics`).
 _SMALL_HARMONICS = 1e-2
 
+_Found = TypeVar("_Found")
+
 _NO_TERMS = Terms(*[None] * len(Terms._fields))
 
 
@@ -67,20 +72,20 @@ class CompiledScene:
     def initial_state(self, time: float = 0.0, wear_depth: Array | None = None) -> State:
         """Return the scene's initial state, its pads worn by `wear_depth` [m] instead of the scene's initial depth."""
         state = new_record(state_type(self.parts.terms))
-        state.y[:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
-        if self.parts.terms.hysteretic is not None:
-            state.damping_factor[:] = self.scene.contact.damping or 0.0
+        self.start(state)
         if wear_depth is not None:
             state.wear_depth[:] = wear_depth
-        elif self.scene.wear is not None:
-            state.wear_depth[:] = self.scene.wear.initial_depth_m
         state.step_start = state.time = time
         settle_modes(self.params, state, self.parts.terms.stick)
         return state
 
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, Real)
+    def start(self, state: State | np.void) -> None:
+        """Write place, rates, damping and wear of the initial state to a record of zeros; its modes are not settled."""
+        state["y"][:] = geometry.state_of(self.scene, self.scene.initial.q, self.scene.initial.v)
+        if self.parts.terms.hysteretic is not None:
+            state["damping_factor"][:] = self.scene.contact.damping or 0.0
+        if self.scene.wear is not None:
+            state["wear_depth"][:] = self.scene.wear.initial_depth_m
 
 
 def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> CompiledScene:
@@ -99,26 +104,98 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     ArgumentError
         For a tolerance out of range.
     """
+    _check_tolerance(tol)
+    return _describe(scene, tol, sampled, _Shared()).compiled()
+
+
+def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void], list[CompiledScene]]:
+    """Compile many scenes at one tolerance: what they have in common, as an object, is computed once.
+
+    Returns
+    -------
+    params : ndarray of `PARAMS`, shape (m,)
+        Constants of all scenes in one block; zeros for those whose head carries corners.
+    compiled : list of CompiledScene
+        The scenes; their constants are the rows of `params`, or records of their own where the head carries corners.
+
+    Raises
+    ------
+    ArgumentError
+        For a tolerance out of range.
+    """
+    _check_tolerance(tol)
+    shared, params = _Shared(), new_records(PARAMS, len(scenes))
+    descriptions = [_describe(scene, tol, False, shared) for scene in scenes]
+    shares = [_params_type(scene) is PARAMS for scene in scenes]
+    for name in PARAMS.names or ():
+        there = [index for index, one in enumerate(descriptions) if shares[index] and name in one.values]
+        if there:
+            params[name][there] = [descriptions[index].values[name] for index in there]
+    rows = params.view(np.recarray)
+    return params, [one.compiled(rows[i] if shares[i] else None) for i, one in enumerate(descriptions)]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real)
+
+
+def _check_tolerance(tol: float) -> None:
     low, high = TOLERANCE_RANGE
     if not (_is_number(tol) and low <= tol <= high):
         raise ArgumentError(f"tol: got {tol!r}, expected a number from {low:g} to {high:g}")
-    loads = compile_loads(() if sampled else scene.loads)
+
+
+class _Shared:
+    """What scenes have in common, computed once for each object that it is made of."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Any, ...], tuple[Any, Any]] = {}
+
+    def of(self, compute: Callable[..., _Found], *sources: object) -> _Found:
+        """Return `compute` of the sources, computed before where it was."""
+        key = (compute, *map(id, sources))
+        if key not in self._known:
+            self._known[key] = sources, compute(*sources)  # the sources stay, and keep their identity
+        found: _Found = self._known[key][1]
+        return found
+
+
+@dataclass(frozen=True)
+class _Description:
+    """A scene in the solver's terms; `values` are the fields of its `PARAMS`."""
+
+    scene: Scene
+    values: dict[str, Any]
+    parts: Parts
+    loads: LoadSet
+
+    def compiled(self, params: Params | None = None) -> CompiledScene:
+        """Return the compiled scene, its constants in `params` or in a record of its own."""
+        if params is None:
+            params = new_record(_params_type(self.scene))
+            for name, value in self.values.items():
+                params[name] = value
+        return CompiledScene(self.scene, params, self.parts, self.loads)
+
+
+def _describe(scene: Scene, tol: float, sampled: bool, shared: _Shared) -> _Description:
+    loads = shared.of(compile_loads, () if sampled else scene.loads)
     mass, inertia = scene.head.mass_kg, scene.head.inertia_kg_m2
     gravity = scene.gravity.acceleration_m_s2
     constant = per_mass(scene, loads.constant)
     constant[1] -= gravity
     constant[2] -= mass * gravity * scene.gravity.arm_m / inertia
-    direction, harmonics = _harmonics(scene, loads)
-    terms, number = law_terms(scene.contact)
+    direction, harmonics = shared.of(_harmonics, scene.head, loads)
+    terms, number = shared.of(law_terms, scene.contact)
     length = geometry.length_scale(scene)
     speed = _velocity_scale(scene, loads, length)
     admissible = min(tol * (STEP_SHARE if terms.fraction is None else STEP_SHARE_FRACTION), LARGEST_STEP_ERROR)
     order, radius = order_for(admissible), geometry.half_diagonal(scene)
-    params, rows = new_record(_params_type(scene)), geometry.penetration_rows(scene)
+    rows = geometry.penetration_rows(scene)
     values: dict[str, Any] = dict(
         penetration_rows=rows,
         arm_rows=geometry.arm_rows(scene),
-        enabled=np.array([name in scene.pairs for name in PAIR_NAMES], dtype=np.int64),
+        enabled=[name in scene.pairs for name in PAIR_NAMES],
         inverse_mass=1.0 / mass,
         inverse_inertia=1.0 / inertia,
         stiffness=float(scene.contact.stiffness),
@@ -132,15 +209,15 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
         direction=direction,
         order=order,
         lacuna=_lacuna(scene.contact.exponent),
-        threshold=speed * admissible ** (np.arange(MAX_ORDER + 1) / order),
+        threshold=speed * shared.of(_thresholds, admissible, order),
         velocity_tolerance=tol * speed,
         position_tolerance=tol * length,
         weight=radius * speed / length,
         radius=radius,
         release=0.0 if terms.fraction is None else _release(scene, tol, length, speed),
-        wear_per_impulse=0.0 if scene.wear is None else wear_rate(scene.wear, scene.wear.travel_speed_m_s),
+        wear_per_impulse=_wear_rates(scene.wear),
         offset=scene.head.com_offset_m,
-        free=np.array([float(name not in scene.locked) for name in DOF_NAMES]),
+        free=[float(name not in scene.locked) for name in DOF_NAMES],
         fastest=float(loads.omega.max(initial=0.0)),
         leverage=float(np.hypot(rows[0], rows[1]).max()),
         half_cavity=0.5 * float(geometry.wall_distances(scene).min()),
@@ -148,13 +225,12 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
     )
     if scene.head.carries == "corners":
         values["tumbles"] = float(geometry.tumbles(scene))
-    for name, value in (values | _rubbing(scene) | _slip(scene) | _frame(scene)).items():
-        params[name] = value
+    values |= _rubbing(scene) | _slip(scene) | _frame(scene)
     segments = _segments(scene, loads.pieces) if loads.pieces is not None else None
     if sampled:
         segments = np.zeros(1, SEGMENT)
     terms = _scene_terms(scene, terms, loads, harmonics, segments)
-    return CompiledScene(scene, params, Parts(terms, harmonics, segments, _implicit(scene, terms, params)), loads)
+    return _Description(scene, values, Parts(terms, harmonics, segments, _implicit(scene, terms, values)), loads)
 
 
 def _params_type(scene: Scene) -> np.dtype[np.void]:
@@ -189,6 +265,10 @@ def _scene_terms(
     return law._replace(**_flags(present))
 
 
+def _wear_rates(wear: Wear | None) -> list[float]:
+    return [0.0 if wear is None else wear_rate(wear, wear.travel_speed_m_s)] * PAIR_COUNT
+
+
 def _wear_terms(wear: Wear | None) -> dict[str, bool]:
     if wear is None or wear.coefficient_m2_n == 0.0:
         return {"wear": False}
@@ -213,6 +293,12 @@ def _initial_depth(scene: Scene) -> float:
     y = geometry.state_of(scene, scene.initial.q, scene.initial.v)
     rows = geometry.penetration_rows(scene)
     return max(float((np.array([y[COS], y[SIN], y[X], y[Y], 1.0]) @ rows).max()), 0.0)
+
+
+def _thresholds(admissible: float, order: int) -> Array:
+    """Return the admissible size of each term over that of the first."""
+    sizes: Array = admissible ** (np.arange(MAX_ORDER + 1) / order)
+    return sizes
 
 
 def order_for(admissible: float) -> int:
@@ -266,12 +352,13 @@ def _flags(present: dict[str, bool]) -> dict[str, int]:
     return {name: 1 for name, there in present.items() if there}
 
 
-def _harmonics(scene: Scene, loads: LoadSet) -> tuple[Array, Harmonics | None]:
+def _harmonics(head: Head, loads: LoadSet) -> tuple[Array, Harmonics | None]:
     """Return directions and harmonic loads: one direction (no S2) when all forces are parallel, else x and y."""
     if loads.omega.size == 0:
         return np.eye(2), None
     # (h, 2, 3): sine and cosine amplitudes of Fx, Fy, M
-    amplitudes = np.stack([per_mass(scene, loads.sine), per_mass(scene, loads.cosine)], axis=1)
+    inertias = np.array([head.mass_kg, head.mass_kg, head.inertia_kg_m2])
+    amplitudes = np.stack([loads.sine / inertias, loads.cosine / inertias], axis=1)
     acting = amplitudes.any(axis=(1, 2))
     if not acting.any():
         return np.eye(2), None
@@ -325,25 +412,27 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     return release
 
 
-def _implicit(scene: Scene, terms: Terms, params: Params) -> Implicit | None:
+def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | None:
     """Return what implicit steps need, where a contact's damping can outweigh its spring."""
     contact = scene.contact
-    mobility = 1.0 / scene.head.mass_kg + float(params.radius) ** 2 / scene.head.inertia_kg_m2
-    mobility += float(params.frame_mobility[0] + params.radius**2 * params.frame_mobility[2])
-    largest_force = scene.head.mass_kg * params.threshold[0] ** 2 / geometry.length_scale(scene)
+    mobility = 1.0 / scene.head.mass_kg + values["radius"] ** 2 / scene.head.inertia_kg_m2
+    if scene.support is not None:
+        mobility += float(values["frame_mobility"][0] + values["radius"] ** 2 * values["frame_mobility"][2])
+    largest_force = scene.head.mass_kg * values["threshold"][0] ** 2 / geometry.length_scale(scene)
     depth = max((largest_force / contact.stiffness) ** (1.0 / contact.exponent), _initial_depth(scene))
     largest_force = contact.stiffness * depth**contact.exponent
     spring = contact.exponent * largest_force / depth
-    damping = params.stick_damping
+    damping = values.get("stick_damping", 0.0)
     if terms.viscous is not None:
-        damping += params.viscous
+        damping += values["viscous"]
     elif terms.hysteretic is not None:
-        damping += largest_force * (contact.damping or params.damping_number / params.speed_floor)
+        damping += largest_force * (contact.damping or values["damping_number"] / values["speed_floor"])
     if terms.slip is not None:
-        damping += params.friction * largest_force / params.slip_speed
+        damping += values["friction"] * largest_force / values["slip_speed"]
     overdamped = damping * mobility > OVERDAMPED_RATIO * math.sqrt(spring * mobility)
     # or those of a support
-    overdamped |= bool((params.frame_damping > OVERDAMPED_RATIO * np.sqrt(params.frame_stiffness)).any())
+    if scene.support is not None:
+        overdamped |= bool((values["frame_damping"] > OVERDAMPED_RATIO * np.sqrt(values["frame_stiffness"])).any())
     return new_implicit(scene.support is not None) if overdamped else None
 
 

@@ -148,6 +148,13 @@ def settle_moved(params, states, which, places, time, stick) -> None:
                 state.damping_factor[pair] = damping[pair]
 
 
+@kernel(entry=True)
+def settle_many(params, states, members) -> None:
+    """Do the work of `settle_modes` for some of many scenes without friction that sticks."""
+    for member in members:
+        settle_modes(params[member], states[member], None)
+
+
 @kernel(inline="source")
 def any_penetrates(state) -> bool:
     """Tell whether any pair is inside its wall, with or without force."""

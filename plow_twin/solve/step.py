@@ -30,9 +30,9 @@ METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
 #: How far in sigma a step goes past an instant at which modes flip without end.
-_PAST_AN_INSTANT = 1e-9
+PAST_AN_INSTANT = 1e-9
 #: Two times in s closer than this share of them are one instant: some roundings.
-_ONE_INSTANT = 1e-15
+ONE_INSTANT = 1e-15
 
 
 @kernel()
@@ -91,7 +91,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
     if pair >= 0 and state.events_at_once > p.max_events:
         # modes flip at one instant: go on past it with the modes as they are
         state.recoveries += 1
-        end, pair = max(end, min(sigma, _PAST_AN_INSTANT)), -1
+        end, pair = max(end, min(sigma, PAST_AN_INSTANT)), -1
     turn = turn_at(p, state, w, order, end)
     if turn < end:
         end, pair = turn, -1
@@ -123,7 +123,7 @@ def complete_step(p, harmonics, flight, support, state, w, totals, log, wear, fr
     state.time = state.step_start
     state.step_size = -1.0
     state.elapsed = 0.0
-    at_once = state.step_start - before <= _ONE_INSTANT * (1.0 + abs(before))
+    at_once = state.step_start - before <= ONE_INSTANT * (1.0 + abs(before))
     if not at_once:
         state.last_step_size = state.step_start - before
     touching = state.touching if at_once else 0

@@ -83,7 +83,7 @@ def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
     """Lay out a step of free flight, where it is longer than one of a series."""
     if own is None:
         return False
-    size = 0.0 if penetrating else _safe_time(p, parts.harmonics, state, w, span)
+    size = 0.0 if penetrating else safe_time(p, parts.harmonics, state, w, span)
     state.in_flight = 1 if size > 0.0 else 0
     state.sigma_end, state.order = size, 1
     state.ends_at_stop = 1 if size == span else 0
@@ -91,7 +91,7 @@ def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
 
 
 @kernel()
-def _safe_time(p, harmonics, state, w, span) -> float:
+def safe_time(p, harmonics, state, w, span) -> float:
     """Return a time of at most `span` within which no wall can be reached, or 0 where a series serves as well."""
     least = _LEAST_PHASE / p.fastest
     if span < least:

@@ -30,14 +30,29 @@ _DEEP = 1e-7
 AT_REST = 5 + EVALUATIONS
 
 
+@kernel(inline="source")
+def _gyration(p) -> float:
+    return math.sqrt(p.inverse_mass / p.inverse_inertia)
+
+
+@kernel(inline="source")
+def _speed(p, y) -> float:
+    return math.hypot(math.hypot(y[VX], y[VY]), _gyration(p) * y[OMEGA])
+
+
+@kernel(inline="source")
+def slow_enough(p, y) -> bool:
+    """Tell whether a head may be at rest by its speed."""
+    return bool(_speed(p, y) <= 0.5 * _SHARE * p.velocity_tolerance)
+
+
 @kernel()
 def _still(p, acts, harmonics, state, w) -> bool:
     """Tell whether the head stays within the share of the tolerances for all time; bring it to rest then."""
     y, z, rate = state.y, w.rest[0], w.rest[1]
-    gyration = math.sqrt(p.inverse_mass / p.inverse_inertia)
-    speed = math.hypot(math.hypot(y[VX], y[VY]), gyration * y[OMEGA])
+    gyration, speed = _gyration(p), _speed(p, y)
     way, fast = _SHARE * p.position_tolerance, _SHARE * p.velocity_tolerance
-    if speed > 0.5 * fast or not held(p, state, y, max(_MARGIN * way, _DEEP)):
+    if not slow_enough(p, y) or not held(p, state, y, max(_MARGIN * way, _DEEP)):
         return False
     to_world(p, y, z)
     z[3] = z[4] = z[5] = 0.0

@@ -163,7 +163,7 @@ def run_members_of(
 ) -> Array:
     """Compute members, by number; return shape (k, 1 + statistics): status, then the statistics.
 
-    Every member has the bits of its single run, whichever chunk, thread or machine of the same build computes it.
+    A member has the same bits whichever chunk, thread or machine of the same build computes it.
     """
     scene = replace(sweep.scene(), marks={})
     table = np.full((len(members), 1 + len(sweep.statistics)), np.nan)

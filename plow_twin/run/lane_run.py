@@ -1,0 +1,111 @@
+"""Scenes in the lanes of a SIMD vector, in slices; steps of other methods through the loop of a single scene."""
+
+from __future__ import annotations
+
+import time as _time
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.run.motion import Motion, next_slice, run_events
+from plow_twin.solve.compiled_scene import CompiledScene
+from plow_twin.solve.lanes.loop import OTHER_METHOD, Members, run_lanes
+from plow_twin.solve.lanes.record import new_lanes
+from plow_twin.solve.modes import settle_many
+from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, new_records
+
+#: Steps that each lane takes in the first slice.
+_FIRST_SLICE: Final = 256
+#: Steps that the loop of a single scene takes at most when a lane needs one of another method: a call takes as long as
+#: some thirty steps.
+_OTHER_STEPS: Final = 32
+_UNDER_WAY: Final = (int(Status.PAUSED), OTHER_METHOD)
+
+
+class LaneRun:
+    """The members of an ensemble that run in lanes.
+
+    Parameters
+    ----------
+    params : ndarray of `PARAMS`, shape (m,)
+    compiled : sequence of CompiledScene
+        All members.
+    members : sequence of int
+        Those that run here.
+    times : ndarray, shape (n,)
+        Times of the rows in s.
+    q, v : ndarray, shape (m, n, 3)
+        Receive the rows.
+    t_end : float
+        End in s.
+    max_steps : int
+        Steps that each member may take.
+    """
+
+    def __init__(
+        self,
+        params: NDArray[np.void],
+        compiled: Sequence[CompiledScene],
+        members: Sequence[int],
+        times: NDArray[np.float64],
+        q: NDArray[np.float64],
+        v: NDArray[np.float64],
+        t_end: float,
+        max_steps: int,
+    ) -> None:
+        count = len(compiled)
+        self._compiled, self._times, self._t_end, self._max_steps = compiled, times, t_end, max_steps
+        self._size = _FIRST_SLICE
+        self.states, self.totals = new_records(STATE, count), np.zeros(count, TOTALS)
+        self.status = np.full(count, int(Status.PAUSED))
+        for index in members:
+            compiled[index].start(self.states[index])
+        settle_many(params, self.states, np.array(members))
+        self._members = Members(
+            params, self.states, self.totals, *_joined(compiled, members), self.status, np.zeros(count, np.int64),
+            q, v,
+        )  # fmt: skip
+
+    def go_on(self, waiting: NDArray[np.int64], work: Work) -> NDArray[np.int64]:
+        """Bring members farther by a slice of work; return those that are not done."""
+        one, begin = self._compiled[waiting[0]], _time.perf_counter()
+        terms = one.parts.terms
+        run_lanes(
+            self._members, terms.harmonics, terms.second, terms.viscous, terms.flight, terms.rest,
+            int(one.params.order), new_lanes(), work, waiting, self._t_end, self._max_steps, self._size, self._times,
+        )  # fmt: skip
+        self._size = next_slice(self._size, _time.perf_counter() - begin)
+        for index in waiting[self.status[waiting] == OTHER_METHOD].tolist():
+            self._take_other_steps(index, work)
+        return waiting[np.isin(self.status[waiting], _UNDER_WAY)]
+
+    def _take_other_steps(self, index: int, work: Work) -> None:
+        """Let the loop of a single scene take some steps of a member."""
+        members = self._members
+        state, totals = self.states.view(np.recarray)[index], self.totals.view(np.recarray)[index]
+        motion = Motion(state, totals, np.zeros(16 * _OTHER_STEPS, EVENT), members.q[index], members.v[index])
+        motion.first = members.first[index : index + 1]
+        logged, totals.logged = int(totals.logged), 0
+        budget = min(self._max_steps, int(state.steps) + _OTHER_STEPS)
+        status, _ = run_events(self._compiled[index], motion, self._times, self._t_end, work, budget)
+        totals.logged += logged
+        more = status == Status.BUDGET and budget < self._max_steps
+        self.status[index] = int(Status.PAUSED) if more else status
+
+
+def _joined(compiled: Sequence[CompiledScene], members: Sequence[int]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    """Return the harmonics of all members in one array; shape (m, 2): where those of each begin, and their number."""
+    parts, extent, begin = [np.zeros(0, HARMONIC)], np.zeros((len(compiled), 2), np.int64), 0
+    known: dict[int, tuple[int, int]] = {}
+    for index in members:
+        harmonics = compiled[index].parts.harmonics
+        if harmonics is None:
+            continue
+        if id(harmonics) not in known:
+            known[id(harmonics)] = begin, len(harmonics)
+            parts.append(harmonics)
+            begin += len(harmonics)
+        extent[index] = known[id(harmonics)]
+    return np.concatenate(parts), extent

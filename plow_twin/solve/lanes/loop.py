@@ -1,0 +1,333 @@
+"""The loop over lanes: each takes its own steps through its own scene, and the next scene when that is done."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.kernel.arrays import unowned
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import below, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.kinematics import pose_of
+from plow_twin.solve.lanes.events import first_events, note_switches
+from plow_twin.solve.lanes.record import (
+    COMPONENTS,
+    WIDTH,
+    load_lane,
+    note_modes,
+    penetration_at,
+    save_lane,
+    weigh_lanes,
+)
+from plow_twin.solve.lanes.series import accurate_steps, expand, expand_loads
+from plow_twin.solve.lanes.totals import add_step, sum_step
+from plow_twin.solve.lanes.waves import turn_lanes
+from plow_twin.solve.method.flight import safe_time
+from plow_twin.solve.method.rest import slow_enough
+from plow_twin.solve.modes import LARGEST_ANGLE, within_range
+from plow_twin.solve.state import COS, OFF, OMEGA, SIN, THETA, VX, VY, Status, X, Y
+from plow_twin.solve.step import LONGEST_STEP, ONE_INSTANT, PAST_AN_INSTANT
+
+
+class Members(NamedTuple):
+    """Arrays of all scenes of a run, whose first axis numbers the scenes."""
+
+    params: NDArray[np.void]
+    states: NDArray[np.void]
+    totals: NDArray[np.void]
+    harmonics: NDArray[np.void]  #: of all scenes, one after the other
+    extent: NDArray[np.int64]  #: where the harmonics of each scene begin, and their number
+    status: NDArray[np.int64]
+    first: NDArray[np.int64]  #: rows written
+    q: NDArray[np.float64]
+    v: NDArray[np.float64]
+
+
+_OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
+_BUDGET, _PAUSED = int(Status.BUDGET), int(Status.PAUSED)
+#: Internal: the next step is one of another method; the scene has reached the end.
+OTHER_METHOD: Final = 6
+_DONE: Final = 7
+
+
+@kernel()
+def _lane_in_range(lanes, p, state, lane) -> bool:
+    for i in range(COMPONENTS):
+        state.y[i] = lanes.y[i, lane]
+    return within_range(p, state, state.y)
+
+
+@kernel()
+def _bits_in_range(lanes):
+    """Return a bit for each lane in which surely the model holds (`modes.within_range`)."""
+    c, s = exact_row(lanes.y, COS), exact_row(lanes.y, SIN)
+    bits = below(magnitude(exact_row(lanes.y, THETA)), exact_splat(LARGEST_ANGLE))
+    for pair in range(PAIR_COUNT):
+        along = exact_row(lanes.y, X if pair % 2 == 1 else Y)
+        bits &= below(penetration_at(lanes, pair, c, s, along), exact_row(lanes.half_cavity, 0))
+    return bits
+
+
+@kernel()
+def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, span) -> bool:
+    """Tell whether the next step of a lane may be one of free flight or of rest, which the lanes do not take."""
+    if lanes.inside[lane] == 0:
+        if flight is not None:
+            for j in range(3):
+                w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
+            _write_state(state, lanes, lane)
+            first = extent[0]
+            return safe_time(p, harmonics[first : first + extent[1]], state, w, span) > 0.0
+        return False
+    if rest is not None:
+        _write_state(state, lanes, lane)
+        return slow_enough(p, state.y)
+    return False
+
+
+@kernel()
+def _write_state(state, lanes, lane) -> None:
+    for i in range(COMPONENTS):
+        state.y[i] = lanes.y[i, lane]
+    state.step_start = lanes.time[lane]
+
+
+@kernel()
+def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int:
+    """Return `OK` where the scene in a lane takes its next step there, else the status it leaves with."""
+    member = lanes.member[lane]
+    p, state = members.params[member], members.states[member]
+    if not in_range and not _lane_in_range(lanes, p, state, lane):
+        return _RANGE
+    if lanes.time[lane] >= t_end:
+        return _DONE
+    if state.steps >= budget:
+        return _BUDGET
+    lanes.whole[lane] = min(t_end - lanes.time[lane], LONGEST_STEP)
+    if _another_method(
+        p, members.harmonics, members.extent[member], flight, rest, state, lanes, lane, w, lanes.whole[lane]
+    ):
+        return OTHER_METHOD
+    return _OK
+
+
+@kernel()
+def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
+    """Fill the rows within a lane's step from row i on, eight instants at once; return the first row after it."""
+    last, begin, sigma = i, lanes.time[lane], lanes.root
+    while last < t.size and t[last] < end:
+        last += 1
+    while i < last:
+        count = min(last - i, WIDTH)
+        for j in range(WIDTH):
+            sigma[j] = max(t[i + min(j, count - 1)] - begin, 0.0)
+        at = exact_row(sigma, 0)
+        for component in range(COMPONENTS):
+            series = lanes.series[component]
+            value = exact_splat(series[order, lane])
+            for k in range(order - 1, -1, -1):
+                value = fused(value, at, exact_splat(series[k, lane]))
+            set_row(lanes.out, component, value)
+        _turn(lanes.out, X, Y)
+        _turn(lanes.out, VX, VY)
+        for j in range(count):
+            q[i + j, 0], q[i + j, 1], q[i + j, 2] = lanes.out[X, j], lanes.out[Y, j], lanes.out[THETA, j]
+            v[i + j, 0], v[i + j, 1], v[i + j, 2] = lanes.out[VX, j], lanes.out[VY, j], lanes.out[OMEGA, j]
+        i += count
+    return i
+
+
+@kernel()
+def _turn(out, first, second) -> None:
+    """Resolve a vector at eight instants along world axes."""
+    c, s, x, y = exact_row(out, COS), exact_row(out, SIN), exact_row(out, first), exact_row(out, second)
+    set_row(out, first, fused(c, x, s * y * -1.0))
+    set_row(out, second, fused(s, x, c * y))
+
+
+@kernel()
+def _part(state, sums, lanes, lane) -> None:
+    """Let clipped pairs that part within a lane's step do so."""
+    for pair in range(PAIR_COUNT):
+        if lanes.parted[pair, lane] < lanes.step[lane]:
+            lanes.mode[pair, lane] = OFF
+            state.events += 1
+            sums.logged += 1
+
+
+@kernel()
+def _switch(state, sums, lanes, lane) -> None:
+    """Let the pairs of a lane change their modes at the step's end."""
+    for pair in range(PAIR_COUNT):
+        new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
+        if new < 0:
+            continue
+        lanes.mode[pair, lane] = new
+        state.events += 1
+        if old == OFF:
+            sums.makes[pair] += 1
+        sums.logged += 1
+
+
+@kernel(inline="source")
+def _end_of(lanes, lane, t_end):
+    """Return the time at which a lane's step ends."""
+    if lanes.ends_at_stop[lane] == 1 and lanes.whole[lane] < LONGEST_STEP:
+        return t_end
+    return lanes.time[lane] + lanes.step[lane]
+
+
+@kernel()
+def _complete(p, state, sums, lanes, lane, order, t_end) -> None:
+    """Move a lane to the end of its step: time, counts and modes; its state has been moved."""
+    begin, parted = lanes.time[lane], False
+    state.steps += 1
+    state.evaluations += order
+    for pair in range(PAIR_COUNT):
+        parted |= lanes.parted[pair, lane] < lanes.step[lane]
+    if parted:
+        _part(state, sums, lanes, lane)
+    end = _end_of(lanes, lane, t_end)
+    lanes.time[lane] = end
+    at_once = end - begin <= ONE_INSTANT * (1.0 + abs(begin))
+    if not at_once:
+        state.last_step_size = end - begin
+    if lanes.event[lane] < 0:
+        state.events_at_once = 0
+        if not parted:
+            return
+    else:
+        state.events_at_once = state.events_at_once + 1 if at_once else 0
+        _switch(state, sums, lanes, lane)
+    note_modes(p, lanes, lane)
+    lanes.stale[0] = 1
+
+
+@kernel()
+def _move(lanes) -> None:
+    """Add the changes over the steps to the states; set cosine and sine from the angle anew."""
+    for component in range(COMPONENTS):
+        set_row(lanes.y, component, exact_row(lanes.y, component) + exact_row(lanes.change, component))
+    turn_lanes(lanes.y[THETA], lanes.y[COS], lanes.y[SIN])
+
+
+@kernel()
+def _go_past_an_instant(members, lanes) -> None:
+    """Go on past an instant at which modes flip without end, with the modes as they are."""
+    for lane in range(WIDTH):
+        member = lanes.member[lane]
+        if member >= 0 and lanes.event[lane] >= 0:
+            lanes.ends_at_stop[lane] = 0
+            state = members.states[member]
+            if state.events_at_once > members.params[member].max_events:
+                state.recoveries += 1
+                lanes.step[lane] = max(lanes.step[lane], min(lanes.accurate[lane], PAST_AN_INSTANT))
+                lanes.event[lane] = -1
+
+
+@kernel()
+def _leave(members, lanes, lane, code, t) -> None:
+    """Take the scene out of a lane, with its status; at the end write the rows that are left."""
+    member = lanes.member[lane]
+    p, state = members.params[member], members.states[member]
+    save_lane(state, members.totals[member], lanes, lane)
+    members.status[member] = _OK if code == _DONE else code
+    if code != _DONE:
+        return
+    i = members.first[member]
+    while i < t.size:
+        pose_of(p, state.y, None, members.q[member, i], members.v[member, i])
+        i += 1
+    members.first[member] = i
+
+
+@kernel(inline="source")
+def _unowned_members(members):
+    """Return the arrays of all scenes without counting who holds them."""
+    return Members(
+        unowned(members.params),
+        unowned(members.states),
+        unowned(members.totals),
+        unowned(members.harmonics),
+        unowned(members.extent),
+        unowned(members.status),
+        unowned(members.first),
+        unowned(members.q),
+        unowned(members.v),
+    )
+
+
+@kernel(entry=True)
+def run_lanes(
+    members, waves, second, viscous, flight, rest, order, lanes, w, queue, t_end, budget, iterations, t
+) -> bool:
+    """Take the members numbered in `queue` to `t_end`, eight at a time; return False where `iterations` are used up.
+
+    `t` are the times of the rows, `order` that of the series, `budget` the steps that each scene may take. A scene
+    leaves its lane with a `Status`, `OTHER_METHOD` or, where the iterations are used up, `PAUSED`.
+    """
+    members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
+    waiting = 0
+    for _ in range(iterations):
+        in_range, live = _bits_in_range(lanes), 0
+        for lane in range(WIDTH):
+            sure = in_range >> lane & 1 == 1
+            while True:
+                if lanes.member[lane] < 0:
+                    if waiting == queue.size:
+                        break
+                    member = queue[waiting]
+                    waiting += 1
+                    load_lane(
+                        members.params[member], members.states[member], members.totals[member], lanes, lane, member
+                    )
+                    sure, lanes.stale[0] = False, 1
+                code = _look(members, flight, rest, lanes, lane, w, t_end, budget, sure)
+                if code == _OK:
+                    live += 1
+                    break
+                _leave(members, lanes, lane, code, t)
+        if live == 0:
+            return True
+        if lanes.stale[0] == 1:
+            weigh_lanes(lanes)
+            lanes.stale[0] = 0
+        _step(members, waves, second, viscous, order, lanes, w, t_end, t)
+    for lane in range(WIDTH):
+        if lanes.member[lane] >= 0:
+            _leave(members, lanes, lane, _PAUSED, t)
+    return False
+
+
+@kernel()
+def _step(members, waves, second, viscous, order, lanes, w, t_end, t) -> None:
+    """Take one step in each lane."""
+    if waves is not None:
+        expand_loads(members.harmonics, members.extent, second, lanes, w, order)
+    expand(lanes, w, order, waves, second, viscous)
+    infinite = accurate_steps(members.params, lanes, order)
+    if infinite != 0:
+        for lane in range(WIDTH):
+            if infinite >> lane & 1:
+                _leave(members, lanes, lane, _NON_FINITE, t)
+    first_events(members.states, lanes, w, order, viscous)
+    _go_past_an_instant(members, lanes)
+    note_switches(lanes, order, viscous)
+    sum_step(lanes, w, order)
+    add_step(members.totals, lanes, w, order, viscous)
+    for lane in range(WIDTH):
+        member = lanes.member[lane]
+        if member >= 0 and members.first[member] < t.size:
+            first, end = members.first[member], _end_of(lanes, lane, t_end)
+            if t[first] < end:
+                members.first[member] = _fill_rows(
+                    lanes, lane, order, t, first, end, members.q[member], members.v[member]
+                )
+    _move(lanes)
+    for lane in range(WIDTH):
+        member = lanes.member[lane]
+        if member >= 0:
+            _complete(members.params[member], members.states[member], members.totals[member], lanes, lane, order, t_end)

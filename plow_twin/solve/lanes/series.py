@@ -1,0 +1,258 @@
+"""Taylor series of eight scenes side by side, contact modes frozen (equations in `method.series`).
+
+Where the contacts' force is linear in penetration and rate, all acting pairs of a scene are one affine map of the
+state: an order takes twelve Cauchy products, however many pairs act and whichever they are.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import choose, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, damped_at, penetration_at
+from plow_twin.solve.lanes.waves import turn_lanes
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
+
+#: A term beyond this is not finite, or will not be when it is multiplied.
+_FINITE = 1e300
+
+
+@kernel()
+def _gather_harmonic(harmonics, extent, lanes, i) -> None:
+    """Write number `i` of each lane's harmonics to `lanes.harmonic`: zeros where a scene has fewer."""
+    there = lanes.harmonic
+    for lane in range(WIDTH):
+        member = lanes.member[lane]
+        if member >= 0 and i < extent[member, 1]:
+            one = harmonics[extent[member, 0] + i]
+            there[0, lane], there[9, lane] = one.omega, one.omega * lanes.time[lane]
+            for j in range(2):
+                there[3 + j, lane], there[5 + j, lane] = one.first[j], one.second[j]
+                there[7 + j, lane] = one.moment[j]
+        else:
+            for j in range(10):
+                there[j, lane] = 0.0
+    turn_lanes(there[9], there[2], there[1])
+
+
+@kernel()
+def _add_wave(load, k, lanes, first, sine, cosine) -> None:
+    """Add order k of a harmonic, its amplitudes in rows `first` and the next, to one of the loads."""
+    wave = fused(exact_row(lanes.harmonic, first), sine, exact_row(load, k))
+    set_row(load, k, fused(exact_row(lanes.harmonic, first + 1), cosine, wave))
+
+
+@kernel()
+def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
+    """Write the series of the harmonic loads S1, S2, M of each lane's scene.
+
+    sin and cos follow from one another. `extent` (n, 2) tells where each scene's harmonics begin, and their number.
+    """
+    zero, most = exact_splat(0.0), 0
+    for k in range(order):
+        for j in range(3):
+            set_row(lanes.load[j], k, zero)
+    for lane in range(WIDTH):
+        if lanes.member[lane] >= 0:
+            most = max(most, extent[lanes.member[lane], 1])
+    for i in range(most):
+        _gather_harmonic(harmonics, extent, lanes, i)
+        omega, sine, cosine = (exact_row(lanes.harmonic, 0), exact_row(lanes.harmonic, 1), exact_row(lanes.harmonic, 2))
+        for k in range(order):
+            _add_wave(lanes.load[0], k, lanes, 3, sine, cosine)
+            if second is not None:
+                _add_wave(lanes.load[1], k, lanes, 5, sine, cosine)
+            _add_wave(lanes.load[2], k, lanes, 7, sine, cosine)
+            scale = omega * w.inverse[k + 1]
+            sine, cosine = scale * cosine, scale * sine * -1.0
+
+
+@kernel()
+def expand(lanes, w, order, waves, second, viscous) -> None:
+    """Write the series of the state up to `order`, and those of `lanes.turning` up to the order before."""
+    series, turning, moment = lanes.series, lanes.turning, lanes.moment
+    zero = exact_splat(0.0)
+    x0, y0, vx0, vy0 = (exact_row(lanes.y, X), exact_row(lanes.y, Y), exact_row(lanes.y, VX), exact_row(lanes.y, VY))
+    om0, c0, s0, angle = (
+        exact_row(lanes.y, OMEGA), exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, THETA),
+    )  # fmt: skip
+    x, y, vx, vy, om, c, s = x0, y0, vx0, vy0, om0, c0, s0
+    start_x, start_y = exact_row(lanes.constant, 0), exact_row(lanes.constant, 1)
+    m, i = exact_row(lanes.inverse_mass, 0), exact_row(lanes.inverse_inertia, 0)
+    along, turn, load, direction = lanes.along, lanes.turn, lanes.load, lanes.direction
+    for k in range(order):
+        _set_state(series, k, x, y, vx, vy, om, c, s, angle)
+        # a product's newest orders come last: most of the sum need not wait for them
+        px = py = pvx = pvy = pc = ps = zero
+        for j in range(1, k):
+            turned = exact_row(series[OMEGA], j)
+            px = fused(turned, exact_row(series[X], k - j), px)
+            py = fused(turned, exact_row(series[Y], k - j), py)
+            pvx = fused(turned, exact_row(series[VX], k - j), pvx)
+            pvy = fused(turned, exact_row(series[VY], k - j), pvy)
+            pc = fused(turned, exact_row(series[COS], k - j), pc)
+            ps = fused(turned, exact_row(series[SIN], k - j), ps)
+        share = 0.0 if k == 0 else 1.0  # order 0 is one product, not two
+        early = om0 * share
+        px, py = fused(om, x0, fused(early, x, px)), fused(om, y0, fused(early, y, py))
+        pvx, pvy = fused(om, vx0, fused(early, vx, pvx)), fused(om, vy0, fused(early, vy, pvy))
+        pc, ps = fused(om, c0, fused(early, c, pc)), fused(om, s0, fused(early, s, ps))
+        dx, dy, dc, ds = vx + py, vy - px, ps * -1.0, pc
+        set_row(turning[DC], k, dc)
+        set_row(turning[DS], k, ds)
+        set_row(turning[DX], k, dx)
+        set_row(turning[DY], k, dy)
+        ax, ay = fused(start_x, c, fused(start_y, s, pvy)), fused(start_y, c, (fused(start_x, s, pvx)) * -1.0)
+        turned_by = exact_row(lanes.constant, 2) * (1.0 - share)
+        if waves is not None:
+            wc, ws = _waves(load[0], series, k, c0, s0, c, s, share)
+            ax = fused(exact_row(direction, 0), wc, fused(exact_row(direction, 1), ws, ax))
+            ay = fused(exact_row(direction, 1), wc, fused(exact_row(direction, 0), ws * -1.0, ay))
+            if second is not None:
+                wc, ws = _waves(load[1], series, k, c0, s0, c, s, share)
+                ax = fused(exact_row(direction, 2), wc, fused(exact_row(direction, 3), ws, ax))
+                ay = fused(exact_row(direction, 3), wc, fused(exact_row(direction, 2), ws * -1.0, ay))
+            turned_by = turned_by + exact_row(load[2], k)
+        if k == 0:
+            _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy)
+            fx, fy, gc, gs = (
+                exact_row(lanes.start, 0), exact_row(lanes.start, 1), exact_row(lanes.start, 2),
+                exact_row(lanes.start, 3),
+            )  # fmt: skip
+        else:
+            fx = _force(along[0], viscous, c, s, x, dc, ds, dx)
+            fy = _force(along[1], viscous, c, s, y, dc, ds, dy)
+            gc = _lever(turn[0], viscous, c, s, x, y, dc, ds, dx, dy)
+            gs = _lever(turn[1], viscous, c, s, x, y, dc, ds, dx, dy)
+        gx, gy = fy * -1.0, fx
+        set_row(moment[DC], k, gc)
+        set_row(moment[DS], k, gs)
+        set_row(moment[DX], k, gx)
+        set_row(moment[DY], k, gy)
+        torque, other = zero, zero
+        for j in range(1, k):
+            torque = fused(exact_row(series[COS], j), exact_row(moment[DC], k - j), torque)
+            other = fused(exact_row(series[SIN], j), exact_row(moment[DS], k - j), other)
+            torque = fused(exact_row(series[X], j), exact_row(moment[DX], k - j), torque)
+            other = fused(exact_row(series[Y], j), exact_row(moment[DY], k - j), other)
+        torque = fused(c * share, exact_row(moment[DC], 0), fused(x * share, exact_row(moment[DX], 0), torque))
+        other = fused(s * share, exact_row(moment[DS], 0), fused(y * share, exact_row(moment[DY], 0), other))
+        torque = fused(c0, gc, fused(x0, gx, torque)) + fused(s0, gs, fused(y0, gy, other))
+        ax, ay, turned_by = fused(m, fx, ax), fused(m, fy, ay), fused(i, torque, turned_by)
+        part = w.inverse[k + 1]
+        x, y, vx, vy, c, s = dx * part, dy * part, ax * part, ay * part, dc * part, ds * part
+        angle, om = om * part, turned_by * part
+        if k >= order - 2:
+            set_row(lanes.size, k - (order - 2), _size(lanes, vx, vy, om, c, s))
+    _set_state(series, order, x, y, vx, vy, om, c, s, angle)
+
+
+@kernel(inline="code")
+def _set_state(series, k, x, y, vx, vy, om, c, s, angle) -> None:
+    set_row(series[X], k, x)
+    set_row(series[Y], k, y)
+    set_row(series[VX], k, vx)
+    set_row(series[VY], k, vy)
+    set_row(series[OMEGA], k, om)
+    set_row(series[COS], k, c)
+    set_row(series[SIN], k, s)
+    set_row(series[THETA], k, angle)
+
+
+@kernel(inline="code")
+def _waves(load, series, k, c0, s0, c, s, share):
+    """Return order k of a load's series times cosine and sine."""
+    wc = ws = exact_splat(0.0)
+    for j in range(1, k):
+        one = exact_row(load, j)
+        wc = fused(one, exact_row(series[COS], k - j), wc)
+        ws = fused(one, exact_row(series[SIN], k - j), ws)
+    first, newest = exact_row(load, 0) * share, exact_row(load, k)
+    return fused(newest, c0, fused(first, c, wc)), fused(newest, s0, fused(first, s, ws))
+
+
+@kernel()
+def _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy) -> None:
+    """Write the contacts' forces along X and Y and their factors of cosine and sine in the moment at the start.
+
+    They come from the penetrations as the guards have them: a sum of maps would round them otherwise, and walls that
+    push and walls that let go would stand 1e-17 m apart.
+    """
+    zero = exact_splat(0.0)
+    for i in range(4):
+        set_row(lanes.start, i, zero)
+    for pair in range(PAIR_COUNT):
+        on = lanes.on[pair]
+        if on == 0:
+            continue
+        place, rate = (x, dx) if pair % 2 == 1 else (y, dy)
+        depth = penetration_at(lanes, pair, c, s, place)
+        if viscous is not None:
+            depth = damped_at(lanes, pair, exact_row(lanes.ratio, pair), depth, dc, ds, rate)
+        force = choose(on, exact_row(lanes.stiffness, 0) * depth, zero)
+        axis, arms = 1 - pair % 2, lanes.arms[pair]
+        set_row(lanes.start, axis, fused(exact_row(lanes.rows[pair], 2) * -1.0, force, exact_row(lanes.start, axis)))
+        for i in range(2):
+            set_row(lanes.start, 2 + i, fused(exact_row(arms, i), force, exact_row(lanes.start, 2 + i)))
+
+
+@kernel(inline="code")
+def _force(row, viscous, c, s, z, dc, ds, dz):
+    """Return order k > 0 of a contact force along X or Y."""
+    force = fused(exact_row(row, 2), z, fused(exact_row(row, 0), c, exact_row(row, 1) * s))
+    if viscous is not None:
+        rates = fused(exact_row(row, 3), dc, fused(exact_row(row, 4), ds, exact_row(row, 5) * dz))
+        force = force + rates
+    return force
+
+
+@kernel(inline="code")
+def _lever(row, viscous, c, s, x, y, dc, ds, dx, dy):
+    """Return order k > 0 of the factor of cosine or sine in the contacts' moment."""
+    lever = fused(exact_row(row, 0), c, exact_row(row, 1) * s)
+    lever = lever + fused(exact_row(row, 2), x, exact_row(row, 3) * y)
+    if viscous is not None:
+        rates = fused(exact_row(row, 4), dc, exact_row(row, 5) * ds)
+        lever = lever + (rates + fused(exact_row(row, 6), dx, exact_row(row, 7) * dy))
+    return lever
+
+
+@kernel(inline="code")
+def _size(lanes, vx, vy, om, c, s):
+    """Return the size of an order as a velocity."""
+    size = fused(exact_row(lanes.weight, 0), magnitude(c) + magnitude(s), magnitude(vx) + magnitude(vy))
+    return fused(exact_row(lanes.radius, 0), magnitude(om), size)
+
+
+@kernel()
+def accurate_steps(params, lanes, order) -> int:
+    """Write the step over which each lane's series meets its share of the tolerance to `lanes.step`.
+
+    As `method.step_size.accurate_step`, which see. Returns a bit for each lane whose series is not finite.
+    """
+    infinite = 0
+    for lane in range(WIDTH):
+        member, whole = lanes.member[lane], lanes.whole[lane]
+        lanes.ends_at_stop[lane] = 1
+        lanes.step[lane] = whole
+        if member < 0:
+            continue
+        p, least = params[member], np.inf
+        for k in range(order, order - 2, -1):
+            size = lanes.size[k - order + 1, lane]
+            if not size <= _FINITE:
+                infinite |= 1 << lane
+            elif size > 0.0:
+                least = min(least, math.log(p.threshold[k] / size) / k)
+        step = min(whole, math.exp(least))
+        # an error of velocity becomes one of position over a long step
+        stretch = step * p.velocity_tolerance / (p.position_tolerance * (order + 1))
+        if stretch > 1.0 and step < whole:
+            step *= math.exp(-math.log(stretch) / order)
+        lanes.step[lane] = lanes.accurate[lane] = step
+        lanes.ends_at_stop[lane] = 1 if step == whole else 0
+    return infinite

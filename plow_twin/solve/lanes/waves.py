@@ -1,0 +1,55 @@
+"""Sine and cosine of eight numbers side by side."""
+
+from __future__ import annotations
+
+import math
+
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
+
+#: Beyond it the product of the number of quarter turns and the first part of pi / 2 is not exact.
+_LARGEST = 1e5
+#: Added and taken away again it rounds to a whole number.
+_ROUNDS = 6755399441055744.0
+#: pi / 2 in three parts, the first two of 33 bits (fdlibm, e_rem_pio2.c).
+_QUARTERS = (0.6366197723675814, 1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
+#: Polynomials of sine and cosine on [-pi/4, pi/4] (fdlibm, k_sin.c, k_cos.c).
+_SINE = (
+    1.58969099521155010221e-10, -2.50507602534068634195e-08, 2.75573137070700676789e-06, -1.98412698298579493134e-04,
+    8.33333333332248946124e-03, -1.66666666666666324348e-01,
+)  # fmt: skip
+_COSINE = (
+    -1.13596475577881948265e-11, 2.08757232129817482790e-09, -2.75573143513906633035e-07, 2.48015872894767294178e-05,
+    -1.38888888888741095749e-03, 4.16666666666666019037e-02,
+)  # fmt: skip
+
+
+@kernel()
+def turn_lanes(angle, cosine, sine) -> None:
+    """Write cosine and sine of the eight numbers in `angle`, each to a rounding or two."""
+    x = exact_row(angle, 0)
+    turns = (x * _QUARTERS[0] + _ROUNDS) - _ROUNDS
+    r = fused(turns, exact_splat(-_QUARTERS[1]), x)
+    r = fused(turns, exact_splat(-_QUARTERS[2]), r)
+    r = fused(turns, exact_splat(-_QUARTERS[3]), r)
+    square = r * r
+    s, c = exact_splat(_SINE[0]), exact_splat(_COSINE[0])
+    for i in range(1, 6):
+        s = fused(s, square, exact_splat(_SINE[i]))
+        c = fused(c, square, exact_splat(_COSINE[i]))
+    s = fused(s * square, r, r)
+    c = fused(c * square, square, fused(square, exact_splat(-0.5), exact_splat(1.0)))
+    # 0 to 3 quarter turns beside whole turns
+    whole = (turns * 0.25 - 0.375 + _ROUNDS) - _ROUNDS
+    quarter = turns - whole * 4.0
+    first, half, last = (
+        below(quarter, exact_splat(0.5)), below(quarter, exact_splat(1.5)), below(quarter, exact_splat(2.5)),
+    )  # fmt: skip
+    swapped = (half & ~first) | ~last
+    set_row(sine, 0, choose(half, exact_splat(1.0), exact_splat(-1.0)) * choose(swapped, c, s))
+    set_row(cosine, 0, choose(last & ~first, exact_splat(-1.0), exact_splat(1.0)) * choose(swapped, s, c))
+    large = below(exact_splat(_LARGEST), magnitude(x))
+    if large != 0:
+        for lane in range(8):
+            if large >> lane & 1:
+                cosine[lane], sine[lane] = math.cos(angle[lane]), math.sin(angle[lane])

@@ -1,0 +1,188 @@
+"""Scenes in the lanes of one SIMD vector: bits of their own, and the motion that the loop of a single scene finds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import pose_error, preset, reference
+from test_solve_flight import swaying
+from test_solve_rest import fallen
+
+from plow_twin import (
+    Clearance,
+    Contact,
+    Frame,
+    Friction,
+    Gravity,
+    Harmonic,
+    Head,
+    Initial,
+    Scene,
+    Status,
+    Table,
+    Wear,
+    simulate,
+    simulate_many,
+)
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.run.ensemble import Ensemble
+from plow_twin.solve.compiled_scene import compile_scene
+from plow_twin.solve.lanes import loop
+from plow_twin.solve.lanes.record import fits_lanes
+
+FIELDS = (
+    "q",
+    "v",
+    "peak",
+    "impulse",
+    "time_in_contact",
+    "makes",
+    "set_time",
+    "events",
+    "wear_depth",
+    "steps",
+    "status",
+)
+
+
+def draw(rng: np.random.Generator) -> Scene:
+    """Draw geometry, law, stiffness, loads of several frequencies and directions, pairs and initial rates."""
+    mass, width, height = 10 ** rng.uniform(1.0, 3.5), *rng.uniform(0.1, 0.5, 2)
+    stiffness = 10 ** rng.uniform(5.5, 10.0)
+    damping = 2.0 * np.sqrt(stiffness * mass) * 10 ** rng.uniform(-3.0, 0.0)
+    undamped = rng.random() < 0.3
+    contact = Contact("hertz", stiffness, 1.0) if undamped else Contact("kelvin_voigt", stiffness, 1.0, damping=damping)
+    force, parallel = 4.0 * 9.81 * mass, rng.random() < 0.5
+    directions = [rng.uniform(-1.0, 1.0, 2)] * 3 if parallel else list(rng.uniform(-1.0, 1.0, (3, 2)))
+    loads = tuple(
+        Harmonic(f"load {i}", tuple(force * directions[i]), rng.uniform(1.0, 30.0), rng.uniform(0.0, 6.0), 0.05 * force)
+        for i in range(rng.integers(0, 4))
+    )
+    pairs = PAIR_NAMES if rng.random() < 0.7 else tuple(name for name in PAIR_NAMES if rng.random() < 0.8)
+    return Scene(
+        head=Head(mass, mass * 10 ** rng.uniform(-1.5, -0.5)),
+        frame=Frame(width, height),
+        clearance=Clearance(*10 ** rng.uniform(-3.0, -1.6, 2)),
+        contact=contact,
+        gravity=Gravity(9.81, 0.05),
+        loads=loads,
+        initial=Initial(v=tuple(rng.uniform(-0.3, 0.3, 3))),
+        pairs=pairs,
+    )
+
+
+def drawn(seed: int, count: int) -> list[Scene]:
+    rng = np.random.default_rng(seed)
+    scenes = [draw(rng) for _ in range(2 * count)]
+    fitting = [scene for scene in scenes if fits_lanes(compile_scene(scene, 1e-6))]
+    assert len(fitting) >= count
+    return fitting[:count]
+
+
+def same(one: Ensemble, i: int, other: Ensemble, k: int) -> bool:
+    return all(np.array_equal(getattr(one, name)[i], getattr(other, name)[k], equal_nan=True) for name in FIELDS)
+
+
+def test_a_scene_has_the_same_bits_alone_and_in_any_company() -> None:
+    scenes = drawn(1, 19)
+    together = simulate_many(scenes, 1.0, 0.05, 1e-7, workers=1)
+    assert together.events.min() < together.events.max() // 10  # lanes end far apart, and are filled again
+    backwards = simulate_many(scenes[::-1], 1.0, 0.05, 1e-7, workers=3)
+    for index, scene in enumerate(scenes):
+        assert same(together, index, simulate_many([scene], 1.0, 0.05, 1e-7), 0)
+        assert same(together, index, backwards, len(scenes) - 1 - index)
+
+
+def test_rows_and_limits_on_the_time_between_two_looks_move_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = drawn(2, 9)
+    whole = simulate_many(scenes, 0.5, 0.05, 1e-7)
+    monkeypatch.setattr("plow_twin.run.lane_run.next_slice", lambda size, took_s: 7)
+    monkeypatch.setattr("plow_twin.run.lane_run._FIRST_SLICE", 3)
+    finer = simulate_many(scenes, 0.5, 0.0125, 1e-7)
+    assert np.array_equal(finer.q[:, ::4], whole.q) and np.array_equal(finer.impulse, whole.impulse)
+    assert np.array_equal(finer.steps, whole.steps)
+
+
+def _check_beside_the_loop(seed: int, count: int) -> None:
+    scenes = drawn(seed, count)
+    many = simulate_many(scenes, 0.7, 0.02, 1e-12)
+    close = 0
+    for index, scene in enumerate(scenes):
+        if many.status[index] != Status.OK:
+            assert many.status[index] == Status.OUT_OF_RANGE
+            continue
+        alone = simulate(scene, 0.7, 0.02, tol=1e-12)
+        error = pose_error(scene, many.q[index], alone.q)
+        if error > 1e-9:
+            # the scene amplifies what rounding leaves, in two single runs as well
+            assert error < 300.0 * pose_error(scene, simulate(scene, 0.7, 0.02, tol=1e-11).q, alone.q), index
+            continue
+        close += 1
+        rows = alone.statistics.values()
+        assert many.events[index] == len(alone.events)
+        assert many.makes[index].tolist() == [row["makes"] for row in rows]
+        for name, found in (("max", many.peak), ("impulse", many.impulse), ("time_in_contact", many.time_in_contact)):
+            expected = np.array([row[name] for row in rows])
+            assert np.abs(found[index] - expected).max() <= 1e-7 * expected.max(initial=1e-9), (index, name)
+        for sense, shares in zip(many.set_time[index], alone.contact_sets.values(), strict=True):
+            found_shares = np.sort(sense[sense > 1e-9] / max(sense.sum(), 1e-300))
+            np.testing.assert_allclose(found_shares, np.sort([x for x in shares.values() if x > 1e-9]), atol=1e-7)
+    assert close >= count // 4
+
+
+def test_random_scenes_move_as_in_the_loop_of_a_single_scene() -> None:
+    _check_beside_the_loop(3, 24)
+
+
+@pytest.mark.stress
+@settings(max_examples=10)
+@given(st.integers(0, 2**32 - 1))
+def test_many_random_scenes_move_as_in_the_loop_of_a_single_scene(seed: int) -> None:
+    _check_beside_the_loop(seed, 40)
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
+def test_the_bench_scene_meets_its_reference_with_every_event(tol: float) -> None:
+    found, exact = simulate_many([preset("bench_kv")], 20.0, 0.1, tol), reference("bench_kv")
+    stride = round(0.1 / (exact["t"][1] - exact["t"][0]))
+    assert pose_error(preset("bench_kv"), found.q[0], exact["q"][::stride]) < 10.0 * tol
+    assert found.events[0] == 366 and found.makes.sum() == 120
+    # a clipped pair that parts changes no force: its event ends no step
+    assert found.steps[0] < 0.95 * simulate(preset("bench_kv"), 20.0, 0.1, tol=tol).solver["steps"]
+
+
+@pytest.mark.parametrize("build", [fallen, swaying])
+def test_rest_and_flight_are_left_to_their_methods(build: Callable[[], Scene]) -> None:
+    scene = build()
+    many, alone = simulate_many([scene] * 3, 3600.0, 7.3), simulate(scene, 3600.0, 7.3)
+    assert many.steps.max() <= alone.solver["steps"] + 64 and (many.status == Status.OK).all()
+    assert pose_error(scene, many.q[1], alone.q) < 1e-8 and many.events[1] == len(alone.events)
+
+
+def test_what_the_lanes_do_not_cover_keeps_its_way() -> None:
+    scene = preset("bench_kv")
+    others = [
+        preset("bench_hc"),
+        dataclasses.replace(scene, contact=dataclasses.replace(scene.contact, damping=1e9)),
+        dataclasses.replace(scene, friction=Friction(0.2, 0.02)),
+        dataclasses.replace(scene, wear=Wear(1e-11, 0.015, 2.0)),
+        dataclasses.replace(scene, locked=("theta",)),
+        dataclasses.replace(scene, loads=(Table("push", np.array([0.0, 1.0]), np.zeros((2, 3))),)),
+    ]
+    assert [fits_lanes(compile_scene(one, 1e-6)) for one in (*others, scene)] == [False] * len(others) + [True]
+    mixed = simulate_many([scene, others[0], scene], 0.5, 0.1)
+    assert np.array_equal(mixed.q[1], simulate(others[0], 0.5, 0.1).q) and np.array_equal(mixed.q[0], mixed.q[2])
+
+
+def test_terms_that_a_scene_lacks_are_not_compiled() -> None:
+    scene = dataclasses.replace(preset("bench_kv"), loads=(), contact=Contact("hertz", 2e7, 1.0))
+    simulate_many([scene], 0.2, 0.1)
+    names = loop.run_lanes.py_func.__code__.co_varnames  # type: ignore[attr-defined]
+    signatures = loop.run_lanes.signatures  # type: ignore[attr-defined]
+    compiled = [dict(zip(names, map(str, signature), strict=False)) for signature in signatures]
+    assert any(all(one[name] == "none" for name in ("waves", "second", "viscous", "flight")) for one in compiled)
