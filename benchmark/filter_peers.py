@@ -29,7 +29,7 @@ from plow_twin.estimate.unknowns import DAMPING, GX, GY, SIZE, SOFTNESS, Unknown
 from plow_twin.kernel.compiler import kernel
 from plow_twin.model.scene import Clearance
 from plow_twin.solve.compiled_scene import compile_scene, inertias
-from plow_twin.solve.loop import advance_batch
+from plow_twin.solve.loop import advance_rows
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.modes import settle_modes
 from plow_twin.solve.state import (
@@ -60,10 +60,14 @@ _UNKNOWN_NOISE = 3e-4
 
 @kernel(entry=True)
 def move(params, parts, states, saved, work, totals, times, wrench, rows, pace):  # type: ignore[no-untyped-def]
-    """Let all members settle and advance them; arrays as `advance_batch` takes them."""
+    """Let all members settle and advance them; arrays as `advance_rows` takes them."""
+    marks = np.zeros(0, np.int64)
     for m in range(states.size):
         settle_modes(params[m], states[m], parts.terms.stick)
-    advance_batch(params, parts, states, saved, work, totals, 0, states.size, times, wrench, 20_000, rows, None, pace)
+    advance_rows(
+        params, parts, states, saved, work, totals, 0, states.size, times, wrench, 20_000, rows, marks, states[:0],
+        None, pace,
+    )  # fmt: skip
 
 
 class Members:

@@ -136,11 +136,13 @@ def as_markdown(rows: Sequence[dict[str, Any]]) -> str:
         def mean(key: str, own: list[dict[str, Any]] = own) -> float:
             return float(np.nanmean([row[key] for row in own]))
 
+        most = f"{100 * max(row['rms'] for row in own):.0f} %"
         clearance = 0.5 * (mean("horizontal_coverage") + mean("vertical_coverage"))
         lines.append(
-            f"| {group.title} | {len(own)} | {middle('rms_nominal')}, {middle('rms')} | {middle('peak_nominal')}, "
-            f"{middle('peak')} | {middle('impulse_nominal')}, {middle('impulse')} | {mean('coverage_late'):.2f}, "
-            f"{mean('peak_coverage'):.2f}, {mean('impulse_coverage'):.2f} | {clearance:.2f} | {mean('cores'):.2f} |"
+            f"| {group.title} | {len(own)} | {middle('rms_nominal')}, {middle('rms')} (most {most}) | "
+            f"{middle('peak_nominal')}, {middle('peak')} | {middle('impulse_nominal')}, {middle('impulse')} | "
+            f"{mean('coverage_late'):.2f}, {mean('peak_coverage'):.2f}, {mean('impulse_coverage'):.2f} | "
+            f"{clearance:.2f} | {mean('cores'):.2f} |"
         )
     return "\n".join(lines)
 

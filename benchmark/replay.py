@@ -27,6 +27,7 @@ from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Sample
 from plow_twin.stream.session import Session
 from plow_twin.view import to_rrd
@@ -50,9 +51,9 @@ def record(folder: Path, seconds: float, outputs: bool) -> int:
     for index in range(round(1000 * seconds)):
         fx, fy, moment = (np.sin(2e-3 * index) * _AMPLITUDE).tolist()
         session.apply(Sample(_START_NS + index * 1_000_000, (fx, fy, moment)))
-        publication = session.outputs.take()
-        if outputs and publication is not None:
-            recorder.publication(publication)
+        published = session.outputs.take()
+        if outputs:
+            recorder.publication(published)
     session.close()
     report = recorder.close(timeout_s=600.0)
     if not report.complete:
@@ -79,11 +80,11 @@ def _wrenches(index: NDArray[np.int64]) -> NDArray[np.float64]:
 def move(seconds: float, rows: bool) -> None:
     """Advance a twin by the samples of the recording, with or without what is published of them."""
     twin = Twin(load_scene(scene_path("paper")), excitation="sampled")
-    index = np.arange(round(1000 * seconds))
+    index, memory = np.arange(round(1000 * seconds)), np.zeros(_BATCH, ROW)
     for begin in range(0, len(index), _BATCH):
         here = index[begin : begin + _BATCH]
         stamps = 1e-3 * here.astype(np.float64)
-        twin.advance_marked(stamps, _wrenches(here), np.zeros(0, np.int64), rows=rows)
+        twin.advance_rows(stamps, _wrenches(here), memory[: len(here)] if rows else None)
 
 
 def decompress_all(path: Path) -> None:

@@ -23,6 +23,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.journal import Entry, Hold, Parameter, Reset, Sample, Travel
+from plow_twin.stream.outputs import NOTHING
 from plow_twin.stream.session import Session
 
 BASE_NS = 1_800_000_000_000_000_000
@@ -83,11 +84,11 @@ def record_run(
     session.start()
     for index, entry in enumerate(entries):
         session.apply(entry)
-        frame = session.outputs.take() if index % frame_every == 0 else None
-        messages = {} if frame is None else publication_messages(frame, header.frame_id, header.child_frame_id)
+        published = session.outputs.take() if index % frame_every == 0 else NOTHING
+        messages = publication_messages(published, header.frame_id, header.child_frame_id)
         run.outputs += [(header.topic(name), message) for name, message in messages.items()]
-        if frame is not None:
-            recorder.publication(frame)
+        if len(published.rows):
+            recorder.publication(published)
         if recorder.snapshot_wanted:
             journal(session.snapshot())
         if pause_every and index % pause_every == 0:

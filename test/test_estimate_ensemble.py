@@ -13,7 +13,6 @@ from plow_twin.estimate.answer import followed
 from plow_twin.estimate.forces import ForceEnsemble, ForcesError, draw_scenes, forces_of
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.result import Interval, State
-from plow_twin.estimate.unknowns import CORRELATED
 
 
 def test_forces_have_intervals_that_hold_peaks_and_impulses() -> None:
@@ -32,9 +31,6 @@ def test_forces_have_intervals_that_hold_peaks_and_impulses() -> None:
         for value, low, high in zip(values, getattr(forces, name)[0], getattr(forces, name)[2], strict=True)
     ]
     assert sum(held) >= 11, "of 16, whose errors go together"
-    # confounded: a softer contact with a smaller clearance moves the head much alike
-    softness = CORRELATED.index("softness")
-    assert all(result.correlation[axis][softness] < -0.3 for axis in (0, 1))
     assert forces.peak[2].max() < 1.4 * forces.peak[0].max()
     withdrawn = replace(result, horizontal_state=State.WITHDRAWN)
     with pytest.raises(ForcesError, match="withdrawn"):

@@ -186,6 +186,19 @@ def test_late_poses_correct_too_and_later_ones_tell_nothing(truth: Truth, forces
     assert np.array_equal(_run(follower, truth, 1.1, 1.005), _run(same, truth, 1.1, 1.005))
 
 
+def test_a_machine_without_gravity_is_steered_too(truth: Truth, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved, move = [], TwinBatch.move
+
+    def counted(twins: TwinBatch, which: Array, q: Array, v: Array) -> None:
+        moved.append(len(which))
+        move(twins, which, q, v)
+
+    monkeypatch.setattr(TwinBatch, "move", counted)
+    nominal = replace(truth.nominal, gravity=replace(truth.nominal.gravity, acceleration_m_s2=0.0))
+    _run(Follower(nominal, MEMBERS), truth, 1.0)
+    assert np.mean(moved) > MEMBERS / 3  # with a limit of zero: none
+
+
 def test_a_member_is_never_pushed_into_a_hard_wall() -> None:
     truth = draw(replace(GROUPS["hard"], periods=0.7), 71102)
     follower = Follower(truth.nominal, MEMBERS)

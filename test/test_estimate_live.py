@@ -215,8 +215,7 @@ def test_what_is_estimated_stays_until_it_is_withdrawn_or_the_pads_are_changed()
     def clearance(stamp_s: float) -> dict[str, float]:
         session.apply(Sample(START_NS + round(stamp_s * 1e9), (5e4, -1e4, 0.0)))
         publication = session.outputs.take()
-        assert publication is not None and publication.slow is not None
-        return dict(zip(CLEARANCE_NAMES, publication.slow.clearance.tolist(), strict=True))
+        return dict(zip(CLEARANCE_NAMES, publication.slow["clearance"][0].tolist(), strict=True))
 
     assert clearance(0.0)["horizontal"] == 0.025
     first = entry_of(_found(State.ESTIMATED, State.ESTIMATED), session, None)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from estimate_support import GROUPS, draw, known
+from estimate_support import GROUPS, KINDS, draw, known, mismatched
 from scenes import preset
 
 from plow_twin import Clearance, Scene, Table, simulate
@@ -35,22 +35,65 @@ def test_intervals_hold_and_the_same_data_give_the_same_bits() -> None:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("kelvin_voigt", marks=pytest.mark.stress),
         pytest.param("jam", marks=pytest.mark.stress),
         "shift",
-        "scale_xy",
         *(
             pytest.param(name, marks=pytest.mark.stress)
-            for name in ("exponent", "shape", "scale", "stuck", "noisier", "hard_shape", "hard_kelvin_voigt")
+            for name in ("stuck", "noisier", "hard_shape", "hard_kelvin_voigt")
         ),
     ],
 )
-def test_a_machine_outside_the_model_is_flagged_and_its_estimate_withdrawn(name: str) -> None:
+def test_data_that_contradict_themselves_are_withdrawn(name: str) -> None:
     truth = draw(replace(GROUPS[name], periods=6.0), 1)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
     assert result.horizontal_state is result.vertical_state is State.WITHDRAWN
     assert result.reasons
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "scale_xy",
+        *(pytest.param(name, marks=pytest.mark.stress) for name in ("kelvin_voigt", "exponent", "shape", "scale")),
+    ],
+)
+def test_what_is_outside_the_model_is_flagged_and_rough_at_best(name: str) -> None:
+    truth = draw(replace(GROUPS[name], periods=6.0), 1)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert (result.model, result.sensor) == (truth.group.model, truth.group.sensor), result.reasons
+    for value, state, true in zip(
+        (result.horizontal, result.vertical),
+        (result.horizontal_state, result.vertical_state),
+        truth.clearance,
+        strict=True,
+    ):
+        assert state in (State.ROUGH, State.NOT_OBSERVABLE)
+        assert abs(value.mean - true) < 3.0 * value.deviation
+
+
+def test_a_lever_arm_of_the_sensor_is_found_and_the_interval_holds() -> None:
+    """Without it the fit did not come to its end, or was 0.4 mm off under 0.05 mm."""
+    truth = mismatched(replace(KINDS["lever"], periods=6.0), 80_000)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    for value, state, true in zip(
+        (result.horizontal, result.vertical),
+        (result.horizontal_state, result.vertical_state),
+        truth.clearance,
+        strict=True,
+    ):
+        assert state.known
+        assert abs(value.mean - true) < 3.0 * value.deviation and value.deviation < 4e-4
+    found = [result.differs[f"lever_{axis}"] for axis in "xy"]
+    assert max(share for share, _, _ in found) > 0.95
+    assert np.hypot(*(share * by for share, by, _ in found)) == pytest.approx(5e-3, rel=0.2)
+
+
+def test_of_a_head_that_never_moves_sideways_the_vertical_clearance_is_told() -> None:
+    truth = mismatched(replace(KINDS["vertical"], periods=6.0), 80_000)
+    result = estimate(truth.nominal, truth.load, truth.poses)
+    assert result.horizontal_state is State.NOT_OBSERVABLE and result.vertical_state.known, result.reasons
+    assert abs(result.vertical.mean - truth.clearance[1]) < 3.0 * result.vertical.deviation < 3e-3
 
 
 @pytest.mark.parametrize("seed", [pytest.param(43202, marks=pytest.mark.stress), 43210])

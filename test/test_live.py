@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -49,7 +49,7 @@ from plow_twin.record.times import time_ns
 from plow_twin.record.unused import unused_messages
 from plow_twin.record.writer import RunWriter
 from plow_twin.scene_file import load_scene
-from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Gaps, PartOfPose, Pose
 from plow_twin.stream.limits import pose_limits, value_limits
 
@@ -751,25 +751,24 @@ def test_a_wrong_call_says_what_was_expected(
 
 def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     used: list[Any] = []
-    keep = lambda stamp_ns, value, *more: used.append(value)  # noqa: E731
-    inputs = Inputs("excitation", Intake(), keep, 10, keep, 2.0, keep)
-    inputs.active = True
+    inputs = Inputs(cast(Any, None), "excitation", 10, 2.0, journaled=False)
+    inputs.active = inputs.started = True
     inputs.set_limits(value_limits(2.0, 1.0), pose_limits(load_scene("paper"), 0.05, 0.7), value_limits(0.1, 1.0))
     second = 10**9
     for at, speed in ((1, 0.5), (2, 1.4), (3, 2.5), (4, -1.7), (5, 0.0)):  # 2.5 is too large, -1.7 changes too fast
-        inputs.take_travel(at * second, speed)
+        used += [speed] if inputs.uses_travel(at * second, speed) else []
     assert used == [0.5, 1.4, 0.0] and inputs.travel.counts[Verdict.IMPLAUSIBLE] == 2
     used.clear()
     nan = math.nan
     poses = [(0.01, 0.0, 0.0), (0.04, nan, 0.0), (0.02, 0.06, 0.0), (-0.04, 0.0, 0.0), (nan, 0.001, 0.0)]
     for at, pose in enumerate(poses):  # of the third y is too large, the fourth changes too fast
-        inputs.take_pose(second + at * 50_000_000, pose)
+        used += [pose] if inputs.uses_pose(second + at * 50_000_000, pose) else []
     assert [pose[0] for pose in used[:2]] == [0.01, 0.04] and used[2][1] == 0.001 and len(used) == 3
     assert inputs.head_pose.counts[Verdict.IMPLAUSIBLE] == 2
     used.clear()
     # pair 3 is not in the second; its change counts from the first on
     for at, gaps in enumerate([{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.09, 1: 0.02}, {1: 0.11}, {3: 0.05, 1: 0.03}]):
-        inputs.take_gaps(second + at * 20_000_000, gaps)
+        used += [gaps] if inputs.uses_gaps(second + at * 20_000_000, gaps) else []
     assert used == [{1: 0.01, 3: 0.01}, {1: 0.02}, {3: 0.05, 1: 0.03}]
     assert inputs.gaps.counts[Verdict.IMPLAUSIBLE] == 2
 

@@ -37,6 +37,7 @@ from plow_twin.record.replay import replay
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Digest, Sample
 from plow_twin.stream.session import Session
 
@@ -279,13 +280,13 @@ def test_digests_alone_are_compared_without_opening_the_outputs(run: Run, tmp_pa
 
 def test_digests_do_not_break_a_run_of_samples(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    advance = Session.advance_marked
+    advance = Session.advance
 
     def counted(session: Session, stamps: Any, *rest: Any, **options: Any) -> Any:
         calls.append(len(stamps))
         return advance(session, stamps, *rest, **options)
 
-    monkeypatch.setattr(Session, "advance_marked", counted)
+    monkeypatch.setattr(Session, "advance", counted)
     assert replay(run.folder).exit_code == 0
     # one call warms up; the others take thousands of samples, not the hundred between two digests
     assert sum(calls) == COUNT + 2 and len(calls) <= 4
@@ -296,9 +297,9 @@ def test_without_rows_the_motion_is_the_same_and_nothing_is_counted() -> None:
     times, marks = 1e-3 * np.arange(COUNT), np.array([1, 700, COUNT])
     wrench = np.sin(2.0 * times)[:, None] * np.array(PAPER_AMPLITUDE)
     digests, in_contact = [], []
-    for rows in (True, False):
+    for rows in (np.zeros(COUNT, ROW), None):
         twin = Twin(scene, excitation="sampled")
-        digests.append(twin.advance_marked(times, wrench, marks, rows=rows).digests)
+        digests.append(twin.advance_rows(times, wrench, rows, marks).digests)
         in_contact.append(float(twin._all_totals["set_time"].sum()))
     assert digests[0] == digests[1]
     assert in_contact[0] > 1.0 and in_contact[1] == 0.0

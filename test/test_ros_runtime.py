@@ -12,7 +12,6 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,6 @@ from plow_twin.record.replay import replay
 from plow_twin.ros.connections import Connections
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.input_queue import InputQueue, Taken
-from plow_twin.ros.messages import read_wrench
 from plow_twin.ros.node import TwinNode
 from plow_twin.ros.qos import OUTPUTS, sensor_input
 from plow_twin.scene_file import load_scene
@@ -52,9 +50,11 @@ class _Flood:
         self.fd = os.eventfd(1)
         self.taken = 0
 
-    def take(self, most: int, *, all_there_are: bool = False) -> bool:
-        self.taken += most
-        return True
+    def take(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
+        return [Taken(b"", 0, 0, b"")] * most, True
+
+    def receive(self, topic: str, batch: list[Taken]) -> None:
+        self.taken += len(batch)
 
     def close(self) -> None:
         os.close(self.fd)
@@ -192,7 +192,7 @@ def test_a_pose_and_its_negative_quaternion_give_the_same_residual() -> None:
             front = node._front
             assert front is not None
             taken = [Taken(b"", number, 0, serialize_message(message))]
-            front.subscriptions._measured_poses(PoseStamped, taken)
+            front.subscriptions._measured_poses(taken)
             residual = node.runtime.inputs.residual(np.array([0.0, 0.0, 0.002]))
             assert residual is not None
             found.append(residual[2])
@@ -213,13 +213,13 @@ def test_the_covariance_of_each_pose_goes_into_the_journal_and_the_estimate(tmp_
             for axis, variance in zip((0, 1, 5), variances, strict=True):
                 message.pose.covariance[7 * axis] = variance
             taken = [Taken(b"", number, 0, serialize_message(message))]
-            front.subscriptions._measured_poses(PoseWithCovarianceStamped, taken)
+            front.subscriptions._measured_poses(taken)
         assert front.runtime.inputs.head_pose.counts[Verdict.NON_FINITE] == 2
         # a quaternion that nobody has filled in is no angle of 0
         message.pose.pose.orientation.w = 0.0
-        front.subscriptions._measured_poses(PoseWithCovarianceStamped, [Taken(b"", 6, 0, serialize_message(message))])
+        front.subscriptions._measured_poses([Taken(b"", 6, 0, serialize_message(message))])
         assert front.runtime.inputs.head_pose.counts[Verdict.MALFORMED] == 1
-        front.runtime.samples([(stamp * 1_000_000_000, (0.0, 0.0, 0.0)) for stamp in (1, 2, 3)])
+        list(front.runtime.step([(stamp * 1_000_000_000, (0.0, 0.0, 0.0)) for stamp in (1, 2, 3)]))
         assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
         assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
     entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
@@ -248,7 +248,7 @@ def test_under_a_flood_of_samples_what_is_due_is_done_and_others_have_their_turn
     flood, turns, errors = _Flood(), Turns(), list[Exception]()
     done, at = threading.Semaphore(0), list[int]()
     loop = InputLoop(turns, errors.append)
-    loop.add(flood)  # type: ignore[arg-type]
+    loop.add(flood, flood, "flood")  # type: ignore[arg-type]
 
     def due() -> None:
         at.append(flood.taken)
@@ -272,7 +272,7 @@ def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
     with _node() as node:
         heard: list[int] = []
         subscription = node.create_subscription(TwistStamped, "burst", lambda _: None, sensor_input(1000), raw=True)
-        queue = InputQueue(node, subscription, lambda batch: heard.extend(taken.number for taken in batch))
+        queue = InputQueue(node, subscription)
         publisher = node.create_publisher(TwistStamped, "burst", OUTPUTS["contact_forces"])
         give_up = time.monotonic() + 30.0
 
@@ -285,9 +285,15 @@ def test_a_queue_that_fills_while_it_is_emptied_is_emptied_to_its_end() -> None:
         while publisher.get_subscription_count() == 0 and time.monotonic() < give_up:
             time.sleep(0.01)
         send(50)
-        assert queue.take(20)
+
+        def take() -> bool:
+            taken, more = queue.take(20)
+            heard.extend(message.number for message in taken)
+            return more
+
+        assert take()
         send(3)
-        while queue.take(20):
+        while take():
             pass
         queue.close()
     assert heard == list(range(1, 54))
@@ -310,7 +316,7 @@ def test_loss_is_counted_by_the_publishers_numbers() -> None:
         subscriptions = node._front.subscriptions
         for numbers in ((7, 8), (11,), (10,), (12,)):  # 9 never comes, 10 late
             batch = [Taken(b"one", number, 0, serialize_message(TwistStamped())) for number in numbers]
-            subscriptions._counted("travel", subscriptions._travel_speeds, batch)
+            subscriptions.receive("travel", batch)
         assert node.runtime.inputs.lost == 1
 
 
@@ -326,7 +332,7 @@ def test_what_was_sent_before_the_subscription_is_no_loss_whenever_its_publisher
             # its clock is another one
             received_ns, sent_ns = begun_ns + number * period_ns, number * period_ns
             batch = [Taken(sender, number, received_ns, serialize_message(WrenchStamped()), sent_ns)]
-            subscriptions._counted("excitation", partial(subscriptions._samples, "excitation", read_wrench), batch)
+            subscriptions.receive("excitation", batch)
         return node.runtime.inputs.senders.lost
 
     with _node() as node:
@@ -358,7 +364,7 @@ def test_an_error_in_the_thread_of_the_inputs_ends_the_program_and_is_said() -> 
         def fail(*arguments: object) -> None:
             raise RuntimeError("not foreseen")
 
-        node.runtime.inputs.take_travel = fail  # type: ignore[method-assign,assignment]
+        node.runtime.inputs.uses_travel = fail  # type: ignore[method-assign,assignment]
         publisher = node.create_publisher(TwistStamped, "travel", 10)
         give_up = time.monotonic() + 60.0
         while node._front.error is None and time.monotonic() < give_up:

@@ -173,7 +173,7 @@ def test_a_scene_compiles_only_what_it_needs() -> None:
     """Parts that a scene lacks are None in the compiled signature of the step."""
     twin = Twin(wall_and_point(preset("bench_kv").contact, speed=1.0))
     twin.advance(0.01)
-    compiled = [str(signature[1]) for signature in loop.advance_times.signatures]  # type: ignore[attr-defined]
+    compiled = [str(signature[1]) for signature in loop.advance_rows.signatures]  # type: ignore[attr-defined]
     there = {"viscous", "free", "rest"}
     terms = f"Terms({', '.join('int64' if name in there else 'none' for name in Terms._fields)})"
     bare = f"Parts({terms}, none, none, none)"
@@ -190,15 +190,13 @@ def test_in_free_flight_nothing_of_the_contact_runs() -> None:
 def test_warm_up_leaves_nothing_to_compile() -> None:
     twin = Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
     twin.warm_up()
-    before = [len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)]
+    before = [len(kernel.signatures) for kernel in (loop.advance_rows, loop.interrupt_step, loop.lay_out_again)]
     assert min(before) > 0 and twin.time == 0.0
     twin.advance(0.01)
     twin.set_travel_speed(1.0)
     twin.advance(0.02)
     twin.restore(twin.snapshot())
-    assert [
-        len(kernel.signatures) for kernel in (loop.advance_times, loop.interrupt_step, loop.lay_out_again)
-    ] == before
+    assert [len(kernel.signatures) for kernel in (loop.advance_rows, loop.interrupt_step, loop.lay_out_again)] == before
 
 
 def test_a_bound_on_evaluations_is_kept_and_the_error_estimated() -> None:

@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
-from plow_twin.record.sending import PublicationBytes
+from plow_twin.record.sending import Messages
 from plow_twin.run.twin import DEFAULT_BUDGET, Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
-from plow_twin.stream.driver import Driver, Policy, StreamState, counters
+from plow_twin.stream.driver import Arrival, Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
-from plow_twin.stream.journal import Entry, Hold, Reset, Sample, Unload
+from plow_twin.stream.journal import Digest, Entry, Hold, Reset, Sample, Unload
 from plow_twin.stream.limits import excitation_limits
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Session
 
 SCENE = load_scene(scene_path("paper"))
 T0 = 1_795_000_000_000_000_000
 MS = NS_PER_S // 1000
 LOAD = (32e3, 0.0, -45e3)
+
+
+def _some(published: Published) -> Published | None:
+    """Return what is published, None where it is nothing."""
+    return published if len(published.rows) else None
 
 
 class Bench:
@@ -33,10 +39,15 @@ class Bench:
         session = Session(twin, on_entry=self.journal.append)
         self.driver = Driver(session, Intake(), policy or Policy(), every_sample=every_sample)
 
-    def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Publication | None:
+    def sample(self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int) -> Published | None:
         """Return what is published for one sample."""
-        frames = list(self.driver.samples([(stamp_ns, wrench)], now_ns))
-        return frames[0] if frames else None
+        return _some(Published.joined(list(self.driver.samples([(stamp_ns, wrench)], now_ns))))
+
+    def silence(self, now_ns: int) -> Published | None:
+        return _some(self.driver.silence(now_ns))
+
+    def tick(self, stamp_ns: int, now_ns: int) -> Published | None:
+        return _some(self.driver.clock_tick(stamp_ns, now_ns))
 
     def kinds(self) -> list[str]:
         return [type(entry).__name__ for entry in self.journal]
@@ -46,12 +57,12 @@ class Bench:
 def test_silence_is_bridged_that_far_behind_the_clock(hold: str) -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1, hold=hold))
     driver = bench.driver
-    assert driver.silence(5 * NS_PER_S) is None
+    assert bench.silence(5 * NS_PER_S) is None
     bench.sample(T0, LOAD, now_ns=0)
     bench.sample(T0 + MS, LOAD, now_ns=MS)
-    assert driver.silence(101 * MS) is None
+    assert bench.silence(101 * MS) is None
     for now_ms in (121, 131):
-        assert driver.silence(now_ms * MS) is not None
+        assert bench.silence(now_ms * MS) is not None
     held = bench.journal[2:]
     first: Entry = Unload(T0 + 21 * MS) if hold == "zero" else Hold(T0 + 21 * MS)
     assert held == [first, Hold(T0 + 31 * MS)]
@@ -77,7 +88,7 @@ def test_time_spent_inactive_is_not_caught_up() -> None:
     bench = Bench(Policy(excitation_timeout_s=0.1))
     bench.sample(T0, LOAD, now_ns=0)
     bench.driver.resume(100 * NS_PER_S)
-    assert bench.driver.silence(100 * NS_PER_S + 50 * MS) is None
+    assert bench.silence(100 * NS_PER_S + 50 * MS) is None
 
 
 @pytest.mark.parametrize(("jump_ns", "key"), [(-5 * NS_PER_S, "jumps_back"), (60 * NS_PER_S, "jumps_forward")])
@@ -90,7 +101,7 @@ def test_a_jump_of_the_stamps_starts_the_model_anew(jump_ns: int, key: str) -> N
         jumped = bench.sample(T0 + jump_ns + index * MS, LOAD, now_ns=(400 + index) * MS)
         direct = fresh.sample(T0 + jump_ns + index * MS, LOAD, now_ns=index * MS)
     assert jumped is not None and direct is not None
-    assert (jumped.q == direct.q).all() and (jumped.force == direct.force).all()
+    assert (jumped.rows["q"] == direct.rows["q"]).all() and (jumped.rows["force"] == direct.rows["force"]).all()
     assert bench.kinds().count("Reset") == counters(bench.driver)[key] == counters(bench.driver)["resets"] == 1
 
 
@@ -133,12 +144,12 @@ def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_res
 def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:
     bench = Bench(excitation="scene")
     stamps = [T0, T0 + 250 * MS, T0 + 250 * MS, T0 + 1700 * MS]
-    advances = [bench.driver.clock_tick(stamp, now_ns=0) for stamp in stamps]
+    advances = [bench.tick(stamp, now_ns=0) for stamp in stamps]
     assert advances[2] is None  # a paused clock moves nothing
     direct = Twin(SCENE)
     for stamp, advance in zip(stamps, advances, strict=True):
         if advance is not None:
-            assert (advance.q == direct.advance((stamp - T0) * 1e-9).q).all()
+            assert (advance.rows["q"][0] == direct.advance((stamp - T0) * 1e-9).q).all()
     bench.driver.clock_tick(T0 - 100 * NS_PER_S, now_ns=0)
     assert isinstance(bench.journal[-2], Reset)
 
@@ -150,12 +161,12 @@ def test_model_time_goes_on_where_it_was_after_an_inactive_hour() -> None:
     for now in (0, 500 * MS):
         driver.clock_tick(T0 + now, now)
     driver.resume(hour)
-    assert driver.clock_tick(T0 + hour, hour) is None
-    advance = driver.clock_tick(T0 + hour + 200 * MS, hour + 200 * MS)
+    assert bench.tick(T0 + hour, hour) is None
+    advance = bench.tick(T0 + hour + 200 * MS, hour + 200 * MS)
     assert advance is not None
     direct = Twin(SCENE)
     direct.advance(0.5)
-    assert advance.q.tobytes() == direct.advance(700 * MS * 1e-9).q.tobytes()
+    assert advance.rows["q"][0].tobytes() == direct.advance(700 * MS * 1e-9).q.tobytes()
     assert "Reset" not in bench.kinds()
     # a step of the clock, and a reset, start on the clock itself
     driver.clock_tick(T0 + 2 * hour, hour)
@@ -180,10 +191,9 @@ def test_batches_give_the_bits_of_single_samples_and_a_journal_that_repeats_them
         assert list(batched.driver.samples(series[begin : begin + batch], now_ns=0)) == []
     assert batched.journal == single.journal
     one, other = single.driver.due(), batched.driver.due()
-    assert one is not None and other is not None
-    assert one.makes.sum() > 0
+    assert one.rows["makes"].sum() > 0
     for name in ("stamp_ns", "q", "v", "force", "makes", "impulse", "peak"):
-        assert np.asarray(getattr(one, name)).tobytes() == np.asarray(getattr(other, name)).tobytes(), name
+        assert one.rows[name].tobytes() == other.rows[name].tobytes(), name
 
 
 @pytest.mark.parametrize("batch", [1, 40])
@@ -222,9 +232,9 @@ def test_a_sample_that_jumps_is_used_when_none_follows_and_counted_when_the_twin
     bench = Bench(Policy(excitation_timeout_s=0.1))
     bench.sample(T0, LOAD, now_ns=0)
     assert bench.sample(T0 + 60 * NS_PER_S, LOAD, now_ns=MS) is None
-    assert bench.driver.silence(50 * MS) is None and bench.kinds() == ["Sample"]
-    published = bench.driver.silence(102 * MS)
-    assert published is not None and published.stamp_ns == T0 + 60 * NS_PER_S
+    assert bench.silence(50 * MS) is None and bench.kinds() == ["Sample"]
+    published = bench.silence(102 * MS)
+    assert published is not None and published.rows["stamp_ns"].tolist() == [T0 + 60 * NS_PER_S]
     assert bench.kinds() == ["Sample", "Reset", "Sample"]
     assert bench.sample(T0, LOAD, now_ns=103 * MS) is None
     bench.driver.pause()
@@ -239,7 +249,7 @@ def test_silence_is_seen_after_a_reset_within_the_last_batch(every_sample: bool)
     batch = [(T0 + i * MS, absurd if 95 <= i < 99 else LOAD) for i in range(110)]
     list(bench.driver.samples(batch, now_ns=0))
     assert bench.kinds().count("Reset") == 1 and bench.driver.newest_ns == T0 + 109 * MS
-    assert bench.driver.silence(NS_PER_S) is None or every_sample
+    assert bench.silence(NS_PER_S) is None or every_sample
     assert bench.driver.state is StreamState.STALE
 
 
@@ -250,7 +260,7 @@ def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
     assert (bench.driver.failures, bench.kinds()[-1]) == (3, "Reset")
     list(bench.driver.samples([(T0 + i * MS, LOAD) for i in range(13, 20)], now_ns=0))
     frame = bench.driver.due()
-    assert frame is not None and frame.finite and bench.driver.state is StreamState.RUNNING
+    assert len(frame.rows) and frame.finite and bench.driver.state is StreamState.RUNNING
 
 
 def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[float, float, float]]], int]]:
@@ -286,45 +296,49 @@ def _troubled(seed: int, count: int) -> list[tuple[str, list[tuple[int, tuple[fl
 
 
 @pytest.mark.parametrize("max_steps", [DEFAULT_BUDGET, 3])
-def test_a_sample_applied_directly_gives_what_the_general_path_gives(
-    max_steps: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Bytes, journal, counters and all that a later sample depends on; with 3 steps an advance fails now and then."""
-    direct = Session.apply_directly
-    taken = [0]
+def test_whatever_comes_single_calls_of_the_session_give_the_bits_of_the_driver_s(max_steps: int) -> None:
+    """Messages, journal and all that a later sample depends on; with 3 steps an advance fails now and then."""
 
-    def counted(session: Session, sample: Sample) -> tuple[int, Publication | None]:
-        taken[0] += 1
-        return direct(session, sample)
-
-    monkeypatch.setattr(Session, "apply_directly", counted)
-    calls, found = _troubled(3, 3000), []
-    for always_general in (False, True):
-        if always_general:
-            monkeypatch.setattr(Session, "can_apply_directly", lambda *_: False)
-        journal: list[Entry] = []
+    def new_session(journal: list[Entry]) -> Session:
         twin = Twin(SCENE, excitation="sampled", max_steps=max_steps)
-        session = Session(twin, on_entry=journal.append, rollback_span_s=1.0)
-        driver = Driver(session, Intake(limits=excitation_limits(SCENE)), Policy(excitation_timeout_s=0.5))
-        sent, states, messages = [], [], PublicationBytes("slide", "head")
-        for kind, arrived, now in calls:
-            published = list(driver.samples(arrived, now))
-            if kind == "silence":
-                published += [one for one in [driver.silence(now + NS_PER_S)] if one is not None]
-            elif kind == "travel":
-                driver.travel(arrived[0][0] + 20 * MS, 0.4)
-            elif kind == "reset":
-                driver.reset(arrived[0][0], "asked for")
-            for one in published:
-                sent.append((one.stamp_ns, one.held, one.corrected, one.marked, messages.write(one)))
-            states.append((session.snapshot(), tuple(session.wear_depth), session.history._snapshots[-1:]))
-        found.append((sent, states, list(map(repr, journal)), counters(driver), driver.state, driver.real_time.model_s))
-        if not always_general:
-            assert 0.6 * len(calls) < taken[0] < 0.97 * len(calls)
-    direct_path, general_path = found
-    for one, other in zip(direct_path, general_path, strict=True):
-        assert one == other
-    counted_as = direct_path[3]
+        return Session(twin, on_entry=journal.append, rollback_span_s=1.0)
+
+    journal, again, messages = list[Entry](), list[Entry](), Messages("slide", "head")
+    session, single = new_session(journal), new_session(again)
+    driver = Driver(session, Intake(limits=excitation_limits(SCENE)), Policy(excitation_timeout_s=0.5))
+    done = 0
+
+    def follow() -> None:
+        """Apply what the driver has journaled, entry by entry."""
+        nonlocal done
+        for entry in journal[done:]:
+            if not isinstance(entry, Digest):
+                single.apply(entry)
+        done = len(journal)
+
+    def calls(kind: str, arrived: list[Arrival], now: int) -> Iterator[Published]:
+        yield from driver.samples(arrived, now)
+        if kind == "silence":
+            yield driver.silence(now + NS_PER_S)
+        elif kind == "travel":
+            driver.travel(arrived[0][0] + 20 * MS, 0.4)
+        elif kind == "reset":
+            driver.reset(arrived[0][0], "asked for")
+
+    for call in _troubled(3, 3000):
+        for published in calls(*call):
+            follow()
+            same = single.outputs.take()
+            assert len(same.rows) == len(published.rows)
+            if len(published.rows):
+                sent = [(topic, bytes(data)) for topic, data in messages.write(published)]
+                assert sent == [(topic, bytes(data)) for topic, data in messages.write(same)]
+        follow()
+        assert single.twin.digest() == session.twin.digest()
+        assert (single.wear_depth == session.wear_depth).all() and single.stamp_ns == session.stamp_ns
+        assert single.history.oldest_ns == session.history.oldest_ns
+    assert again == journal
+    counted_as = counters(driver)
     wanted = (
         "rolled_back",
         "holds",

@@ -18,7 +18,7 @@ from plow_twin.stream.driver import Driver, Policy
 from plow_twin.stream.intake import Intake
 from plow_twin.stream.journal import Entry, Mark, Restore, SetModel, Snapshot
 from plow_twin.stream.model_changes import changed_scene
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Session
 
 T0 = 1_795_000_000_000_000_000
@@ -33,22 +33,22 @@ class Bench:
 
     def __init__(self, scene: Scene) -> None:
         self.journal: list[Entry] = []
-        self.out: list[Publication] = []
+        self.out: list[Published] = []
         self.session = Session(Twin(scene, excitation="sampled"), on_entry=self.journal.append, rollback_span_s=0.5)
         self.driver = Driver(self.session, Intake(), Policy())
         self.session.start()
 
-    def send(self, first: int, last: int, shift_ns: int = 0) -> list[Publication]:
+    def send(self, first: int, last: int, shift_ns: int = 0) -> list[Published]:
         arrived = [(T0 + shift_ns + k * MS, tuple(WRENCH[k])) for k in range(first, last)]
         found = list(self.driver.samples(arrived, 0))  # type: ignore[arg-type]
         self.out += found
         return found
 
 
-def _same(first: list[Publication], second: list[Publication]) -> bool:
+def _same(first: list[Published], second: list[Published]) -> bool:
     names = ("q", "v", "force", "penetration", "peak", "impulse")
     pairs = list(zip(first, second, strict=True))
-    return all((getattr(a, name) == getattr(b, name)).all() for a, b in pairs for name in names)
+    return all((a.rows[name] == b.rows[name]).all() for a, b in pairs for name in names)
 
 
 def _again(scene: Scene, entries: list[Entry]) -> list[Entry]:
@@ -70,14 +70,14 @@ def test_a_restored_motion_goes_on_as_it_did_after_its_snapshot_whatever_the_sta
     kept = bench.driver.snapshot()
     first = bench.send(700, 900)
     bench.send(900, 1300)
-    makes = bench.out[-1].makes.copy()
+    makes = bench.out[-1].rows["makes"].copy()
     for shift_ns in (0, 3600 * 10**9, -3600 * 10**9):  # the stamps of then, a later and an earlier time
         bench.driver.restore(T0, kept)
         again = bench.send(699, 900, shift_ns)
-        assert again[0].stamp_ns == T0 + 699 * MS + shift_ns
-        assert (again[0].q == bench.out[699].q).all()
+        assert again[0].rows["stamp_ns"][0] == T0 + 699 * MS + shift_ns
+        assert (again[0].rows["q"] == bench.out[699].rows["q"]).all()
         assert _same(first, again[1:])
-        assert (again[-1].makes >= makes).all()  # counts are not set back
+        assert (again[-1].rows["makes"] >= makes).all()  # counts are not set back
     assert bench.driver.resets == 0
     bench.driver.mark(bench.session.stamp_ns or 0, "after the third")
     bench.session.close()
@@ -94,7 +94,7 @@ def test_wear_outlives_a_restored_motion() -> None:
     bench.driver.restore(T0, kept)
     (again,) = bench.send(699, 700)
     assert (bench.session.wear_depth == depth).all() and depth.max() > 0.0
-    np.testing.assert_allclose(again.q, bench.out[699].q, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(again.rows["q"], bench.out[699].rows["q"], rtol=0.0, atol=1e-12)
     bench.send(700, 900)
     bench.session.close()
     assert _again(WORN, bench.journal) == bench.journal
@@ -108,7 +108,7 @@ def test_a_changed_model_goes_on_from_pose_rates_and_wear_and_a_snapshot_of_it_h
         T0, {"clearance.horizontal_m": 0.03, "contact.stiffness": 2e7, "wear.coefficient_m2_n": 3e-14}
     )
     (after,) = bench.send(731, 732)
-    np.testing.assert_allclose(after.q, before.q + 1e-3 * before.v, rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(after.rows["q"], before.rows["q"] + 1e-3 * before.rows["v"], rtol=0.0, atol=1e-5)
     assert (bench.session.wear_depth >= depth).all()
     bench.send(732, 1100)
     assert bench.session.outputs.modelled(np.zeros(8))[0] == 0.03
@@ -116,7 +116,7 @@ def test_a_changed_model_goes_on_from_pose_rates_and_wear_and_a_snapshot_of_it_h
     bench.send(1100, 1300)
     bench.driver.reset(T0, "test")
     (start,) = bench.send(0, 1)
-    np.testing.assert_allclose(start.q, PAPER.initial.q, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(start.rows["q"][0], PAPER.initial.q, rtol=0.0, atol=1e-12)
     bench.driver.set_model(T0, {})
     bench.send(1, 400)
     bench.session.close()

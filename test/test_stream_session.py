@@ -20,8 +20,9 @@ from plow_twin.run.simulate import simulate
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
+from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Digest, Entry, Hold, Loss, Reset, Sample, Snapshot, Travel
-from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, Outputs, Publication, prior_points
+from plow_twin.stream.outputs import CLEARANCE_NAMES, SLOW_PERIOD_NS, THE_ONE, Outputs, Published, prior_points
 from plow_twin.stream.session import DIGEST_INTERVAL, Session
 
 T0 = 1_795_000_000_123_456_789
@@ -55,32 +56,35 @@ class Run:
 
     def __init__(self) -> None:
         self.emitted: list[Entry] = []
-        self.publications: list[Publication] = []
+        self.publications: list[Published] = []
         self.session = Session(Twin(SCENE, excitation="sampled"), on_entry=self.emitted.append)
 
     def apply(self, entries: list[Entry], take: bool = True) -> Run:
         for entry in entries:
             self.session.apply(entry)
-            publication = self.session.outputs.take() if take else None
-            if publication is not None:
-                self.publications.append(publication)
+            if take and len((published := self.session.outputs.take()).rows):
+                self.publications.append(published)
         return self
 
 
-def _bits(publication: Publication) -> bytes:
-    parts = [
-        publication.penetration,
-        publication.rate,
-        publication.force,
-        publication.makes,
-        publication.impulse,
-        publication.peak,
-        publication.q,
-        publication.v,
-    ]
-    if publication.slow is not None:
-        parts += [publication.slow.clearance, publication.slow.wear_rate]
-    return publication.stamp_ns.to_bytes(8, "little") + b"".join(part.tobytes() for part in parts)
+#: What is published of a row, beside its stamp.
+NUMBERS = ("penetration", "rate", "force", "makes", "impulse", "peak", "q", "v")
+
+
+def _number(published: Published, name: str) -> np.ndarray:
+    """Return a field of the one row."""
+    found: np.ndarray = published.rows[name][0]
+    return found
+
+
+def _stamp(published: Published) -> int:
+    return int(published.rows["stamp_ns"][0])
+
+
+def _bits(published: Published) -> bytes:
+    parts = [published.rows["stamp_ns"], *(published.rows[name] for name in NUMBERS)]
+    parts += [published.slow["clearance"], published.slow["wear_rate"]]
+    return b"".join(part.tobytes() for part in parts)
 
 
 @pytest.fixture(scope="module")
@@ -130,10 +134,10 @@ def test_frames_carry_the_twins_own_numbers(reference: Run) -> None:
     series = twin.advance_samples(np.arange(200) * 2 * MS * 1e-9, WRENCH[:200])
     for index, publication in enumerate(reference.publications[:200]):
         for name in ("penetration", "rate", "force", "impulse", "peak", "q", "v"):
-            assert getattr(publication, name).tobytes() == getattr(series, name)[index].tobytes()
+            assert _number(publication, name).tobytes() == getattr(series, name)[index].tobytes()
     touches = np.cumsum(series.makes, axis=0)
     assert touches[-1].sum() > 0
-    assert (np.array([publication.makes for publication in reference.publications[:200]]) == touches).all()
+    assert (np.array([_number(publication, "makes") for publication in reference.publications[:200]]) == touches).all()
 
 
 @settings(max_examples=8)
@@ -147,11 +151,12 @@ def test_nothing_is_lost_however_rarely_frames_are_taken(cuts: set[int]) -> None
         rare.apply(entries[begin : end - 1], take=False)
         rare.apply(entries[end - 1 : end])
     assert len(rare.publications) == len(bounds) - 1
-    assert (rare.publications[-1].makes == every.publications[-1].makes).all()
+    assert (_number(rare.publications[-1], "makes") == _number(every.publications[-1], "makes")).all()
     for publication, begin, end in zip(rare.publications, bounds, bounds[1:], strict=False):
         part = every.publications[begin:end]
-        assert (publication.peak == np.max([single.peak for single in part], axis=0)).all()
-        np.testing.assert_allclose(publication.impulse, np.sum([single.impulse for single in part], axis=0), rtol=1e-12)
+        assert (_number(publication, "peak") == np.max([_number(single, "peak") for single in part], axis=0)).all()
+        impulse = np.sum([_number(single, "impulse") for single in part], axis=0)
+        np.testing.assert_allclose(_number(publication, "impulse"), impulse, rtol=1e-12)
         assert _bits(publication)[:200] == _bits(part[-1])[:200]
 
 
@@ -178,12 +183,11 @@ def test_an_entry_that_cannot_be_applied_changes_nothing(reference: Run) -> None
 def test_clearance_is_base_plus_mean_wear_of_each_side_with_the_priors_interval() -> None:
     outputs = Outputs(SCENE)
     twin = Twin(SCENE, excitation="sampled")
-    advance = twin.advance(0.0, np.zeros(3))
-    depth = np.arange(1.0, 9.0) * 1e-3
-    outputs.add(T0, replace(advance, wear_depth=depth))
-    publication = outputs.take()
-    assert publication is not None and publication.slow is not None
-    named = dict(zip(CLEARANCE_NAMES, publication.slow.clearance, strict=True))
+    rows = np.zeros(1, ROW)
+    twin.advance_rows(np.zeros(1), np.zeros((1, 3)), rows)
+    rows["wear_depth"] = np.arange(1.0, 9.0) * 1e-3
+    published = outputs.add(rows, np.array([T0]), THE_ONE)
+    named = dict(zip(CLEARANCE_NAMES, published.slow["clearance"][0], strict=True))
     # pads 1, 7 left; 3, 5 right; 0, 2 top; 4, 6 bottom
     assert named["horizontal"] == pytest.approx(0.025 + (2e-3 + 8e-3) / 2 + (4e-3 + 6e-3) / 2)
     assert named["vertical"] == pytest.approx(0.030 + (1e-3 + 3e-3) / 2 + (5e-3 + 7e-3) / 2)
@@ -200,16 +204,15 @@ def test_without_wear_the_interval_is_the_value() -> None:
 
 
 def test_the_wear_rate_times_the_time_is_the_growth(reference: Run) -> None:
-    slow = [publication for publication in reference.publications[:200] if publication.slow is not None]
-    assert [publication.stamp_ns // SLOW_PERIOD_NS for publication in slow] == sorted(
-        {publication.stamp_ns // SLOW_PERIOD_NS for publication in reference.publications[:200]}
-    )
+    stamps = [_stamp(publication) for publication in reference.publications[:200]]
+    slow = np.concatenate([publication.slow for publication in reference.publications[:200]])
+    spans = (slow["stamp_ns"] // SLOW_PERIOD_NS).tolist()
+    assert spans == sorted({stamp // SLOW_PERIOD_NS for stamp in stamps})
     for before, after in itertools.pairwise(slow):
-        assert before.slow is not None and after.slow is not None
-        grown = after.slow.clearance[2:10] - before.slow.clearance[2:10]
-        seconds = (after.stamp_ns - before.stamp_ns) * 1e-9
-        np.testing.assert_allclose(after.slow.wear_rate * seconds, grown, atol=1e-18)
-    assert max(publication.slow.wear_rate.max() for publication in slow if publication.slow is not None) > 0.0
+        grown = after["clearance"][2:10] - before["clearance"][2:10]
+        seconds = (int(after["stamp_ns"]) - int(before["stamp_ns"])) * 1e-9
+        np.testing.assert_allclose(after["wear_rate"] * seconds, grown, atol=1e-18)
+    assert slow["wear_rate"].max() > 0.0
 
 
 def test_running_in_and_sliding_in_the_plane_wear_live_as_offline_and_go_on_after_a_restart(tmp_path: Path) -> None:

@@ -26,14 +26,14 @@ SUBPACKAGES = (
 )
 CORE = {"kernel", "model", "solve", "run"}
 SAMPLE = (
-    ("message", "WrenchStamped, 1 kHz"),
-    ("ros/subscriptions | live/bridge", "to stamp and wrench; loss counted"),
-    ("stream/intake", "used, or dropped by a counted reason"),
-    ("stream/driver, session", "journal, then apply"),
-    ("run/twin, solve/loop", "steps from event to event up to the stamp"),
-    ("stream/outputs", "state, and peaks since the last one"),
-    ("ros/publishers | record/recorder", "topics | MCAP"),
-    ("record/replay", "the journal again: the same bits"),
+    ("ros/input_loop, input_queue", "messages as they come | live/bridge: files, MQTT"),
+    ("ros/subscriptions, live/inputs", "stamp and wrench; loss counted"),
+    ("live/runtime: step", "samples in, messages out"),
+    ("stream/driver, intake", "used, or dropped by a counted reason"),
+    ("stream/session: advance", "journal, then apply | record/replay comes in here"),
+    ("run/twin, solve/loop: advance_rows", "steps from event to event; one row for a sample"),
+    ("stream/outputs, live/publishing", "all since the publication before; bytes"),
+    ("ros/front: send | record/recorder", "topics | MCAP"),
 )
 
 

@@ -14,7 +14,7 @@ Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteor
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import Final
@@ -27,6 +27,7 @@ from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GAIN, MOVING, PROBES, QUANTITIES, SIZE, Unknowns
 from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -233,6 +234,39 @@ class Problem:
         rate[rows] = np.delete(motions.v, ends, axis=0)
         defect = states[1 : len(ends) + 1] - np.hstack((motions.q[ends], motions.v[ends]))
         return Point(shared, states, swing, residual, rate, motions.contact, defect)
+
+    def predicted(
+        self, point: Point, turns: Array | None = None, push: Array | None = None, share: Array | None = None,
+        change: Callable[[Scene], Scene] | None = None,
+    ) -> tuple[Array, Array] | None:  # fmt: skip
+        """Return poses and rates, (n, 3), at a point with something changed; NaN outside the swings.
+
+        Parameters
+        ----------
+        turns, push, share : ndarray, optional
+            Turns of the walls in m (4,); as `Forward.run`.
+        change : callable, optional
+            Returns another scene, perhaps with other terms.
+
+        Returns
+        -------
+        tuple of ndarray, or None
+            None where the model cannot be run.
+        """
+        times, rows = self.window.poses.t - point.shared[DELAY], np.flatnonzero(point.swing >= 0)
+        edges = np.searchsorted(point.swing[rows], np.arange(self.window.swings + 1)).astype(np.int64)
+        scene, forward = self.unknowns.scene_of(point.shared), self.forward
+        if change is not None:
+            scene, forward = change(scene), forward.of(change(self.unknowns.scene))
+        motions = forward.run(
+            scene, point.shared[GAIN], self.window.starts[:-1], point.states, edges, times[rows],
+            depth_of(self.turns if turns is None else turns), push, share,
+        )  # fmt: skip
+        if motions is None:
+            return None
+        q, v = np.full((len(times), 3), np.nan), np.zeros((len(times), 3))
+        q[rows], v[rows] = motions.q, motions.v
+        return q, v
 
     def cost(self, point: Point, variance: Array) -> float:
         """Return twice the negative logarithm of the posterior: Huber's function of the residuals and the prior.

@@ -43,8 +43,9 @@ LATEST_S: Final = 0.25
 APART_S: Final = 4e-3
 #: Poses from whose quick changes the noise is told: fewest, and most.
 _NOISE_ROWS: Final = (20, 400)
-#: Share of the head's weight that a correction may press a pair with, beyond its force.
+#: Share of the head's weight on earth that a correction may press a pair with, beyond its force.
 _PRESSED: Final = 0.5
+_STANDARD_GRAVITY: Final = 9.81
 #: Share of the clearances, as a standard deviation, by which the members of a new ensemble are apart at first, and rows
 #: over whose distance the rates of the measured poses are told.
 _APART, _RATE_ROWS = 0.12, 5
@@ -174,7 +175,7 @@ class Follower:
 
         One that is withdrawn lets the prior hold again.
         """
-        told = [found.horizontal_state is State.ESTIMATED, found.vertical_state is State.ESTIMATED]
+        told = [found.horizontal_state.known, found.vertical_state.known]
         if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
             if self.estimate is None:
                 return False
@@ -278,7 +279,7 @@ class Ensemble:
         self._gain, self._rng = gain, rng
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
-        weight = _PRESSED * scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2)
+        weight = _PRESSED * scene.head.mass_kg * _STANDARD_GRAVITY
         stiffness, exponent = np.array([one.contact.stiffness for one in scenes])[:, None], scene.contact.exponent
         self._pressed = stiffness, exponent, weight
         self._good = np.ones(members, dtype=bool)

@@ -64,25 +64,25 @@ class Forward:
         if self._implicit is None and scene.contact.restitution is not None:
             self._implicit = new_implicit(False)
         pieces = Pieces.through(load.t, load.wrench)
-        self._start, self._slope = pieces.start / inertias(scene), pieces.slope / inertias(scene)
+        self._start, self._slope = pieces.start, pieces.slope
         self._knots = pieces.knots
-        self._scene, self._load = scene, load
+        self._scene, self.load = scene, load
         self._work, self._log = new_work(), np.zeros(_LOG_SIZE, EVENT)
-        self._last: tuple[Scene, tuple[bytes, bytes | None], Any, Any] | None = None
+        self._last: tuple[Scene, tuple[bytes | None, ...], Any, Any] | None = None
         #: work done so far, in steps of the series
         self.work = 0
 
     def renewed(self) -> Forward:
         """Return another one for the same motions, with no work done."""
-        return Forward(self._scene, self._load)
+        return Forward(self._scene, self.load)
 
     def of(self, scene: Scene) -> Forward:
         """Return one of another nominal scene under the same load, with no work done."""
-        return Forward(scene, self._load)
+        return Forward(scene, self.load)
 
     def run(
         self, scene: Scene, gain: Array, starts: Array, states: Array, edges: NDArray[np.int64], times: Array,
-        depth: Array | None = None,
+        depth: Array | None = None, push: Array | None = None, share: Array | None = None,
     ) -> Motions | None:  # fmt: skip
         """Return the motions of `scene` under the load times `gain`, shape (3,), from several states.
 
@@ -96,13 +96,17 @@ class Forward:
             Times of the rows in s, rising within each run and not before its start.
         depth : ndarray, shape (8,), optional
             By how much each pad lies further out than the clearances say, in m.
+        push : ndarray, shape (3,), optional
+            A constant load beside the one believed, in N, N, N m.
+        share : ndarray, shape (8,), optional
+            Each pair's stiffness over the contact's.
 
         Returns
         -------
         Motions or None
             None where the head leaves the model's range.
         """
-        params, segments = self._compiled(scene, gain, depth)
+        params, segments = self._compiled(scene, gain, depth, push, share)
         records = new_records(state_type(self._terms), len(starts))
         records["y"] = body_states(states, scene.head.com_offset_m)
         if self._terms.hysteretic is not None:
@@ -122,16 +126,24 @@ class Forward:
             return None
         return Motions(q, v, np.array(totals["time_in_contact"]))
 
-    def _compiled(self, scene: Scene, gain: Array, depth: Array | None) -> tuple[Any, Any]:
+    def _compiled(
+        self, scene: Scene, gain: Array, depth: Array | None, push: Array | None, share: Array | None
+    ) -> tuple[Any, Any]:
         """Return parameters and segments of the load; many runs in a row differ by their states alone."""
-        others = gain.tobytes(), None if depth is None else depth.tobytes()
+        others = tuple(None if part is None else part.tobytes() for part in (gain, depth, push, share))
         if self._last is not None and self._last[:2] == (scene, others):
             return self._last[2:]
-        segments = np.zeros(len(self._knots), SEGMENT)
+        segments, inertia = np.zeros(len(self._knots), SEGMENT), inertias(scene)
         segments["knot"] = self._knots
-        segments["start"], segments["slope"] = self._start * gain, self._slope * gain
+        segments["start"] = self._start / inertia * gain
+        segments["slope"] = self._slope / inertia * gain
+        if push is not None:
+            segments["start"] += push / inertia
         params = compile_scene(scene, TOLERANCE, sampled=True).params
         if depth is not None:
             params["penetration_rows"][4] -= depth
+        if share is not None:
+            # a linear contact whose penetration counts so many times is so many times as stiff
+            params["penetration_rows"][:] *= share
         self._last = scene, others, params, segments
         return params, segments

@@ -26,9 +26,15 @@ class State(Enum):
     """How far a value can be relied on."""
 
     ESTIMATED = "estimated"
+    ROUGH = "rough"  #: the machine is not exactly the model: an interval that allows for it
     NOT_OBSERVABLE = "not_observable"  #: the motion does not tell it: what was known before, with its interval
     PRIOR = "prior"  #: nothing was measured
-    WITHDRAWN = "withdrawn"  #: model or sensor are suspect: the interval is not to be trusted
+    WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict themselves or every motion of the model
+
+    @property
+    def known(self) -> bool:
+        """Whether the measurements determine the value."""
+        return self in (State.ESTIMATED, State.ROUGH)
 
 
 @dataclass(frozen=True)
@@ -161,6 +167,9 @@ class Estimate:
         `vertical_right`, in m.
     forces_measured : ForcesUsed, optional
         How measured contact forces were used, where there were some.
+    differs : dict of str to (float, float, float)
+        Of each further quantity of machine and sensor the probability that it differs from the scene, and by how much
+        then: mean and standard deviation.
     """
 
     t_start: float
@@ -187,6 +196,7 @@ class Estimate:
     figures: dict[str, float] = field(default_factory=dict)
     groups: dict[str, tuple[Interval, State]] = field(default_factory=dict)
     forces_measured: ForcesUsed | None = None
+    differs: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def values(self) -> dict[str, Interval]:
         """Return all that is told, by the names of `QUANTITIES`."""
@@ -215,5 +225,9 @@ class Estimate:
             else {"names": list(CORRELATED), "matrix": [list(row) for row in self.correlation]},
             "figures": self.figures,
             "groups": {name: clearance(value, state) for name, (value, state) in self.groups.items()},
+            "differs": {
+                name: {"probability": share, "by": mean, "deviation": deviation}
+                for name, (share, mean, deviation) in self.differs.items()
+            },
             **({} if self.forces_measured is None else {"forces_measured": self.forces_measured.as_dict()}),
         }

@@ -120,6 +120,12 @@ class Units:
         unit["stiffness"] = self.force / length**contact.exponent
         unit["damping"] = 1.0 if contact.damping is None else self._damping(contact)
         converted: dict[str, Any] = {name: value.times(unit[name]) for name, value in found.values().items()}
+
+        def length_of(name: str) -> float:
+            if name == "filter":
+                return time**2
+            return length if name.startswith(("frame.", "turn_", "lever_")) else 1.0
+
         told = (f"all in units of {length:g} m, {self.mass:g} kg, {time:g} s: the machine is not of the paper's size",)
         return replace(
             found,
@@ -127,6 +133,10 @@ class Units:
             t_end=found.t_end * time,
             **converted,
             noise=None if found.noise is None else (found.noise[0] * length, found.noise[1] * length, found.noise[2]),
+            differs={
+                name: (share, by * length_of(name), deviation * length_of(name))
+                for name, (share, by, deviation) in found.differs.items()
+            },
             groups={name: (value.times(length), state) for name, (value, state) in found.groups.items()},
             forces_measured=None
             if found.forces_measured is None

@@ -111,6 +111,8 @@ _LEAST_CLEARANCE = 5e-4
 #: The law that a linear contact may have instead of the one believed.
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
+#: Least prior deviation: a number stated to be known exactly stays where it is.
+_HELD = 1e-6
 #: Largest prior deviation of a load's gain.
 _MOST_GAIN = 1.0
 
@@ -154,7 +156,7 @@ class Unknowns:
         damped = "contact.damping" if contact.restitution is None else "contact.restitution"
         deviation[DAMPING] = deviation_of(scene, damped)
         deviation[GAIN] = np.minimum(np.hypot(deviation[GAIN], load.gain_deviations()), _MOST_GAIN)
-        return Unknowns(scene, deviation, poses.deviation)
+        return Unknowns(scene, np.maximum(deviation, _HELD), poses.deviation)
 
     @property
     def damped(self) -> bool:

@@ -37,6 +37,8 @@ STUCK_ROWS, STUCK_MOTION = 12, 6.0
 STUCK_FOR_CERTAIN = 50
 #: Gain in chi^2 from which a change within the window counts, and its least size in m.
 CHANGE_CHI2, CHANGE_M = 200.0, 5e-4
+#: Share of what is left over beyond the noise that a change must explain to be one.
+CHANGE_SHARE = 0.25
 #: Moments of a window, about, at which a change is looked for.
 MOMENTS = 60
 #: Step from the law believed to another one in its standard deviations (at most 2.1 for 16 right models, seeds from
@@ -52,12 +54,18 @@ MOST_NOISE_RATIO = 2.0
 
 @dataclass
 class Verdict:
-    """What was found; `figures` are the statistics behind it; `by_scale`: only its scales are against the sensor."""
+    """What was found.
+
+    figures : the statistics behind it
+    by_scale : whether only its scales are against the sensor
+    broken : whether the sensor fails, or the data contradict themselves: nothing can be told then
+    """
 
     model: list[str] = field(default_factory=list)
     sensor: list[str] = field(default_factory=list)
     figures: dict[str, float] = field(default_factory=dict)
     by_scale: bool = False
+    broken: bool = False
 
 
 def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
@@ -224,6 +232,7 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
             moved = float(np.nanmax(span) - np.nanmin(span)) if np.isfinite(span).any() else 0.0
             if moved > STUCK_MOTION * max(noise_level(column[there][:, None])[0], 1e-5) or length > STUCK_FOR_CERTAIN:
                 verdict.sensor.append(f"{name}: the same value {length} times in a row")
+                verdict.broken = True
                 break
 
 
@@ -240,6 +249,7 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
         verdict.figures[f"noise_ratio_{name}"] = ratio
         if ratio > MOST_NOISE_RATIO:
             verdict.sensor.append(f"{name}: the noise of one part of the window is {ratio:.1f} times that of the rest")
+            verdict.broken = True
 
 
 def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
@@ -258,12 +268,27 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     for name, (gained, _) in best.items():
         verdict.figures[f"change_{name}"] = gained
     (bias, shift), (clearance, growth) = best["bias"], best["clearance"]
+    share = max(bias, clearance) / max(_excess(fit), 1e-9)
+    verdict.figures["change_share"] = share
     if max(bias, clearance) < CHANGE_CHI2:
         return
+    found = len(verdict.sensor) + len(verdict.model)
     if bias >= clearance and (np.abs(shift) * [1.0, 1.0, 0.2]).max() > CHANGE_M:
         verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
     elif clearance > bias and np.abs(growth).max() > CHANGE_M:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
+    # what a wrong load or law leaves over looks like a change too, which explains little of it
+    verdict.broken |= len(verdict.sensor) + len(verdict.model) > found and share > CHANGE_SHARE
+
+
+def _excess(fit: Fit) -> float:
+    """Return the sum of the residuals' squares beyond their quick noise, in those of the fit's variances."""
+    total = 0.0
+    for i in range(3):
+        quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
+        square = fit.point.residual[:, i] ** 2 - quick**2
+        total += float(np.nansum(square / fit.variance[:, i]))
+    return total
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:

@@ -120,7 +120,8 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "stale_inputs": "silent inputs, separated by commas",
     "clock": "running; under use_sim_time also waiting (for the first message on /clock) or paused",
     "recorder": "off, recording, or trouble (a loss, or it has stopped)",
-    "horizontal": "state of the interval of the horizontal clearance: prior, estimated, not_observable or withdrawn",
+    "horizontal": "state of the interval of the horizontal clearance: prior, estimated, rough, not_observable or "
+    "withdrawn",
     "vertical": "the same for the vertical clearance",
     "model": "agreement of the model with the measurements: ok or suspect; empty: no estimate yet",
     "sensor": "the same for the sensor of head_pose",

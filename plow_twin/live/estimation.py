@@ -147,7 +147,7 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
         ((result.horizontal, result.horizontal_state), (result.vertical, result.vertical_state))
     ):
         own = slice(3 * axis, 3 * axis + 3)
-        if state is State.ESTIMATED:
+        if state.known:
             shift[own] = np.array([value.mean, value.p05, value.p95]) - model[own]
         elif state is not State.NOT_OBSERVABLE:
             shift[own] = 0.0

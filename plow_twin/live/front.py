@@ -19,10 +19,9 @@ from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
 from plow_twin.record.mapping import Role, read_map, stamps_by, with_units
-from plow_twin.record.messages import DiagnosticStatus, JointState
+from plow_twin.record.messages import DiagnosticStatus, JointState, Message
 from plow_twin.record.sources import Arrived
 from plow_twin.record.unit_check import CHECKED, check_units
-from plow_twin.stream.outputs import Publication
 from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
@@ -72,7 +71,7 @@ class BridgeFront:
     ) -> None:
         self.name = NAME
         self.topics: Mapping[str, str] = {topic.name: f"/{topic.name}" for topic in TOPICS}
-        self.follows_samples = bridge.ends
+        self.follows_samples, self.sends_motion = bridge.ends, False
         self._bridge, self._settings, self._say = bridge, settings, say
         self.say_error = on_error
         self._said: Part | None = None
@@ -87,7 +86,7 @@ class BridgeFront:
             raise
         self._connected = {"excitation" if name == "drive" else name for name in self.roles}
         self.runtime = Runtime(self, settings, prepared)
-        self._feeder = Feeder(self.roles, self.runtime, model if "drive" in self.roles else None)
+        self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
 
     def now_ns(self) -> int:
@@ -95,25 +94,21 @@ class BridgeFront:
         # 0 would say that there is no time yet
         return (self._feeder.newest_ns or 1) if self.follows_samples else time.time_ns()
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
-        """Send nothing: the recording holds the messages. None when a number is not finite."""
-        if not publication.finite:
-            return None
-        forces_sent()
-        return {}
+    def send(self, topic: str, message: memoryview | Message) -> None:
+        """Say an alarm, an estimate or what follows from it (of forces their peaks); the recording holds the motion."""
+        if isinstance(message, DiagnosticStatus):
+            self._say(topic, (message.level, message.message, dict(message.values)))
+        elif isinstance(message, JointState):
+            numbers = message.position if len(message.position) else message.effort
+            values = zip(message.name, numbers.tolist(), strict=True)
+            self._say(topic, (0, "", {name: repr(value) for name, value in values}))
 
-    def publish_quality(self, marks: JointState) -> None:
-        """Send nothing, as `publish`."""
+    def look_for_senders(self, topic: str) -> None:
+        """Do nothing: the feeder knows its sender."""
 
-    def publish_alarms(self, status: DiagnosticStatus) -> None:
-        """Say the alarms."""
-        self._say("alarms", (status.level, status.message, dict(status.values)))
-
-    def publish_estimate(self, topic: str, message: JointState) -> None:
-        """Say an estimate, or what follows from it; of forces their peaks."""
-        numbers = message.position if len(message.position) else message.effort
-        values = zip(message.name, numbers.tolist(), strict=True)
-        self._say(topic, (0, "", {name: repr(value) for name, value in values}))
+    def sender_name(self, topic: str, sender: bytes) -> str:
+        """Return the name of a sender of an input."""
+        return sender.decode(errors="replace")
 
     def changed(self) -> None:
         """Say the status when it is another one."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
 
 from numpy.typing import NDArray
 
@@ -14,6 +14,9 @@ from plow_twin.stream.history import RecentStamps
 from plow_twin.stream.intake import Intake, Verdict
 from plow_twin.stream.limits import Limits
 from plow_twin.stream.senders import OneSender, Senders
+
+if TYPE_CHECKING:
+    from plow_twin.live.publishing import Front
 
 #: The inputs, as topics are named.
 TOPICS: Final = ("excitation", "tool_forces", "travel", "head_pose", "gaps")
@@ -30,60 +33,46 @@ class Inputs:
 
     Parameters
     ----------
+    front
+        Whom to ask for the time and for the senders that there are.
     source
         The input that the excitation comes on.
-    intake
-        What judges its samples; those that go no further are counted there.
-    on_travel
-        Receives stamp [ns] and speed along the face [m/s].
     depth
         Length of the queue of the excitation.
-    on_pose
-        Receives stamp [ns], x, y [m], theta [rad] and the standard deviations, if any, of measured poses, late ones up
-        to `pose_span_s` too; None: only the newest is kept.
-    on_gaps
-        Receives stamp [ns] and measured gaps [m] by number of their pairs, in order and late ones as poses.
+    late_span_s
+        How late a measured pose or gap may be [s].
+    journaled
+        Whether messages that are not used are collected for the journal.
+    intake
+        Settings of the intake that judges the excitation, as of `Intake`.
     """
 
     def __init__(
-        self,
-        source: str,
-        intake: Intake,
-        on_travel: Callable[[int, float], None],
-        depth: int,
-        on_pose: Callable[[int, tuple[float, float, float], tuple[float, ...]], None] | None = None,
-        pose_span_s: float = 0.0,
-        on_gaps: Callable[[int, Mapping[int, float]], None] = lambda stamp_ns, gaps: None,
+        self, front: Front, source: str, depth: int, late_span_s: float, *, journaled: bool, **intake: Any
     ) -> None:
-        self._source, self._intake = source, intake
+        self._front, self._source = front, source
+        #: judges the samples of the load; those that go no further are counted there
+        self.intake = Intake(on_unused=self._sample_unused, **intake)
         #: what is not used, for the journal
-        self.unused = UnusedMessages()
+        self.unused = UnusedMessages(journaled)
         #: topic and sender of the message that is being taken in, where it is not one of the source
         self.arriving = ("", b"")
-        self._on_pose = on_pose
-        self._poses = None if on_pose is None else RecentStamps(pose_span_s)
-        self._on_travel = on_travel
+        self._poses, self._gap_stamps = RecentStamps(late_span_s), RecentStamps(late_span_s)
         self.depth = depth
         #: whether samples are taken
         self.active = False
-        #: tells whether the clock that time is to follow has not come yet
-        self.without_clock: Callable[[], bool] = lambda: False
+        #: whether the journal is open: with a clock, or with the first sample
+        self.started = False
         #: senders of the selected source
         self.senders = Senders()
         #: senders of the optional inputs
         self.optional = {topic: OneSender() for topic in OPTIONAL}
-        #: called with the input when it may be that its followed sender has gone
-        self.look_for_senders: Callable[[str], None] = lambda topic: None
         self._queue_peak = (0, 0.0)
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
         #: messages that were sent and could not be read, as far as the transport tells
         self.lost = 0
-        self.travel, self.head_pose, self.gaps = Intake(), Intake(), Intake()
-        for judge in (intake, self.travel, self.head_pose, self.gaps):
-            judge.on_unused = self._sample_unused if judge is intake else self._unused
-        self._on_gaps = on_gaps
-        self._gap_stamps = RecentStamps(pose_span_s)
+        self.travel, self.head_pose, self.gaps = (Intake(on_unused=self._unused) for _ in OPTIONAL)
         self._gap_limits: Limits | None = None
         #: newest stamp [ns] and gap [m] of each pair
         self._newest_gaps: dict[int, tuple[int, float]] = {}
@@ -135,9 +124,9 @@ class Inputs:
         if not followed:
             self._other_heard(self._source, sender, stamp_ns, values)
         elif not self.active:
-            self._intake.refuse(Verdict.INACTIVE, stamp_ns, values)
+            self.intake.refuse(Verdict.INACTIVE, stamp_ns, values)
         else:
-            self._intake.refuse(Verdict.MALFORMED, stamp_ns, values)
+            self.intake.refuse(Verdict.MALFORMED, stamp_ns, values)
         return False
 
     def lost_at_first(self, sender: bytes, more: int) -> bool:
@@ -151,7 +140,7 @@ class Inputs:
     def _other_heard(self, topic: str, sender: bytes, stamp_ns: int, values: Sequence[float]) -> None:
         """Take note of a message of a sender that is not followed."""
         if topic not in self.other_senders():
-            self.look_for_senders(topic)
+            self._front.look_for_senders(topic)
         self._other_heard_ns[topic] = time.monotonic_ns()
         self.unused.note(topic, sender, "not_followed", stamp_ns, values)
 
@@ -163,52 +152,41 @@ class Inputs:
             self._other_heard(topic, sender, stamp_ns, values)
         return followed
 
-    def take_travel(self, stamp_ns: int, speed_m_s: float) -> None:
-        """Take in a speed along the face."""
+    def uses_travel(self, stamp_ns: int, speed_m_s: float) -> bool:
+        """Take in a speed along the face; True when it is used."""
         if not self._follows("travel", stamp_ns, (speed_m_s,)):
-            return
-        if self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used:
-            self._on_travel(stamp_ns, speed_m_s)
+            return False
+        return self._judged("travel", self.travel, stamp_ns, (speed_m_s,)).used
 
-    def take_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
+    def uses_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> bool:
         """Take in a measured pose: x, y [m], theta [rad], and their standard deviations where they are known.
 
-        A component that was not measured is NaN, not all of them.
+        A component that was not measured is NaN, not all of them. True when the pose is used.
         """
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
-            return
+            return False
         missing = [math.isnan(value) for value in pose]
         # what was not measured breaks no limit
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
-        if not verdict.used:
-            return
-        if verdict is not Verdict.WORKED_IN:
+        if verdict.used and verdict is not Verdict.WORKED_IN:
             self._newest_pose = judged
             if not any(missing):
                 self.measured = pose
-        if self._on_pose is not None and self._poses is not None:
-            if verdict.resets:
-                self._poses.clear()
-            self._poses.add(stamp_ns)
-            self._on_pose(stamp_ns, pose, deviation)
+        return verdict.used
 
-    def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
-        """Take in measured gaps [m] by number of their pairs."""
+    def uses_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
+        """Take in measured gaps [m] by number of their pairs; True when they are used."""
         values = tuple(gaps.values())
         if not self._follows("gaps", stamp_ns, values):
-            return
+            return False
         if self.active and self._is_implausible(stamp_ns, gaps):
             self.gaps.refuse(Verdict.IMPLAUSIBLE, stamp_ns, values)
-            return
+            return False
         verdict = self._judged("gaps", self.gaps, stamp_ns, values, self._gap_stamps)
-        if verdict.used:
-            if verdict.resets:
-                self._gap_stamps.clear()
-            self._gap_stamps.add(stamp_ns)
-            if verdict is not Verdict.WORKED_IN:
-                self._newest_gaps |= {pair: (stamp_ns, gap) for pair, gap in gaps.items()}
-            self._on_gaps(stamp_ns, gaps)
+        if verdict.used and verdict is not Verdict.WORKED_IN:
+            self._newest_gaps |= {pair: (stamp_ns, gap) for pair, gap in gaps.items()}
+        return verdict.used
 
     def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
         """Tell whether a gap is larger than it can be, or has changed faster since the newest one of its pair."""
@@ -225,13 +203,17 @@ class Inputs:
     def _judged(
         self, topic: str, intake: Intake, stamp_ns: int, values: tuple[float, ...], history: RecentStamps | None = None
     ) -> Verdict:
-        if not self.active or self.without_clock():
+        if not self.active or (not self.started and self._front.now_ns() == 0):
             refused = Verdict.NO_CLOCK if self.active else Verdict.INACTIVE
             intake.refuse(refused, stamp_ns, values)
             return refused
         verdict = intake.judge(stamp_ns, values, history=history)
         if verdict.used:
             self._heard_ns[topic] = time.monotonic_ns()
+            if history is not None:
+                if verdict.resets:
+                    history.clear()
+                history.add(stamp_ns)
         return verdict
 
     def _sample_unused(self, verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:

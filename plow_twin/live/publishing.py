@@ -1,27 +1,26 @@
-"""From a publication of the session to the front, the recording and the alarms, with what is counted on the way."""
+"""From what is published to messages: what is sent, what is recorded, which alarms follow, and what is counted."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Final, Protocol
+from collections.abc import Callable, Iterator, Mapping
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.live.parameters import Settings
 from plow_twin.record.alarms import ALARMS, alarms_message
-from plow_twin.record.messages import DiagnosticStatus, JointState
-from plow_twin.record.outputs import quality
+from plow_twin.record.messages import Message
 from plow_twin.stream.alarms import Alarms
 from plow_twin.stream.health import DurationHistogram
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import Published
 
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
 
-#: Topic of the marks.
-QUALITY: Final = "quality"
+#: Base name of the topic, and the message: as bytes where it follows from the record of a publication.
+Outgoing = tuple[str, memoryview | Message]
 
 
 class Front(Protocol):
@@ -35,30 +34,26 @@ class Front(Protocol):
         Resolved names of the outputs by their base names.
     follows_samples : bool
         Whether time is that of the samples alone (`/clock`, a file): nothing is held for want of them.
+    sends_motion : bool
+        Whether messages of the motion are sent; else they are at most recorded.
     """
 
     name: str
     topics: Mapping[str, str]
     follows_samples: bool
+    sends_motion: bool
 
     def now_ns(self) -> int:
         """Return the time on the clock of the stamps [ns]."""
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
-        """Send the messages of a publication; call `forces_sent` right after the forces.
+    def send(self, topic: str, message: memoryview | Message) -> None:
+        """Send a message on the topic of that base name."""
 
-        Returns the bytes that were sent by base name of the topic, none of them where nothing is recorded; None, and
-        nothing is sent, when a number is not finite.
-        """
+    def look_for_senders(self, topic: str) -> None:
+        """Find out whether the followed sender of an input is still there."""
 
-    def publish_quality(self, marks: JointState) -> None:
-        """Send the marks of a publication that has some, or follows one that had."""
-
-    def publish_alarms(self, status: DiagnosticStatus) -> None:
-        """Send the alarms."""
-
-    def publish_estimate(self, topic: str, message: JointState) -> None:
-        """Send an estimate, or what follows from it, on one of `ESTIMATES`."""
+    def sender_name(self, topic: str, sender: bytes) -> str:
+        """Return the name of a sender of an input."""
 
     def changed(self) -> None:
         """Take note that the state of the stream may have changed."""
@@ -93,60 +88,67 @@ class Publishing:
         on_alarm: Callable[[str], object],
     ) -> None:
         self._front, self.alarms, self.recording, self._on_alarm = front, alarms, recording, on_alarm
-        self._frame_id, self._head = settings.frame_id, settings.hardware_id
+        self._head = settings.hardware_id
+        self._messages = None
+        if front.sends_motion:
+            from plow_twin.record.sending import Messages
+
+            self._messages = Messages(settings.frame_id, settings.child_frame_id)
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
         #: publications, and those that were not published because a number was not finite
         self.published = self.withheld = 0
-        #: frames computed without a sample, and frames after late samples have been worked in
+        #: publications computed without a sample, and publications after late samples have been worked in
         self.held_frames = self.corrected_frames = 0
-        #: steady time at which what is published next was received [ns]; 0: it answers no message
+        #: steady time at which the samples of the next publication were received [ns]; 0: it answers no message
         self.received_ns = 0
-        self._newest: Publication | None = None
+        #: newest pose that was published
+        self.q: NDArray[np.float64] | None = None
 
     @property
-    def q(self) -> NDArray[np.float64] | None:
-        """Newest pose that was published."""
-        return None if self._newest is None else self._newest.q
+    def memory(self) -> Mapping[str, memoryview]:
+        """The memory that holds each message of the motion when it is sent, by base name of its topic."""
+        return {} if self._messages is None else self._messages.memory
 
-    def publish(self, publication: Publication | None) -> None:
-        """Send a publication, take note of its age and its alarms, and hand it to the recording."""
-        if publication is None:
+    def messages(self, published: Published) -> Iterator[Outgoing]:
+        """Yield the messages of a publication of at most one row, forces first; nothing when a number is not finite.
+
+        Between them latency and age are counted, alarms are looked at, and the recording gets its share.
+        """
+        rows, _ = published
+        if not len(rows):
             return
-        sent = self._front.publish(publication, self._forces_sent)
-        if sent is None:
+        sent = () if self._messages is None else self._messages.write(published)
+        if not (sent or (self._messages is None and published.finite)):
             self.withheld += 1
             return
-        self._newest, marks = publication, None
-        if publication.marked:
-            self.held_frames += publication.held
-            self.corrected_frames += publication.corrected
-            marks = quality(publication, self._frame_id)
-            self._front.publish_quality(marks)
+        if sent:
+            yield sent[0]
+        if self.received_ns:
+            self.latency.add((time.monotonic_ns() - self.received_ns) * 1e-9)
+        yield from sent[1:]
+        self.q, stamp_ns = rows["q"][0], int(rows["stamp_ns"][0])
         self.published += 1
-        changed = self.alarms.take(publication)
+        if rows["marked"][0]:
+            self.held_frames += int(rows["held"][0])
+            self.corrected_frames += int(rows["corrected"][0])
+        changed = list(self.alarms.take(published))
         if self.received_ns and not self._front.follows_samples:
-            self.age.add((time.time_ns() - publication.stamp_ns) * 1e-9)
+            self.age.add((time.time_ns() - stamp_ns) * 1e-9)
         if self.recording:
-            self.recording.publication(publication, sent)
-            if marks is not None:
-                self.recording.message(QUALITY, publication.stamp_ns, marks)
+            self.recording.publication(published, {topic: data.tobytes() for topic, data in sent})
         if changed:
-            self.alarms_changed(publication.stamp_ns)
+            yield from self.alarms_changed(stamp_ns)
 
-    def alarms_changed(self, stamp_ns: int) -> None:
-        """Send the alarms, a level of which has changed."""
-        self.send_alarms(stamp_ns)
+    def alarms_changed(self, stamp_ns: int) -> Iterator[Outgoing]:
+        """Yield the alarms, a level of which has changed."""
+        yield self.alarms_now(stamp_ns)
         if self.alarms.raised:
             self._on_alarm(f"alarm: {', '.join(self.alarms.raised)}")
 
-    def send_alarms(self, stamp_ns: int) -> None:
-        """Send the alarms as they are."""
+    def alarms_now(self, stamp_ns: int) -> Outgoing:
+        """Return the alarms as they are."""
         status = alarms_message(self.alarms, self._front.name, self._head)
-        self._front.publish_alarms(status)
         if self.recording:
             self.recording.message(ALARMS, stamp_ns, status)
-
-    def _forces_sent(self) -> None:
-        if self.received_ns:
-            self.latency.add((time.monotonic_ns() - self.received_ns) * 1e-9)
+        return ALARMS, status

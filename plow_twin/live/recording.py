@@ -14,11 +14,12 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.decimation import Decimation
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import Message
+from plow_twin.record.outputs import marks
 from plow_twin.record.recorder import LossReport, Recorder, RecorderCounters
 from plow_twin.record.writer import in_free_folder
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Session
 
 _QUEUE_SIZE: Final = 20_000
@@ -50,7 +51,7 @@ class Recording:
         clock: Callable[[], int] | None,
         on_error: Callable[[str], None],
     ) -> None:
-        self._topics = topics
+        self._topics, self._frame_id = topics, settings.frame_id
         header = RunHeader(
             scene_yaml=dump_scene(scene),
             tol=settings.tolerance,
@@ -90,11 +91,15 @@ class Recording:
         """Counters as of now."""
         return self._recorder.counters
 
-    def publication(self, publication: Publication, sent: Mapping[str, bytes]) -> None:
+    def publication(self, published: Published, sent: Mapping[str, bytes]) -> None:
         """Take the messages of a publication that has been published; `sent`: their bytes, where there are some."""
-        wanted = self._decimation.take(publication)
+        wanted = self._decimation.take(published)
         if wanted is not None:
-            self._recorder.publication(wanted, sent if wanted is publication else {})
+            self._recorder.publication(wanted, sent if wanted is published else {})
+        if published.rows["marked"][0] and not (sent and wanted is published):
+            stamp_ns = int(published.rows["stamp_ns"][0])
+            for topic, message in marks(published, self._frame_id).items():
+                self.message(topic, stamp_ns, message)
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
         """Take another message that has been published on the topic of that base name."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 from plow_twin.errors import ArgumentError
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
-from plow_twin.live.publishing import Front, Publishing
+from plow_twin.live.publishing import Front, Outgoing, Publishing
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import KeptWear, WearKeeper
 from plow_twin.model.scene import Scene, fastest_travel
@@ -26,7 +26,7 @@ from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.record.wear_state import scene_identity
 from plow_twin.stream.driver import Arrival, Driver, Policy
 from plow_twin.stream.health import Periods
-from plow_twin.stream.intake import Intake, Verdict
+from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose
 from plow_twin.stream.limits import Limits, excitation_limits, pose_limits, value_limits
 from plow_twin.stream.model_changes import changed_scene, changed_twin
@@ -113,25 +113,25 @@ class Runtime:
             rollback_span_s=settings.rollback_span,
             wear_depth=depth,
         )
-        every_sample = settings.publish_mode == "on_sample"
-        self.driver = Driver(session, self._intake(), policy(settings), every_sample=every_sample)
         self.inputs = Inputs(
+            front,
             self.source,
-            self.driver.intake,
-            self.driver.travel,
             settings.input_depth,
-            self._pose,
             settings.rollback_span,
-            self._gaps,
+            journaled=self.recording is not None,
+            jump_back_s=settings.jump_back,
+            jump_forward_s=settings.jump_forward,
+            expected_rate_hz=settings.expected_rate,
+            limits=limits(settings, self.scene),
         )
-        self.inputs.without_clock = lambda: self._start_due and self.without_clock
+        every_sample = settings.publish_mode == "on_sample"
+        self.driver = Driver(session, self.inputs.intake, policy(settings), every_sample=every_sample)
         self._set_limits(settings)
-        if self.recording:
-            self.inputs.unused.journal = session.emit
 
     def start(self) -> None:
         """Open the journal; nothing of the front can fail any more. Without a clock the first sample opens it."""
         self._start_due = self.without_clock
+        self.inputs.started = not self._start_due
         self.clock = "waiting" if self._start_due else "running"
         if not self._start_due:
             self.driver.session.start()
@@ -220,6 +220,10 @@ class Runtime:
     def missed_periods(self) -> int:
         """Periods left out between two reports from which on there is a warning; 0: none."""
         return self.settings.missed_periods
+
+    def send_alarms(self) -> None:
+        """Send the alarms as they are."""
+        self._send([self.publishing.alarms_now(self.stamp_ns)])
 
     def mark(self, text: str) -> tuple[bool, str]:
         """Put a text into the journal and have the ring written, if there is one."""
@@ -318,8 +322,8 @@ class Runtime:
             value_limits(settings.limit_gap or pose_limits(self.scene).largest[0], settings.limit_gap_rate),
         )
 
-    def samples(self, arrived: list[Arrival]) -> None:
-        """Take samples in order of arrival."""
+    def step(self, arrived: list[Arrival]) -> Iterator[Outgoing]:
+        """Take samples in order of arrival; yield what is to be sent, each message before more is computed."""
         if self._start_due:
             self.start()
         if self._start_due:
@@ -332,18 +336,22 @@ class Runtime:
         if self._early:
             arrived, self._early = self._early + arrived, []
         self.publishing.received_ns = now_ns = time.monotonic_ns()
-        for publication in self.driver.samples(arrived, now_ns):
-            self.publishing.publish(publication)
+        for published in self.driver.samples(arrived, now_ns):
+            yield from self.publishing.messages(published)
         self._advanced(len(arrived))
+
+    def _send(self, outgoing: Iterable[Outgoing]) -> None:
+        for topic, message in outgoing:
+            self._front.send(topic, message)
 
     def silence(self) -> float:
         """Go on without samples when they have been missing for too long; return how long that cannot be so [s]."""
         holds, now_ns = self.driver.holds, time.monotonic_ns()
-        publication = self.driver.silence(now_ns)
-        if publication is not None or self.driver.holds != holds:
-            # what is published next answers no message
+        published = self.driver.silence(now_ns)
+        if len(published.rows) or self.driver.holds != holds:
+            # the next publication answers no message
             self.publishing.received_ns = 0
-            self.publishing.publish(publication)
+            self._send(self.publishing.messages(published))
             self._advanced()
         return self.driver.quiet_ns(now_ns) * 1e-9
 
@@ -356,23 +364,14 @@ class Runtime:
             if self._start_due:
                 return
         self.publishing.received_ns = now_ns = time.monotonic_ns()
-        self.publishing.publish(self.driver.clock_tick(self._front.now_ns(), now_ns))
+        self._send(self.publishing.messages(self.driver.clock_tick(self._front.now_ns(), now_ns)))
         self._advanced()
 
     def publish_due(self) -> None:
         """Publish all since the last publication."""
         if self.periods:
             self.periods.turn(time.monotonic())
-        self.publishing.publish(self.driver.due())
-
-    def _intake(self) -> Intake:
-        settings = self.settings
-        return Intake(
-            jump_back_s=settings.jump_back,
-            jump_forward_s=settings.jump_forward,
-            expected_rate_hz=settings.expected_rate,
-            limits=limits(settings, self.scene),
-        )
+        self._send(self.publishing.messages(self.driver.due()))
 
     def _record(self) -> Recording | None:
         if not self.settings.record_path:
@@ -407,23 +406,33 @@ class Runtime:
 
         return both
 
-    def _pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...]) -> None:
+    def take_travel(self, stamp_ns: int, speed_m_s: float) -> None:
+        """Take a speed along the face."""
+        if self.inputs.uses_travel(stamp_ns, speed_m_s):
+            self.driver.travel(stamp_ns, speed_m_s)
+
+    def take_pose(self, stamp_ns: int, pose: tuple[float, float, float], deviation: tuple[float, ...] = ()) -> None:
+        """Take a measured pose, as `Inputs.uses_pose`."""
+        if not self.inputs.uses_pose(stamp_ns, pose, deviation):
+            return
         known = tuple(index for index, value in enumerate(pose) if math.isfinite(value))
         if len(known) < len(pose):
             self.driver.session.apply(PartOfPose(stamp_ns, known, tuple(pose[index] for index in known)))
             return
         self.driver.session.apply(Pose(stamp_ns, pose, deviation))
         if self.alarms.take_pose(stamp_ns, pose):
-            self.publishing.alarms_changed(stamp_ns)
+            self._send(self.publishing.alarms_changed(stamp_ns))
 
-    def _gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
-        self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))
+    def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
+        """Take measured gaps [m] by number of their pairs."""
+        if self.inputs.uses_gaps(stamp_ns, gaps):
+            self.driver.session.apply(Gaps(stamp_ns, tuple(gaps), tuple(gaps.values())))
 
     def _look_for_estimate(self) -> None:
         assert self.estimation is not None
         messages = self.estimation.poll(self.driver.session)
         for topic, message in messages.items():
-            self._front.publish_estimate(topic, message)
+            self._front.send(topic, message)
             if self.recording:
                 self.recording.message(topic, message.stamp_ns, message)
         if messages:
@@ -431,12 +440,13 @@ class Runtime:
 
     def _look_for_clock(self) -> None:
         if self._start_due and not self.without_clock:
-            self.samples([])
+            self._send(self.step([]))
 
     def _journal_unused(self) -> None:
         """Put what was not used into the journal, once there is one."""
         if not self._start_due:
-            self.inputs.unused.flush()
+            for entry in self.inputs.unused.taken(self._front.sender_name):
+                self.driver.session.emit(entry)
 
     def save_wear(self) -> None:
         """Have the wear saved, if it is kept."""

@@ -53,7 +53,7 @@ class Services:
         """Let go the alarms that are latched."""
         left = self._runtime.alarms.acknowledge()
         self._runtime.driver.parameter(ACKNOWLEDGED, self._runtime.stamp_ns)
-        self._runtime.publishing.send_alarms(self._runtime.stamp_ns)
+        self._runtime.send_alarms()
         return True, f"still there: {', '.join(left)}" if left else "no alarm is left"
 
     def forecast(self) -> tuple[bool, str]:

@@ -22,18 +22,21 @@ class _Pending:
 
 
 class UnusedMessages:
-    """Collect messages that are not used, so that a flood of them makes few entries of the journal."""
+    """Collect messages that are not used, so that a flood of them makes few entries of the journal.
 
-    def __init__(self) -> None:
-        #: receives the entries; None: nobody wants them
-        self.journal: Callable[[Unused], object] | None = None
-        #: tells the name of a sender of an input
-        self.name_of: Callable[[str, bytes], str] = lambda topic, sender: sender.decode(errors="replace")
+    Parameters
+    ----------
+    wanted
+        Whether there is a journal for them.
+    """
+
+    def __init__(self, wanted: bool) -> None:
+        self._wanted = wanted
         self._pending: dict[tuple[str, bytes, str], _Pending] = {}
 
     def note(self, topic: str, sender: bytes, reason: str, stamp_ns: int, values: Sequence[float]) -> None:
         """Take note of one message."""
-        if self.journal is None:
+        if not self._wanted:
             return
         pending = self._pending.setdefault((topic, sender, reason), _Pending())
         pending.count += 1
@@ -42,15 +45,15 @@ class UnusedMessages:
             pending.values.append(tuple(map(float, values)))
 
     def note_lost(self, topic: str, sender: bytes, count: int) -> None:
-        """Take note of messages that were sent and have not arrived; a `count` below 0: that came after all."""
-        if self.journal is not None and count:
+        """Take note of messages that were sent and have not arrived; a `count` below 0: they came after all."""
+        if self._wanted and count:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 
-    def flush(self) -> None:
-        """Hand over what has been collected."""
+    def taken(self, name_of: Callable[[str, bytes], str]) -> list[Unused]:
+        """Return the entries of what has been collected, and forget it; `name_of` names a sender of an input."""
         pending, self._pending = self._pending, {}
-        for (topic, sender, reason), found in pending.items():
-            if self.journal is not None and found.count:
-                name = self.name_of(topic, sender)
-                rows = tuple(found.stamps_ns), tuple(found.values)
-                self.journal(Unused(topic, name, reason, found.count, *rows))
+        return [
+            Unused(topic, name_of(topic, sender), reason, found.count, tuple(found.stamps_ns), tuple(found.values))
+            for (topic, sender, reason), found in pending.items()
+            if found.count
+        ]

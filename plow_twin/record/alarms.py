@@ -15,7 +15,7 @@ from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
 from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.journal import Parameter, Pose
-from plow_twin.stream.outputs import Publication, Publications
+from plow_twin.stream.outputs import Published
 
 #: Base name of their topic.
 ALARMS: Final = "alarms"
@@ -75,11 +75,6 @@ class AlarmCheck:
         self._recorded.clear()
         self._computed.clear()
 
-    def publication(self, sequence: int, step: int, publication: Publication) -> None:
-        """Update the alarms with the publication after entry `sequence`, the advance number `step`."""
-        if self.possible and publication.finite and self._alarms.take(publication):
-            self._say(sequence, step)
-
     def pose(self, sequence: int, step: int, pose: Pose) -> None:
         """Update the alarms with a measured pose of the journal."""
         if self.possible and self._alarms.take_pose(pose.stamp_ns, pose.pose):
@@ -91,27 +86,32 @@ class AlarmCheck:
             self._alarms.acknowledge()
             self._say(sequence, step)
 
-    def publications(
+    def published(
         self,
         sequence: NDArray[np.int64],
         step: NDArray[np.int64],
-        publications: Publications,
-        poses: Sequence[tuple[int, int, Pose]],
+        published: Published,
+        poses: Sequence[tuple[int, int, Pose]] = (),
     ) -> None:
-        """Update the alarms with publications and the poses between them, each with its number and step."""
+        """Take in what was published after entries, each with its number and step, and the poses between them."""
         if not self.possible:
             return
         if not self._alarms.follows_poses:
-            for index in self._alarms.take_many(publications):
-                self._say(int(sequence[index]), int(step[index]))
+            self._take(sequence, step, published)
             return
         waiting = deque(poses)
         for index, place in enumerate(sequence.tolist()):
             while waiting and waiting[0][0] <= place:
                 self.pose(*waiting.popleft())
-            self.publication(place, int(step[index]), publications[index])
+            self._take(sequence[index:], step[index:], published.at(index))
         for pose in waiting:
             self.pose(*pose)
+
+    def _take(self, sequence: NDArray[np.int64], step: NDArray[np.int64], published: Published) -> None:
+        if len(published.rows) == 1 and not published.finite:
+            return  # it was not sent
+        for index in self._alarms.take(published):
+            self._say(int(sequence[index]), int(step[index]))
 
     def recorded(self, record: OutputRecord) -> None:
         """Queue a recorded message for comparison."""

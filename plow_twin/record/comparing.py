@@ -9,15 +9,16 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.chunks import Messages
-from plow_twin.record.outputs import PUBLICATION_TOPICS, SLOW_TOPICS, head_numbers
+from plow_twin.record.outputs import REPLAYED
 from plow_twin.record.template import STAMP_AT, Indexes, Templates, compiled, stamp_word
 from plow_twin.record.words import eight_differ, fetch, word, word_at
-from plow_twin.stream.outputs import Publications
+from plow_twin.stream.outputs import Published
+from plow_twin.stream.topics import Cadence
 
-_KINDS = len(PUBLICATION_TOPICS)
+_KINDS = len(REPLAYED)
 #: Messages ahead that are fetched, a cache line [B] after the other.
 _FETCHED, _LINE = 4, 64
-_IS_SLOW = np.array([name in SLOW_TOPICS for name in PUBLICATION_TOPICS])
+_IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 
 
 class Sent:
@@ -26,7 +27,7 @@ class Sent:
     Parameters
     ----------
     sequence, kind : ndarray of int64, shape (n,)
-        Numbers of the journal, rising, and the messages' places in `PUBLICATION_TOPICS` (-1: another topic).
+        Numbers of the journal, rising, and the messages' places in `REPLAYED` (-1: another topic).
     done : ndarray of int64, shape (k,)
         Advances up to each entry of the run, whose first one has the number `first`.
     advances
@@ -48,21 +49,17 @@ class Sent:
         self.publication = np.empty(advances, np.int64)
         self.publication[self.taken] = np.arange(len(self.taken))
 
-    def expect(self, publications: Publications, templates: Templates, kinds: NDArray[np.bool_]) -> None:
-        """Take the publications after the advances `taken`; only `kinds` of their messages are compared."""
-        now = publications
-        slow, motion = np.full(len(now), -1), np.empty((len(now), 7))
-        slow[now.slow_index] = np.arange(len(now.slow_index))
-        head_numbers(now.q, now.v, motion)
-        numbers = (
-            (now.penetration, now.rate, now.force), (now.makes.astype(np.float64), now.impulse, now.peak),
-            (motion,), (now.clearance,), (now.wear_rate,),
-        )  # fmt: skip
+    def expect(self, published: Published, templates: Templates, kinds: NDArray[np.bool_]) -> None:
+        """Take what is published after the advances `taken`; only `kinds` of its messages are compared."""
+        rows, slow = published
+        slow_of = np.full(len(rows), -1)
+        slow_of[slow["row"]] = np.arange(len(slow))
+        numbers = [topic.numbers(topic.record_of(published)) for topic in REPLAYED]
         #: kept alive: they are read by their addresses
         self._numbers = [[_with_whole_rows(part) for part in parts] for parts in numbers]
         self._expected = (
-            self.publication, slow, kinds, now.stamp_ns, *_pieces(self._numbers, templates),
-            templates.data, templates.fixed, templates.ends,
+            self.publication, slow_of, kinds, np.ascontiguousarray(rows["stamp_ns"]),
+            *_pieces(self._numbers, templates), templates.data, templates.fixed, templates.ends,
         )  # fmt: skip
 
     def differing(self, messages: Messages, chosen: slice) -> list[int]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import Published
 
 
 class Decimation:
@@ -29,19 +27,20 @@ class Decimation:
         self._impulse = np.zeros(PAIR_COUNT)
         self._peak = np.zeros(PAIR_COUNT)
 
-    def take(self, publication: Publication) -> Publication | None:
-        """Return what to record now, or None."""
+    def take(self, published: Published) -> Published | None:
+        """Return what to record now of a publication of one row, or None."""
         if self._outputs == "all":
-            return publication
+            return published
         if self._outputs == "none":
             return None
-        self._impulse += publication.impulse
-        np.maximum(self._peak, publication.peak, out=self._peak)
-        span = publication.stamp_ns // self._span_ns
-        if span == self._kept and publication.slow is None:
+        rows, slow = published
+        self._impulse += rows["impulse"][0]
+        np.maximum(self._peak, rows["peak"][0], out=self._peak)
+        span = int(rows["stamp_ns"][0]) // self._span_ns
+        if span == self._kept and not len(slow):
             return None
-        self._kept = span
-        kept = replace(publication, impulse=self._impulse.copy(), peak=self._peak.copy())
+        self._kept, rows = span, rows.copy()
+        rows["impulse"], rows["peak"] = self._impulse, self._peak
         self._impulse[:] = 0.0
         self._peak[:] = 0.0
-        return kept
+        return Published(rows, slow)

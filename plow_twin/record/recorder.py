@@ -26,9 +26,9 @@ from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.record.outputs import PUBLICATION_TOPICS, SLOW_TOPICS
 from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
-from plow_twin.stream.outputs import Publication, Publications
+from plow_twin.stream.outputs import Published
+from plow_twin.stream.topics import Cadence, names_of
 
 if TYPE_CHECKING:
     from plow_twin.record.ring import RingWriter
@@ -146,10 +146,14 @@ class Recorder:
         self._mark: Path | None = None  # folder that the ring is written to next
         self._marks = self._marks_lost = 0
         self._mark_error: str | None = None
-        self._publication_topics = {name: header.topic(name) for name in PUBLICATION_TOPICS}
-        # topics of a publication without and with its slow part
-        each = tuple(topic for name, topic in self._publication_topics.items() if name not in SLOW_TOPICS)
-        self._topics_of = each, tuple(self._publication_topics.values())
+        each, slow, marked = (
+            tuple(map(header.topic, names_of(cadence))) for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED)
+        )
+        #: topics of a publication, by whether it has a slow part and whether it is marked
+        self._topics_of = {
+            (False, False): each, (True, False): each + slow, (False, True): each + marked,
+            (True, True): each + slow + marked,
+        }  # fmt: skip
         self._limits = (part_bytes, part_s, keep_bytes)
         self._split_due = False
         self._part_since = time.monotonic()
@@ -250,21 +254,20 @@ class Recorder:
             self._lost[topic] += 1
             return False
 
-    def publication(self, publication: Publication, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
-        """Queue all messages of a publication that was sent; False when they were lost.
+    def publication(self, published: Published, sent: Mapping[str, bytes] = MappingProxyType({})) -> bool:
+        """Take all messages of a publication of one row that was sent; False when they were lost.
 
-        `sent` has their bytes by base name of the topic, as `PublicationBytes` writes them; by default the thread makes
-        them.
+        `sent` has their bytes by base name of the topic; without them those that follow from the journal are made.
         """
         now = self._now_ns()
-        topics = self._topics_of[publication.slow is not None]
+        topics = self._topics_of[len(published.slow) > 0, bool(sent) and bool(published.rows["marked"][0])]
         with self._lock:
-            if self._room(1 + len(self._publication_topics), self._queue_size * 3 // 4):
+            if self._room(1 + len(self._topics_of[True, True]), self._queue_size * 3 // 4):
                 for topic in topics if self._output_gaps else ():
                     gap = self._output_gaps.pop(topic, 0)
                     if gap:
                         self._push_entry(now, Dropped(topic, gap))
-                self._queue.append(_PublicationItem(self._sequence, now, publication, sent, topics))
+                self._queue.append(_PublicationItem(self._sequence, now, published, sent, topics))
                 return True
             self._snapshot_due = True
             self._output_gaps.update(topics)
@@ -384,10 +387,10 @@ class Recorder:
     def _write_publications(self, items: list[_PublicationItem]) -> list[_PublicationItem]:
         sent = [item.sent for item in items]
         if items and all(sent):
-            stamps = np.array([item.publication.stamp_ns for item in items], np.int64)
+            stamps = np.concatenate([item.published.rows["stamp_ns"] for item in items])
             self._writer.write_sent(*_numbers(items), stamps, sent)
         elif items:
-            self._writer.write_publications(*_numbers(items), Publications.of([item.publication for item in items]))
+            self._writer.write_publications(*_numbers(items), Published.joined([item.published for item in items]))
         return []
 
     def _part_is_full(self) -> bool:
@@ -513,6 +516,6 @@ class _PublicationItem(NamedTuple):
 
     sequence: int
     log_time_ns: int
-    publication: Publication
+    published: Published
     sent: Mapping[str, bytes]
     keys: tuple[str, ...]

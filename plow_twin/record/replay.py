@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plow_twin.build import build_fingerprint
 from plow_twin.errors import RecordingError
@@ -39,7 +38,6 @@ from plow_twin.record.replay_report import Divergence, ReplayReport
 from plow_twin.record.sent_messages import SentMessages
 from plow_twin.record.template import Indexes, Templates, read_numbers
 from plow_twin.record.unused import InputCounts
-from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
 from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import (
@@ -55,8 +53,8 @@ from plow_twin.stream.journal import (
     Unload,
     Unused,
 )
-from plow_twin.stream.outputs import Publication, Publications
-from plow_twin.stream.session import Session
+from plow_twin.stream.outputs import NONE, NOTHING, Published
+from plow_twin.stream.session import Applied, Session
 from plow_twin.stream.topics import TOPICS
 
 if TYPE_CHECKING:
@@ -138,13 +136,11 @@ class _Replay:
         twin.warm_up()
         templates = publication_templates(header.frame_id, header.child_frame_id)
         self.templates = Templates.of(templates[name] for name in PUBLICATION_TOPICS)
-        if excitation == "sampled" and bound is None:  # a bounded one goes sample by sample
+        if excitation == "sampled":
             _warm_up(scene, header.tol, self.templates, rows=not digests_only)
         self.sink: RunWriter | None = None
         self.rows = np.zeros(0, ROW)  # of the last run of samples
-        self.publications: Publications | None = (
-            None  # of the last run of samples; its last publication may have messages to come
-        )
+        self.published: Published | None = None  # of the last run of samples; its last row may have messages to come
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
         )
@@ -207,8 +203,8 @@ class _Replay:
 
     def _is_run(self, entries: Entries, place: int) -> bool:
         expected = (int(entries.sequence[place]) - self.next_sequence) & _SEQUENCE_MASK == 0
-        plain = self.session.plain and self.session.twin.excitation == "sampled"
-        return self.synced and expected and bool(entries.sample[place]) and plain
+        sampled = self.session.twin.excitation == "sampled"
+        return self.synced and expected and bool(entries.sample[place]) and sampled
 
     def _compare_alarms(self, batch: Batch) -> None:
         """Compare the messages of the alarms of a batch."""
@@ -233,20 +229,22 @@ class _Replay:
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
         stamps, wrench = entries.samples()
-        before = self.session.snapshot(), self.session.outputs.pending, self.session.origin_ns
-        self.messages, self.publications = None, None
-        rows: bool | NDArray[np.void] = False
-        if not self.digests_only or self.sink is not None:
+        self.messages, self.published = None, None
+        sent_here, rows, taken = None, None, NONE
+        if self.sink is not None:
+            taken = np.arange(len(stamps))
+        elif not self.digests_only:
+            sent_here = Sent(
+                sent.sequence[begin:end], sent.kind[begin:end], done, int(entries.sequence[0]), len(stamps)
+            )
+            taken = sent_here.taken
+        if self.sink is not None or sent_here is not None:
             if len(self.rows) < len(stamps):
                 self.rows = np.zeros(len(stamps), ROW)
-            rows = self.rows
+            rows = self.rows[: len(stamps)]
         try:
-            found = self.session.advance_marked(stamps, wrench, done[digests], rows=rows)
+            found = self.session.advance(stamps, wrench, rows, taken, done[digests])
         except ValueError:  # one by one: the sample that is refused is counted
-            return False
-        if found.status.any():
-            # a failed advance is no part of a publication
-            self.session.restore(*before)
             return False
         self.inputs.add(entries)
         self.report.entries += len(entries)
@@ -267,16 +265,17 @@ class _Replay:
         self.report.digests_compared += len(digests)
         self.next_sequence = (int(entries.sequence[-1]) + 1) & _SEQUENCE_MASK
         self.in_a_row += len(entries)
-        if self.sink is not None and found.rows is not None:
-            self._write_run(entries, stamps, found.rows)
+        if self.sink is not None:
+            self._write_run(entries, found)
             self._messages(sent, begin, end)
-        elif found.rows is not None:
-            differences += self._compare_sent(entries, sent, begin, end, stamps, found.rows, done, first_step)
+        elif sent_here is not None:
+            self.published = found.published if len(taken) and taken[-1] == len(stamps) - 1 else None
+            differences += self._compare_sent(entries, sent, (begin, end), sent_here, found.published, done, first_step)
         for difference in sorted(differences, key=lambda found: found[0]):
             self._note(Divergence(*difference))
         return True
 
-    def _write_run(self, entries: Entries, stamps: Indexes, rows: AdvanceSeries) -> None:
+    def _write_run(self, entries: Entries, found: Applied) -> None:
         """Write a run of samples and digests, and a publication after each sample."""
         assert self.sink is not None
         begin = 0
@@ -290,10 +289,11 @@ class _Replay:
                 record = entries.record(end)
                 self.sink.write_entry(record.sequence, record.log_time_ns, record.entry)
             begin = end + 1
-        publications = self.session.outputs.take_rows(stamps, rows, np.arange(len(stamps)))
-        self.sink.write_publications(
-            entries.sequence[entries.sample], entries.log_time_ns[entries.sample], publications
-        )
+        samples, published = np.flatnonzero(entries.sample), found.published
+        if found.failed:  # such an advance is not published
+            good = np.flatnonzero(found.rows["stamp_ns"])
+            samples, published = samples[good], published.of(good)
+        self.sink.write_publications(entries.sequence[samples], entries.log_time_ns[samples], published)
 
     def _write_entry(self, record: EntryRecord) -> None:
         """Write an entry that has been applied, and the publication after it."""
@@ -302,54 +302,48 @@ class _Replay:
         if isinstance(entry, Snapshot) and self.synced:
             entry = self.session.snapshot()  # with the windows of the publications that are written
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
-        publication = self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold | Unload) else None
-        if publication is not None and publication.finite:
-            places = np.array([record.sequence]), np.array([record.log_time_ns])
-            self.sink.write_publications(*places, Publications.of([publication]))
+        published = (
+            self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
+        )
+        if len(published.rows) and published.finite:
+            self.sink.write_publications(np.array([record.sequence]), np.array([record.log_time_ns]), published)
 
     def _compare_sent(
         self,
         entries: Entries,
         sent: SentMessages,
-        begin: int,
-        end: int,
-        stamps: Indexes,
-        rows: AdvanceSeries,
+        span: tuple[int, int],
+        found: Sent,
+        published: Published,
         done: Indexes,
         first_step: int,
     ) -> list[tuple[int, int, str, str, str, str]]:
-        """Form the publications that were sent and compare their messages; return the differences."""
-        first = int(entries.sequence[0])
-        found = Sent(sent.sequence[begin:end], sent.kind[begin:end], done, first, len(stamps))
-        taken = found.taken
-        publications = self.session.outputs.take_rows(stamps, rows, taken)
-        if len(taken) and taken[-1] == len(stamps) - 1:
-            self.publications = publications
+        """Compare the messages that were sent with those of the publications; return the differences."""
         poses = [
             (int(entries.sequence[index]) & _SEQUENCE_MASK, first_step + int(done[index]) - 1, entry)
             for index, entry in sorted(entries.rest.items())
             if isinstance(entry, Pose)
         ]
-        self.alarms.publications(found.first_sequence & _SEQUENCE_MASK, first_step + taken, publications, poses)
+        self.alarms.published(found.first_sequence & _SEQUENCE_MASK, first_step + found.taken, published, poses)
         compared = self.outputs_synced | ~_IS_CUMULATIVE
         for name, count, known in zip(PUBLICATION_TOPICS, found.counts.tolist(), compared.tolist(), strict=True):
             (self.report.compared if known else self.report.not_compared)[name] += count
-        found.expect(publications, self.templates, compared)
-        differences = []
-        for messages, from_, to in sent.pieces(begin, end):
+        found.expect(published, self.templates, compared)
+        differences, begin = [], span[0]
+        for messages, from_, to in sent.pieces(*span):
             chosen = slice(from_ - begin, to - begin)
             for index in found.differing(messages, chosen):
                 record, advance = sent.record(from_ + index), int(found.after[from_ - begin + index])
-                where = self._difference(record, publications[int(found.publication[advance])])
+                where = self._difference(record, published.at(int(found.publication[advance])))
                 if where is not None:
                     topic = self.topics[record.topic]
                     differences.append((first_step + advance, record.publish_time_ns, topic, *where))
         return differences
 
-    def _difference(self, record: OutputRecord, publication: Publication) -> tuple[str, str, str] | None:
+    def _difference(self, record: OutputRecord, published: Published) -> tuple[str, str, str] | None:
         """Return what differs between a recorded message and that of a publication, computed as the node does."""
         name = self.topics[record.topic]
-        computed = publication_messages(publication, self.header.frame_id, self.header.child_frame_id).get(name)
+        computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
             return "message", "a message", "none"
         return None if encode(computed) == record.data else _first_difference(record, computed)
@@ -375,7 +369,7 @@ class _Replay:
         self.next_sequence = (record.sequence + 1) & _SEQUENCE_MASK
         self.in_a_row += 1
         if not isinstance(record.entry, Dropped):  # such a note may stand between the messages of one publication
-            self.messages = self.publications = None
+            self.messages = self.published = None
         self.report.entries += 1
         match record.entry:
             case Loss(count):
@@ -442,15 +436,14 @@ class _Replay:
             self.report.not_compared[name] += 1
             return
         if self.messages is None:  # the first message of a publication
-            if self.publications:
-                publication: Publication | None = self.publications[len(self.publications) - 1]
+            if self.published is not None:
+                published = self.published.at(len(self.published.rows) - 1)
             else:
-                publication = self.session.outputs.take()
-                if publication is not None:
-                    self.alarms.publication(here, self.report.steps - 1, publication)
-            self.publications = None
-            frames = (self.header.frame_id, self.header.child_frame_id)
-            self.messages = {} if publication is None else publication_messages(publication, *frames)
+                published = self.session.outputs.take()
+                if len(published.rows):
+                    self.alarms.published(np.array([here]), np.array([self.report.steps - 1]), published)
+            self.published = None
+            self.messages = publication_messages(published, self.header.frame_id, self.header.child_frame_id)
         computed = self.messages.get(name)
         if computed is None and self.resumed:
             self.report.not_compared[name] += 1
@@ -497,15 +490,15 @@ def _warm_up(scene: Scene, tol: float, templates: Templates, *, rows: bool) -> N
     """Compile what a replay needs, so that its time is that of the work."""
     session = Session(Twin(scene, tol=tol, excitation="sampled"))
     stamps = np.arange(1, 3, dtype=np.int64) * 1000
-    done = session.advance_marked(stamps, np.zeros((2, 3)), np.array([1]), rows=rows)
+    memory = np.zeros(2, ROW) if rows else None
+    done = session.advance(stamps, np.zeros((2, 3)), memory, np.arange(2) if rows else NONE, np.array([1]))
     scan(np.zeros(8, np.uint8), np.empty((6, 2), np.int64), np.empty(2, np.int64))
     none, buffer, flags = np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, bool)
     sample = sample_template("")
     read_numbers(buffer, none, none, sample.data, sample.fixed, sample.places, none, np.zeros((0, 6)), flags)
-    if done.rows is not None:
-        publications = session.outputs.take_rows(stamps, done.rows, np.arange(2))
+    if rows:
         sent = Sent(none, none, np.arange(2), 0, 2)
-        sent.expect(publications, templates, ~_IS_CUMULATIVE)
+        sent.expect(done.published, templates, ~_IS_CUMULATIVE)
         sent.differing(Messages.none(), slice(0))
 
 

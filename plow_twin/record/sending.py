@@ -1,25 +1,25 @@
-"""The messages of a publication as the bytes that are sent: one compiled call for those that each publication has."""
+"""The messages of a publication as the bytes that are sent: one compiled call for those of one record."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.record.outputs import head_numbers, publication_templates
-from plow_twin.record.template import STAMP_AT, Template, compiled, fill, stamp_word
-from plow_twin.record.words import bits, set_word
+from plow_twin.record.outputs import template
+from plow_twin.record.template import STAMP_AT, compiled, stamp_word
+from plow_twin.record.words import bits, set_word, word
 from plow_twin.solve.state import ROW
-from plow_twin.stream.outputs import CLEARANCE_NAMES, Publication, Slow
+from plow_twin.stream.outputs import NOTHING, Published
+from plow_twin.stream.topics import Cadence, Topic, topics_of
 
-#: Those messages, in the order in which they are sent.
-_EACH: Final = ("contact_forces", "contact_peaks", "head_state")
+#: Bytes of a number in a record.
+_WORD: Final = 8
 
 
-class PublicationBytes:
-    """Write messages of one publication after the other.
+class Messages:
+    """Write the messages of one publication after the other to the same memory.
 
     Parameters
     ----------
@@ -28,79 +28,90 @@ class PublicationBytes:
     """
 
     def __init__(self, frame_id: str, child_frame_id: str) -> None:
-        templates = publication_templates(frame_id, child_frame_id)
-        self._slow = {topic: _Filled(templates[topic]) for topic in ("clearance", "wear_rate")}
-        each = [templates[topic] for topic in _EACH]
-        ends = np.cumsum([0, *map(len, each)])
-        #: the three messages one behind the other; only stamps and numbers change
-        self._buffer = np.concatenate([template.data for template in each])
-        self._starts = ends[:-1].copy()
-        self._places = np.concatenate([start + template.places for start, template in zip(ends, each, strict=False)])
-        whole = self._buffer.data
-        #: each of them by base name of its topic, in the order in which they are sent
-        self.parts = [(topic, whole[begin:end]) for topic, begin, end in zip(_EACH, ends, ends[1:], strict=False)]
+        self._each, self._slow, self._marked = (
+            _Group.of(topics_of(cadence), frame_id, child_frame_id)
+            for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED)
+        )
+        #: memory of each message by base name of its topic
+        self.memory = dict((*self._each.parts, *self._slow.parts, *self._marked.parts))
 
-    def write(self, publication: Publication) -> dict[str, bytes] | None:
-        """Return the bytes by base name of the topic, forces first; None when a number is not finite."""
-        return self.taken() | self.slow(publication) if self.fill(publication) else None
+    def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
+        """Return topic and bytes of the messages of a publication of one row, in the order in which they are sent.
 
-    def fill(self, publication: Publication) -> bool:
-        """Write the messages that each publication has into `parts`; False when a number of it is not finite."""
-        finite = _write(publication.stamp_ns, publication.rows, self._buffer, self._starts, self._places)
-        return bool(finite) and (publication.slow is None or publication.finite)
+        The bytes stay until the next call. Without a message where a number is not finite.
+        """
+        rows, slow = published
+        if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):
+            return ()
+        found = self._each.parts
+        if len(slow):
+            found += self._slow.parts
+        if rows["marked"][0]:
+            self._marked.fill(rows)
+            found += self._marked.parts
+        return found
 
-    def taken(self) -> dict[str, bytes]:
-        """Return what `fill` has written, by base name of the topic."""
-        return {topic: part.tobytes() for topic, part in self.parts}
 
-    def slow(self, publication: Publication) -> dict[str, bytes]:
-        """Return the messages of its slow part, if it has one."""
-        slow, stamp_ns = publication.slow, publication.stamp_ns
-        if slow is None:
-            return {}
-        numbers = {"clearance": slow.clearance, "wear_rate": slow.wear_rate}
-        return {topic: self._slow[topic].write(stamp_ns, found) for topic, found in numbers.items()}
+class _Group(NamedTuple):
+    """The messages of one record, one behind the other: only stamps and numbers change."""
+
+    #: base name of each topic, and the memory of its message
+    parts: tuple[tuple[str, memoryview], ...]
+    buffer: NDArray[np.uint8]
+    #: where each message begins
+    starts: NDArray[np.int64]
+    #: place of each number in the buffer [B], its place in the record [words], and whether it is an integer there
+    places: NDArray[np.int64]
+    sources: NDArray[np.int64]
+    integers: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, topics: tuple[Topic, ...], frame_id: str, child_frame_id: str) -> Self:
+        templates = [template(topic, frame_id, child_frame_id) for topic in topics]
+        ends = np.cumsum([0, *map(len, templates)])
+        buffer = np.concatenate([one.data for one in templates])
+        parts = [
+            (topic.name, buffer.data[begin:end]) for topic, begin, end in zip(topics, ends, ends[1:], strict=False)
+        ]
+        places = np.concatenate([begin + one.places for begin, one in zip(ends, templates, strict=False)])
+        sources = np.concatenate([_sources(topic) for topic in topics])
+        integers = np.concatenate([_integers(topic) for topic in topics])
+        return cls(tuple(parts), buffer, ends[:-1].copy(), places, sources, integers)
+
+    def fill(self, records: NDArray[np.void]) -> bool:
+        """Write the messages of a record, shape (1,); False when a number is not finite."""
+        stamp_ns, numbers = records["stamp_ns"], records.view(np.float64)
+        return bool(_write(numbers, stamp_ns, self.buffer, self.starts, self.places, self.sources, self.integers))
+
+
+def _sources(topic: Topic) -> NDArray[np.int64]:
+    """Return where the numbers of a message stand in its record [words]."""
+    fields: Any = topic.record_type.fields
+    return np.concatenate([fields[name][1] // _WORD + np.arange(count) for name, count in topic.parts])
+
+
+def _integers(topic: Topic) -> NDArray[np.bool_]:
+    """Tell of the numbers of a message whether they are integers in its record."""
+    fields: Any = topic.record_type.fields
+    return np.concatenate([np.full(count, fields[name][0].base.kind == "i") for name, count in topic.parts])
 
 
 def warm_up() -> None:
     """Compile what is needed, or load it from the cache on disk."""
-    slow = Slow(np.zeros(len(CLEARANCE_NAMES)), np.zeros(PAIR_COUNT))
-    PublicationBytes("", "").write(Publication.of_row(np.zeros((1, 1), ROW), stamp_ns=0, slow=slow))
-
-
-class _Filled:
-    """The bytes of one message of a template after the other."""
-
-    def __init__(self, template: Template) -> None:
-        self._template, self._buffer = template, np.zeros(len(template), np.uint8)
-
-    def write(self, stamp_ns: int, numbers: NDArray[np.float64]) -> bytes:
-        """Return the template's bytes with a stamp and its numbers (count,)."""
-        template = self._template
-        fill(self._buffer, _START, template.data, template.places, np.array([stamp_ns]), numbers[None])
-        return self._buffer.tobytes()
-
-
-_START: Final = np.zeros(1, np.int64)
+    Messages("", "").write(Published(np.zeros(1, ROW), NOTHING.slow))
 
 
 @compiled
-def _write(stamp_ns, rows, buffer, starts, places):  # type: ignore[no-untyped-def]
-    """Write stamp and numbers of a `ROW` into the three messages; False when a number is not finite."""
-    row, motion, stamp = rows[0, 0], np.empty((1, 7)), stamp_word(stamp_ns)
-    head_numbers(row.q.reshape(1, 3), row.v.reshape(1, 3), motion)
+def _write(numbers, stamps, buffer, starts, places, sources, integers):  # type: ignore[no-untyped-def]
+    """Write stamp and numbers of a record into its messages; False when a number is not finite."""
+    stamp = stamp_word(stamps[0])
     for start in starts:
         set_word(buffer, start + STAMP_AT, stamp)
     total = 0.0
-    for pair in range(PAIR_COUNT):
-        numbers = (
-            row.penetration[pair], row.rate[pair], row.force[pair],
-            float(row.makes[pair]), row.impulse[pair], row.peak[pair],
-        )  # fmt: skip
-        for k in range(6):
-            set_word(buffer, places[8 * k + pair], bits(numbers[k]))
-            total += numbers[k]
-    for k in range(7):
-        set_word(buffer, places[48 + k], bits(motion[0, k]))
-        total += motion[0, k]
+    for k in range(places.size):
+        number = numbers[sources[k]]
+        if integers[k]:
+            number = float(word(numbers, 8 * sources[k]))
+        set_word(buffer, places[k], bits(number))
+        total += number
     return np.isfinite(total)

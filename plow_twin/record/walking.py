@@ -17,9 +17,10 @@ from plow_twin.model.scene import Scene
 from plow_twin.record.entries import Entries, Holes
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.run.advance import AdvanceSeries
+from plow_twin.solve.state import ROW
 from plow_twin.stream.journal import Digest, Entry, Loss, Reset, Restore, SetModel, SetWear, Snapshot, Travel
-from plow_twin.stream.outputs import Publications
-from plow_twin.stream.session import DIGEST_INTERVAL, Session
+from plow_twin.stream.outputs import Published
+from plow_twin.stream.session import DIGEST_INTERVAL, Applied, Session
 
 if TYPE_CHECKING:
     from plow_twin.record.writer import RunWriter
@@ -34,12 +35,15 @@ _FAILURE_LIMIT: Final = 10
 
 @dataclass(frozen=True)
 class Walked:
-    """Some advances: stamps (n,) [ns], wrench (n, 3), the rows of the model, and the publication after each."""
+    """Some advances: stamps (n,) [ns], wrench (n, 3), and the rows that would be published after each."""
 
     stamp_ns: NDArray[np.int64]
     wrench: NDArray[np.float64]
+    #: the rows of `published`: touches are all so far
     rows: AdvanceSeries
-    publications: Publications
+    published: Published
+    #: touches since the advance before, shape (n, 8)
+    makes: NDArray[np.int64]
     #: signed speed along the face [m/s]
     speed_m_s: float
     #: scene with all changes of the model so far
@@ -107,16 +111,17 @@ class Walker:
         count = len(stamp_ns)
         numbers = self._advances + 1 + np.arange(count)
         marks = 1 + np.flatnonzero(numbers % DIGEST_INTERVAL == 0)
-        done = self.session.advance_marked(stamp_ns, wrench, marks)
-        assert done.rows is not None
+        before = self.session.outputs.makes
+        done = self.session.advance(stamp_ns, wrench, np.zeros(count, ROW), np.arange(count), marks)
         self._advances += count
-        good = np.flatnonzero(done.status == 0)
-        self.failures += count - len(good)
-        publications = self.session.outputs.take_rows(stamp_ns, done.rows, np.arange(count))
+        self.failures += done.failed
         if self._writer is not None:
-            self._write(stamp_ns, wrench, log_ns, marks, done.digests, publications, good)
-        self._on_walked(Walked(stamp_ns, wrench, done.rows, publications, self.speed_m_s, self.session.twin.scene))
-        if count >= _FAILURE_LIMIT and done.status[-_FAILURE_LIMIT:].all():
+            self._write(stamp_ns, wrench, log_ns, marks, done)
+        rows = AdvanceSeries(done.rows)
+        makes = np.diff(rows.makes, axis=0, prepend=before[None])
+        scene = self.session.twin.scene
+        self._on_walked(Walked(stamp_ns, wrench, rows, done.published, makes, self.speed_m_s, scene))
+        if count >= _FAILURE_LIMIT and rows.status[-_FAILURE_LIMIT:].all():
             self.apply(Reset(int(stamp_ns[-1]), f"{_FAILURE_LIMIT} failed advances"), int(log_ns[-1]))
 
     def _write(
@@ -125,9 +130,7 @@ class Walker:
         wrench: NDArray[np.float64],
         log_ns: NDArray[np.int64],
         marks: NDArray[np.int64],
-        digests: list[str],
-        publications: Publications,
-        good: NDArray[np.int64],
+        done: Applied,
     ) -> None:
         assert self._writer is not None
         self._open(int(log_ns[0]))
@@ -135,7 +138,7 @@ class Walker:
             self._sequence + 1 + np.arange(len(stamp_ns)) + np.searchsorted(marks, np.arange(len(stamp_ns)), "right")
         )
         begin = 0
-        for mark, digest in zip((*marks.tolist(), len(stamp_ns)), (*digests, ""), strict=True):
+        for mark, digest in zip((*marks.tolist(), len(stamp_ns)), (*done.digests, ""), strict=True):
             part = slice(begin, mark)
             if mark > begin:
                 self._writer.write_samples(sequence[part], log_ns[part], stamp_ns[part], wrench[part])
@@ -145,8 +148,8 @@ class Walker:
             begin = mark
         self._sequence += len(stamp_ns) + len(marks)
         self._log_time_ns = int(log_ns[-1])
-        if len(good) == len(stamp_ns):
-            self._writer.write_publications(sequence, log_ns, publications)
+        if not done.failed:
+            self._writer.write_publications(sequence, log_ns, done.published)
 
     def close(self) -> None:
         """End the journal."""

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError, TakenError
-from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.cdr import encode, schema_text, type_hash, warm_up
 from plow_twin.record.chunks import MESSAGE_HEAD
 from plow_twin.record.durable import sync_path
@@ -22,12 +21,12 @@ from plow_twin.record.journal_codec import Dropped, to_message
 from plow_twin.record.mcap_file import ByteFile, ChunkBuilder, McapFile, UnbufferedFile
 from plow_twin.record.messages import Message, WrenchStamped
 from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, qos_text, write_metadata
-from plow_twin.record.outputs import SLOW_TOPICS, publication_numbers, publication_templates
+from plow_twin.record.outputs import REPLAYED, publication_templates
 from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
 from plow_twin.stream.journal import Digest, Entry, Sample
-from plow_twin.stream.outputs import Publication, Publications
-from plow_twin.stream.topics import TOPICS
+from plow_twin.stream.outputs import Published
+from plow_twin.stream.topics import TOPICS, Cadence, topics_of
 
 #: Folder of other topics in the folder of a run; further ones are `beside_2`, ...
 BESIDE: Final = "beside"
@@ -140,29 +139,29 @@ class RunWriter:
         )
         self._close_full_chunks()
 
-    def write_publications(self, sequence: Indexes, log_time_ns: Indexes, publications: Publications) -> None:
+    def write_publications(self, sequence: Indexes, log_time_ns: Indexes, published: Published) -> None:
         """Write the messages of many publications, each sent after journal entry number `sequence`."""
         log_time_ns = np.maximum(log_time_ns, 0)
-        numbers = publication_numbers(publications)
-        everywhere = np.arange(len(publications))
-        rows = {name: publications.slow_index if name in SLOW_TOPICS else everywhere for name in numbers}
-        sizes = np.zeros(len(publications), np.int64)
+        everywhere = np.arange(len(published.rows))
+        rows = {topic: published.slow["row"] if topic.cadence is Cadence.SLOW else everywhere for topic in REPLAYED}
+        sizes = np.zeros(len(everywhere), np.int64)
         places = {}
-        for name, row in rows.items():
-            places[name] = sizes[row].copy()
-            sizes[row] += MESSAGE_HEAD + len(self._templates[name])
+        for topic, row in rows.items():
+            places[topic] = sizes[row].copy()
+            sizes[row] += MESSAGE_HEAD + len(self._templates[topic.name])
         ends = np.cumsum(sizes)
-        begin = self._outputs.reserve(int(ends[-1])) if len(publications) else 0
-        for name, row in rows.items():
+        begin = self._outputs.reserve(int(ends[-1])) if len(everywhere) else 0
+        for topic, row in rows.items():
             if not len(row):
                 continue
-            stamps, values = numbers[name]
-            template = self._templates[name]
-            channel = self._channel(self.header.topic(name), template.message_type)
-            starts = begin + (ends - sizes)[row] + places[name]
+            records = topic.record_of(published)
+            template = self._templates[topic.name]
+            channel = self._channel(self.header.topic(topic.name), template.message_type)
+            starts = begin + (ends - sizes)[row] + places[topic]
             self._outputs.add_many(
-                channel, template, starts, sequence[row] & _SEQUENCE_MASK, log_time_ns[row], stamps, values
-            )
+                channel, template, starts, sequence[row] & _SEQUENCE_MASK, log_time_ns[row],
+                np.ascontiguousarray(records["stamp_ns"]), np.concatenate(topic.numbers(records), axis=1),
+            )  # fmt: skip
         self._close_full_chunks()
 
     def write_sent(
@@ -171,8 +170,8 @@ class RunWriter:
         """Write publications that were sent: entry before them, log time, stamp [ns], bytes by base name."""
         channels = self._part.sent
         if not channels:
-            for name, template in self._templates.items():
-                channels[name] = self._channel(self.header.topic(name), template.message_type)
+            for topic in topics_of(Cadence.EACH, Cadence.SLOW, Cadence.MARKED):
+                channels[topic.name] = self._channel(self.header.topic(topic.name), topic.type)
         each = np.fromiter(map(len, sent), np.int64, len(sent))
         data = [message for messages in sent for message in messages.values()]
         self._outputs.add_bytes(
@@ -350,6 +349,3 @@ def warm_up_writer(header: RunHeader) -> None:
         builder.reserve(MESSAGE_HEAD + len(template))
         builder.add_many(1, template, one, one, one, one, np.zeros((1, template.count)))
         builder.add_bytes(one, one, one, one, one, b"0")
-    pairs, motion = np.zeros(PAIR_COUNT), np.zeros(3)
-    still = Publication(0, pairs, pairs, pairs, np.zeros(PAIR_COUNT, np.int64), pairs, pairs, motion, motion, None)
-    publication_numbers(Publications.of([still]))

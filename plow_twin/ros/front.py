@@ -6,24 +6,19 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
-from diagnostic_msgs.msg import DiagnosticStatus as RosDiagnosticStatus
 from rclpy.node import Node
-from sensor_msgs.msg import JointState as RosJointState
 
 from plow_twin.live.parameters import ESTIMATES, Settings
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import KeptWear
-from plow_twin.record.messages import DiagnosticStatus, JointState
+from plow_twin.record.messages import Message
 from plow_twin.ros.input_loop import InputLoop, Turns
-from plow_twin.ros.messages import ros_joint_state, ros_status
 from plow_twin.ros.publishers import OutputPublishers
-from plow_twin.ros.qos import OUTPUTS
 from plow_twin.ros.subscriptions import Subscriptions
-from plow_twin.stream.outputs import Publication
 from plow_twin.stream.topics import TOPICS
 
 #: Services by name, each a method of `Services`.
@@ -71,7 +66,8 @@ class RosFront:
         self.name: str = node.get_fully_qualified_name()
         self.topics: Mapping[str, str] = {topic.name: node.resolve_topic_name(topic.name) for topic in TOPICS}
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
-        self.changed = changed
+        self.sends_motion = True
+        self._changed = changed
         #: one thread at a time has to do with the twin
         self.turns = Turns()
         self._lost: list[str] = []
@@ -84,21 +80,14 @@ class RosFront:
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))
-        self._publishers = OutputPublishers(
-            node, settings.frame_id, settings.child_frame_id, kept=runtime.recording is not None
-        )
-        made.callback(self._publishers.close)
-        self._alarms = node.create_publisher(RosDiagnosticStatus, "alarms", OUTPUTS["alarms"])
-        made.callback(node.destroy_publisher, self._alarms)
-        self._estimates: dict[str, Any] = {}
         wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
-        for topic, one in zip(ESTIMATES, wanted, strict=True):
-            if settings.estimate and one:
-                self._estimates[topic] = node.create_publisher(RosJointState, topic, OUTPUTS[topic])
-                made.callback(node.destroy_publisher, self._estimates[topic])
-        self._loop = loop = InputLoop(self.turns, self._failed)
+        without = [topic for topic, one in zip(ESTIMATES, wanted, strict=True) if not (settings.estimate and one)]
+        # the node publishes its status whether it is configured or not
+        self._publishers = OutputPublishers(node, ["status", *without], runtime.publishing.memory)
+        made.callback(self._publishers.close)
+        self._loop = loop = InputLoop(self.turns, self._inputs_failed)
         made.callback(loop.close)
-        self.subscriptions = Subscriptions(node, runtime, loop, self.turns, self.changed)
+        self.subscriptions = Subscriptions(node, runtime, self, loop, self.turns)
         for rate_hz, do in runtime.periodic():
             loop.every(1.0 / rate_hz, do)
         self._services = Services(runtime, self.changed)
@@ -109,21 +98,21 @@ class RosFront:
         """Return the node's time [ns]."""
         return int(self._node.get_clock().now().nanoseconds)
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> Mapping[str, bytes] | None:
-        """Publish the messages of a publication, if all its numbers are finite; return those that a recording keeps."""
-        return self._publishers.publish(publication, forces_sent)
+    def send(self, topic: str, message: memoryview | Message) -> None:
+        """Publish a message."""
+        self._publishers.send(topic, message)
 
-    def publish_quality(self, marks: JointState) -> None:
-        """Publish the marks of a publication."""
-        self._publishers.publish_quality(marks)
+    def look_for_senders(self, topic: str) -> None:
+        """Find out whether the followed publisher of an input is still there."""
+        self.subscriptions.look_for_senders(topic)
 
-    def publish_alarms(self, status: DiagnosticStatus) -> None:
-        """Publish the alarms."""
-        self._alarms.publish(ros_status(status))
+    def sender_name(self, topic: str, sender: bytes) -> str:
+        """Return node and identity of a publisher of an input."""
+        return self.subscriptions.name_of(topic, sender)
 
-    def publish_estimate(self, topic: str, message: JointState) -> None:
-        """Publish an estimate, or what follows from it."""
-        self._estimates[topic].publish(ros_joint_state(message))
+    def changed(self) -> None:
+        """Take note that the state of the stream may have changed."""
+        self._changed()
 
     def say_error(self, text: str) -> None:
         """Log an error."""
@@ -164,5 +153,5 @@ class RosFront:
         self._made.close()
         return self._lost
 
-    def _failed(self, error: Exception) -> None:
+    def _inputs_failed(self, error: Exception) -> None:
         self.say_error(f"the inputs are read no more: {''.join(traceback.format_exception(error))}")

@@ -11,10 +11,10 @@ import select
 import threading
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 from plow_twin.live.timer import Timer
-from plow_twin.ros.input_queue import InputQueue
+from plow_twin.ros.input_queue import InputQueue, Taken
 
 #: Most messages taken at once: what is due, and who waits for a turn, comes in between.
 _MOST: Final = 200
@@ -44,20 +44,28 @@ class Turns:
             self._inside.release()
 
 
+class Receiver(Protocol):
+    """Takes the messages of some topics."""
+
+    def receive(self, topic: str, batch: list[Taken]) -> None:
+        """Take in what has been in the queue of a topic."""
+
+
 class InputLoop:
     """The thread of a node's inputs. All that it does it does in its turn.
 
     Parameters
     ----------
     turns
-        What keeps it apart from the executor's thread.
+        Keeps it apart from the executor's thread.
     on_error
-        Called with what ended the thread, which is kept in `error` too.
+        Called with the error that ended the thread, which is kept in `error` too.
     """
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
-        self._queues: dict[int, InputQueue] = {}
+        #: by file descriptor, each with its receiver and its topic
+        self._queues: dict[int, tuple[InputQueue, Receiver, str]] = {}
         #: the first one always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
@@ -69,10 +77,10 @@ class InputLoop:
         #: what ended the thread; None: it runs, or has been stopped
         self.error: Exception | None = None
 
-    def add(self, queue: InputQueue) -> None:
-        """Empty a queue from now on, and close it at the end."""
+    def add(self, queue: InputQueue, receiver: Receiver, topic: str) -> None:
+        """Give what comes in the queue of a topic to its receiver from now on, and close the queue at the end."""
         with self._turns:
-            self._queues[queue.fd] = queue
+            self._queues[queue.fd] = queue, receiver, topic
             self._signs.append(queue.fd)
         self._look_again()
 
@@ -98,7 +106,7 @@ class InputLoop:
         self._look_again()
         if self._thread.is_alive():
             self._thread.join()
-        for queue in self._queues.values():
+        for queue, _, _ in self._queues.values():
             queue.close()
         self._queues.clear()
         os.close(self._wake)
@@ -106,8 +114,8 @@ class InputLoop:
     def flush(self) -> None:
         """Hand over what waits in the queues now."""
         with self._turns:
-            for queue in self._queues.values():
-                while queue.take(_MOST, all_there_are=True):
+            for fd in self._queues:
+                while self._receive(fd, all_there_are=True):
                     pass
 
     def _look_again(self) -> None:
@@ -125,12 +133,20 @@ class InputLoop:
                 if left:
                     ready = list({*left, *ready})
                 with self._turns:
-                    left = [fd for fd in ready if self._queues[fd].take(_MOST)]
+                    left = [fd for fd in ready if self._receive(fd)]
                     if time.monotonic() >= self._due:
                         self._look_at_timers()
         except Exception as error:  # a thread that ended unseen would be a twin that stands still
             self.error = error
             self._on_error(error)
+
+    def _receive(self, fd: int, *, all_there_are: bool = False) -> bool:
+        """Take what waits in a queue; True when there is more."""
+        queue, receiver, topic = self._queues[fd]
+        batch, more = queue.take(_MOST, all_there_are=all_there_are)
+        if batch:
+            receiver.receive(topic, batch)
+        return more
 
     def _look_at_timers(self) -> None:
         timers = self._timers if self._active else self._timers[:1]
@@ -139,5 +155,5 @@ class InputLoop:
         self._due = min(timer.due for timer in timers)
 
     def _look_at_all(self) -> None:
-        for queue in self._queues.values():
-            queue.take(_MOST, all_there_are=True)
+        for fd in self._queues:
+            self._receive(fd, all_there_are=True)

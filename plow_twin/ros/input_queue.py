@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 import struct
-from collections.abc import Callable
 from functools import cache
 from typing import Final, NamedTuple
 
@@ -79,8 +78,6 @@ class InputQueue:
         The node that the subscription was made on; made in the thread of its executor, as the subscription.
     subscription
         The subscription; its own callback is never called.
-    on_batch
-        Receives messages in order of arrival.
 
     Attributes
     ----------
@@ -88,8 +85,8 @@ class InputQueue:
         Can be read once something has arrived.
     """
 
-    def __init__(self, node: Node, subscription: Subscription, on_batch: Callable[[list[Taken]], None]) -> None:
-        self._node, self._subscription, self._on_batch = node, subscription, on_batch
+    def __init__(self, node: Node, subscription: Subscription) -> None:
+        self._node, self._subscription = node, subscription
         rcl, _ = libraries()
         self._take, self._listen = rcl.rcl_take_serialized_message, rcl.rcl_subscription_set_on_new_message_callback
         self._buffer, self._info = _new_buffer(), _Info()
@@ -101,8 +98,8 @@ class InputQueue:
         with subscription.handle:
             self._listen(subscription.handle.pointer, _count_up(), self.fd)
 
-    def take(self, most: int, *, all_there_are: bool = False) -> bool:
-        """Hand over what waits now, up to `most` messages; True when there are more.
+    def take(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
+        """Return what waits now in order of arrival, up to `most` messages, and whether there are more.
 
         As many are asked for as signs have come, or `most` where `all_there_are` says so: to ask in vain takes a fifth
         of a sample's time.
@@ -116,9 +113,7 @@ class InputQueue:
         taken = self._taken(wanted)
         # where the queue has overrun there were more signs than messages
         self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
-        if taken:
-            self._on_batch(taken)
-        return self._signs > 0 or (all_there_are and len(taken) == most)
+        return taken, self._signs > 0 or (all_there_are and len(taken) == most)
 
     def close(self) -> None:
         """Take the subscription off the node."""

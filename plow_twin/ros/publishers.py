@@ -1,72 +1,53 @@
-"""The outputs of a publication on ROS topics: the same bytes that a recording holds."""
+"""The outputs on ROS topics: the same bytes that a recording holds."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Collection, Mapping
+from typing import Any, Final
 
-from nav_msgs.msg import Odometry as RosOdometry
+from diagnostic_msgs.msg import DiagnosticStatus
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
-from sensor_msgs.msg import JointState as RosJointState
+from sensor_msgs.msg import JointState
 
-from plow_twin.live.publishing import QUALITY
-from plow_twin.record.messages import JointState
-from plow_twin.record.sending import PublicationBytes
-from plow_twin.ros.messages import ros_joint_state
+from plow_twin.record.cdr import encode
+from plow_twin.record.messages import Message
 from plow_twin.ros.qos import OUTPUTS
 from plow_twin.ros.rcl import Sender
-from plow_twin.stream.outputs import Publication
-from plow_twin.stream.topics import JOINT_STATE, ODOMETRY, Cadence, topics_of
+from plow_twin.stream.topics import JOINT_STATE, ODOMETRY, STATUS, TOPICS
 
-_CLASSES: Final[dict[str, type]] = {JOINT_STATE: RosJointState, ODOMETRY: RosOdometry}
-#: Topics of a publication, with the classes of their messages.
-PUBLISHED: Final = {topic.name: _CLASSES[topic.type] for topic in topics_of(Cadence.EACH, Cadence.SLOW, Cadence.MARKED)}
+#: Class of each type of message.
+CLASSES: Final[dict[str, type]] = {JOINT_STATE: JointState, ODOMETRY: Odometry, STATUS: DiagnosticStatus}
 
 
 class OutputPublishers:
-    """Publishers of all outputs of a publication.
+    """Publishers of the outputs.
 
     Parameters
     ----------
     node
         The node.
-    frame_id, child_frame_id
-        Frames named in the messages.
-    kept
-        Whether the bytes sent are wanted: for a recording.
+    without
+        Base names of outputs that are not published here.
+    memory
+        What holds the bytes of the messages that are sent often, by base name of their topic.
     """
 
-    def __init__(self, node: Node, frame_id: str, child_frame_id: str, *, kept: bool) -> None:
+    def __init__(self, node: Node, without: Collection[str], memory: Mapping[str, memoryview]) -> None:
         self._node = node
-        self._publishers = {
-            topic: node.create_publisher(kind, topic, OUTPUTS[topic]) for topic, kind in PUBLISHED.items()
+        self._publishers: dict[str, Any] = {
+            topic.name: node.create_publisher(CLASSES[topic.type], topic.name, OUTPUTS[topic.name])
+            for topic in TOPICS
+            if topic.name not in without
         }
-        self._bytes, self._kept = PublicationBytes(frame_id, child_frame_id), kept
-        self._senders = [Sender(self._publishers[topic], part) for topic, part in self._bytes.parts]
+        self._senders = {topic: Sender(self._publishers[topic], data) for topic, data in memory.items()}
 
-    def publish(self, publication: Publication, forces_sent: Callable[[], None]) -> dict[str, bytes] | None:
-        """Publish the messages of a publication, forces first; `forces_sent` is called right after them.
-
-        Returns their bytes where they are to be kept; None, and nothing is published, when a number is not finite.
-        """
-        if not self._bytes.fill(publication):
-            return None
-        forces, peaks, head = self._senders
-        forces.send()
-        forces_sent()
-        peaks.send()
-        head.send()
-        found = self._bytes.taken() if self._kept else {}
-        if publication.slow is not None:
-            slow = self._bytes.slow(publication)
-            for topic, data in slow.items():
-                self._publishers[topic].publish(data)
-            found |= slow
-        return found
-
-    def publish_quality(self, marks: JointState) -> None:
-        """Publish the marks of a publication."""
-        self._publishers[QUALITY].publish(ros_joint_state(marks))
+    def send(self, topic: str, message: memoryview | Message) -> None:
+        """Send a message, or its bytes in the memory of its topic."""
+        if isinstance(message, memoryview):
+            self._senders[topic].send()
+        else:
+            self._publishers[topic].publish(encode(message))
 
     def close(self) -> None:
         """Take the publishers off the node."""

@@ -1,11 +1,10 @@
-"""The subscriptions: from messages to calls with plain numbers."""
+"""The subscriptions: from messages in their queues to plain numbers for the runtime."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from typing import Any, Final
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TwistStamped, WrenchStamped
@@ -14,6 +13,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
+from plow_twin.live.publishing import Front
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.pairs import PAIR_NAMES
@@ -42,21 +42,16 @@ class Subscriptions:
     node
         The node.
     runtime
-        Where samples go.
+        Takes the samples.
+    front
+        Sends the messages that follow.
     loop, turns
-        The thread that takes the messages, and what keeps it apart from the executor's.
-    on_changed
-        Called when the publishers of an input have changed.
+        The thread that takes the messages, and the lock that keeps it apart from the executor's.
     """
 
-    def __init__(
-        self, node: Node, runtime: Runtime, loop: InputLoop, turns: Turns, on_changed: Callable[[], None]
-    ) -> None:
-        self._node, self._loop, self._turns = node, loop, turns
+    def __init__(self, node: Node, runtime: Runtime, front: Front, loop: InputLoop, turns: Turns) -> None:
+        self._node, self._runtime, self._front, self._loop, self._turns = node, runtime, front, loop, turns
         self._inputs, self._intake = runtime.inputs, runtime.driver.intake
-        self._inputs.look_for_senders = self._look_for_senders
-        self._on_samples = runtime.samples
-        self._on_changed = on_changed
         self._connections = Connections(node)
         self._taken_from: dict[str, Subscription] = {}
         #: publishers of each input at the last look
@@ -70,15 +65,12 @@ class Subscriptions:
         #: publishers of it that were not known to be there then: first message, and losses counted before it
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
-        self._inputs.unused.name_of = self._name_of
-        read_sample = {"excitation": read_wrench, "tool_forces": self._read_tool_forces}
-        for topic, kind in (("excitation", WrenchStamped), ("tool_forces", JointState)):
-            take = self._samples if topic == self._source else self._not_selected
-            self._subscribe(kind, topic, depth, partial(take, topic, read_sample[topic]))
-        self._subscribe(TwistStamped, "travel", _SLOW_DEPTH, self._travel_speeds)
-        kind = PoseWithCovarianceStamped if runtime.poses_have_covariance else PoseStamped
-        self._subscribe(kind, "head_pose", _SLOW_DEPTH, partial(self._measured_poses, kind))
-        self._subscribe(JointState, "gaps", _SLOW_DEPTH, self._measured_gaps)
+        self._pose = PoseWithCovarianceStamped if runtime.poses_have_covariance else PoseStamped
+        self._subscribe(WrenchStamped, "excitation", depth)
+        self._subscribe(JointState, "tool_forces", depth)
+        self._subscribe(TwistStamped, "travel", _SLOW_DEPTH)
+        self._subscribe(self._pose, "head_pose", _SLOW_DEPTH)
+        self._subscribe(JointState, "gaps", _SLOW_DEPTH)
 
     def look(self) -> None:
         """Look who publishes the inputs; not in a turn, which the samples would have to wait for."""
@@ -92,10 +84,10 @@ class Subscriptions:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
             for topic in present:
-                self._look_for_senders(topic)  # anew: messages may have been taken since
-        self._on_changed()
+                self.look_for_senders(topic)  # anew: messages may have been taken since
+        self._front.changed()
 
-    def _look_for_senders(self, topic: str) -> None:
+    def look_for_senders(self, topic: str) -> None:
         """Find out whether the followed publisher of an input is still there."""
         if topic == self._source:
             self._inputs.senders.alive(self._present(topic))
@@ -116,17 +108,17 @@ class Subscriptions:
             self._names[topic, gid] = f"{space}/{publisher.node_name} {gid.hex()}"
         return present
 
-    def _name_of(self, topic: str, sender: bytes) -> str:
+    def name_of(self, topic: str, sender: bytes) -> str:
         """Return node and identity of a publisher; of one that has gone unseen the identity alone."""
         if (topic, sender) not in self._names:
             self._present(topic)
         return self._names.get((topic, sender), sender.hex())
 
-    def _subscribe(self, kind: type, topic: str, depth: int, take: Callable[[list[Taken]], None]) -> None:
+    def _subscribe(self, kind: type, topic: str, depth: int) -> None:
         subscription = self._node.create_subscription(
             kind,
             topic,
-            lambda message: None,  # the queue below takes the messages, with their publishers
+            lambda message: None,  # never called: the queue below gives the messages, with their publishers
             sensor_input(depth),
             qos_overriding_options=OVERRIDABLE,
             raw=True,
@@ -135,10 +127,13 @@ class Subscriptions:
             self._since_ns, self._before = time.time_ns(), frozenset(self._present(topic))
             self._inputs.senders.start(self._before)
         self._taken_from[topic] = subscription
-        self._loop.add(InputQueue(self._node, subscription, partial(self._counted, topic, take)))
+        self._loop.add(InputQueue(self._node, subscription), self, topic)
 
-    def _counted(self, topic: str, take: Callable[[list[Taken]], None], batch: list[Taken]) -> None:
-        """Count the gaps in the publishers' numbers, and hand the messages on."""
+    def receive(self, topic: str, batch: list[Taken]) -> None:
+        """Take in what has been in the queue of an input: the way of every message.
+
+        Gaps in the publishers' numbers are counted first.
+        """
         inputs, following = self._inputs, self._following
         for message in batch:
             key, number = (topic, message.sender), message.number
@@ -159,9 +154,18 @@ class Subscriptions:
                 if topic != self._source:
                     inputs.unused.note_lost(topic, message.sender, missed)
             following[key] = max(expected, number + 1)
-        take(batch)
-        if self._appeared and topic == self._source:
-            self._count_before_first(batch)
+        if topic == self._source:
+            self._samples(topic, batch)
+            if self._appeared:
+                self._count_before_first(batch)
+        elif topic == "travel":
+            self._travel_speeds(batch)
+        elif topic == "head_pose":
+            self._measured_poses(batch)
+        elif topic == "gaps":
+            self._measured_gaps(batch)
+        else:
+            self._not_selected(topic, batch)
 
     def _count_before_first(self, batch: list[Taken]) -> None:
         """Count what publishers sent before the first sample heard, if they began after the subscription.
@@ -182,35 +186,40 @@ class Subscriptions:
             if heard >= _RATE_KNOWN:
                 del self._appeared[sender]
 
-    def _samples(self, topic: str, read: Callable[[bytes], Read], batch: list[Taken]) -> None:
+    def _samples(self, topic: str, batch: list[Taken]) -> None:
         """Take in what has been in the queue of the selected source."""
         inputs = self._inputs
         inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
         arrived: list[Arrival] = []
         followed = inputs.senders.followed
         for message in batch:
-            stamp, values, fits, out_of_plane = read(message.data)
+            stamp, values, fits, out_of_plane = self._read(topic, message.data)
             wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
                 # those before were another publisher's
-                self._hand_over(arrived)
+                self._step(arrived)
                 arrived, followed = [], inputs.senders.followed
             if wanted:
                 self._intake.out_of_plane += out_of_plane
                 fx, fy, moment = values
                 arrived.append((stamp, (fx, fy, moment)))
-        if arrived:
-            self._on_samples(arrived)
+        self._step(arrived)
 
-    def _hand_over(self, arrived: list[Arrival]) -> None:
+    def _step(self, arrived: list[Arrival]) -> None:
+        """Let the twin take samples, and send what follows."""
         if arrived:
-            self._on_samples(arrived)
+            for topic, message in self._runtime.step(arrived):
+                self._front.send(topic, message)
 
-    def _not_selected(self, topic: str, read: Callable[[bytes], Read], batch: list[Taken]) -> None:
+    def _not_selected(self, topic: str, batch: list[Taken]) -> None:
         for message in batch:
-            stamp, values, _, _ = read(message.data)
+            stamp, values, _, _ = self._read(topic, message.data)
             self._inputs.arriving = (topic, message.sender)
             self._intake.refuse(Verdict.NOT_SELECTED, stamp, values)
+
+    def _read(self, topic: str, data: bytes) -> Read:
+        """Return what the bytes of a load hold."""
+        return read_wrench(data) if topic == "excitation" else self._read_tool_forces(data)
 
     def _read_tool_forces(self, data: bytes) -> Read:
         message = _message(data, JointState)
@@ -222,20 +231,20 @@ class Subscriptions:
 
     def _travel_speeds(self, batch: list[Taken]) -> None:
         for message in self._messages("travel", TwistStamped, self._inputs.travel, batch):
-            self._inputs.take_travel(stamp_ns(message.header), message.twist.linear.z)
+            self._runtime.take_travel(stamp_ns(message.header), message.twist.linear.z)
 
     def _measured_gaps(self, batch: list[Taken]) -> None:
         for message in self._messages("gaps", JointState, self._inputs.gaps, batch):
             named, stamp = set(message.name), stamp_ns(message.header)
             if len(message.position) == len(message.name) == len(named) and named <= _PAIR_NUMBERS.keys():
                 gaps = {_PAIR_NUMBERS[name]: gap for name, gap in zip(message.name, message.position, strict=True)}
-                self._inputs.take_gaps(stamp, gaps)
+                self._runtime.take_gaps(stamp, gaps)
             else:
                 self._inputs.gaps.refuse(Verdict.MALFORMED, stamp, tuple(message.position))
 
-    def _measured_poses(self, kind: type, batch: list[Taken]) -> None:
-        for message in self._messages("head_pose", kind, self._inputs.head_pose, batch):
-            with_covariance = kind is PoseWithCovarianceStamped
+    def _measured_poses(self, batch: list[Taken]) -> None:
+        for message in self._messages("head_pose", self._pose, self._inputs.head_pose, batch):
+            with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
             if turn.z == turn.w == 0.0:  # no turn about z: never filled in, or upside down
@@ -243,7 +252,7 @@ class Subscriptions:
                 continue
             theta = 2.0 * math.atan2(turn.z, turn.w)
             deviation = deviations(message.pose.covariance) if with_covariance else ()
-            self._inputs.take_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
+            self._runtime.take_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
         """Yield the messages of an input besides the load; what cannot be read is counted."""

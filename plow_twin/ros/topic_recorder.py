@@ -140,9 +140,10 @@ class TopicRecorder:
             ),
             raw=True,
         )
-        self._loop.add(InputQueue(self._node, subscription, partial(self._take, name, quality, number)))
+        self._loop.add(InputQueue(self._node, subscription), _Subscription(self, quality, number), name)
 
-    def _take(self, name: str, quality: _Quality, number: int, taken: list[Taken]) -> None:
+    def take(self, name: str, quality: _Quality, number: int, taken: list[Taken]) -> None:
+        """Write messages of a subscription, each message once."""
         for message in taken:
             key = (name, message.sender)
             # a weaker subscription of the topic gets the messages of a stronger publisher as well
@@ -158,6 +159,18 @@ class TopicRecorder:
         """Take what still waits, and end the subscriptions."""
         self._loop.flush()
         self._loop.close()
+
+
+class _Subscription(NamedTuple):
+    """A subscription of a recorder: its quality of service, and the topic's number in the file."""
+
+    recorder: TopicRecorder
+    quality: _Quality
+    number: int
+
+    def receive(self, topic: str, batch: list[Taken]) -> None:
+        """Take in what has been in the queue."""
+        self.recorder.take(topic, self.quality, self.number, batch)
 
 
 def record_topics(

@@ -1,24 +1,42 @@
-"""What an advance of a twin tells: at one time, at many, and of many twins at many."""
+"""What an advance of a twin gives: views of the rows that the kernels write, of one time, of many, of many twins."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
-from typing import Any, Final, Self
+from typing import Any, Final, Generic, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import ArgumentError
-from plow_twin.solve.state import ROW, Status
+from plow_twin.solve.state import Status
+
+Number = TypeVar("Number", bound=np.generic)
 
 
-@dataclass(frozen=True)
+class _Column(Generic[Number]):
+    """A field of the rows, as an array that shares their memory."""
+
+    def __init__(self, name: str = "") -> None:
+        self._name = name
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = self._name or name
+
+    @overload
+    def __get__(self, view: None, owner: type) -> _Column[Number]: ...
+    @overload
+    def __get__(self, view: object, owner: type) -> NDArray[Number]: ...
+    def __get__(self, view: Any, owner: type) -> Any:
+        return self if view is None else view.rows[self._name]
+
+
 class Advance:
-    """What the head does at a time, and what happened since the advance before.
+    """What the head does at a time, and what happened since the advance before: a view of one row.
 
     Attributes
     ----------
+    rows : numpy.void of `ROW`
+        The row.
     t : float
         Model time in s.
     q, v : ndarray, shape (3,)
@@ -41,106 +59,106 @@ class Advance:
         Estimated error of the pose in m where `max_evaluations` did not suffice for the tolerance, else 0.
     """
 
-    t: float
-    q: NDArray[np.float64]
-    v: NDArray[np.float64]
-    penetration: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    force: NDArray[np.float64]
-    peak: NDArray[np.float64]
-    impulse: NDArray[np.float64]
-    time_in_contact: NDArray[np.float64]
-    makes: NDArray[np.int64]
-    wear_depth: NDArray[np.float64]
-    steps: int
-    status: Status
-    error_estimate_m: float
+    __slots__ = ("rows",)
+
+    q = _Column[np.float64]()
+    v = _Column[np.float64]()
+    penetration = _Column[np.float64]()
+    rate = _Column[np.float64]()
+    force = _Column[np.float64]()
+    peak = _Column[np.float64]()
+    impulse = _Column[np.float64]()
+    time_in_contact = _Column[np.float64]()
+    makes = _Column[np.int64]()
+    wear_depth = _Column[np.float64]()
+
+    def __init__(self, row: np.void) -> None:
+        self.rows = row
+
+    @property
+    def t(self) -> float:
+        """Model time in s."""
+        return float(self.rows["t"])
+
+    @property
+    def steps(self) -> int:
+        """Steps the solver took."""
+        return int(self.rows["steps"])
+
+    @property
+    def status(self) -> Status:
+        """How the advance ended."""
+        return _STATUS[int(self.rows["status"])]
+
+    @property
+    def error_estimate_m(self) -> float:
+        """Estimated error of the pose in m."""
+        return float(self.rows["error_estimate"])
 
 
-@dataclass(frozen=True)
 class _Rows:
-    t: NDArray[np.float64]
-    q: NDArray[np.float64]
-    v: NDArray[np.float64]
-    penetration: NDArray[np.float64]
-    rate: NDArray[np.float64]
-    force: NDArray[np.float64]
-    peak: NDArray[np.float64]
-    impulse: NDArray[np.float64]
-    time_in_contact: NDArray[np.float64]
-    makes: NDArray[np.int64]
-    wear_depth: NDArray[np.float64]
-    steps: NDArray[np.int64]
-    status: NDArray[np.int64]
-    error_estimate_m: NDArray[np.float64]
+    """The columns of many rows."""
 
-    @classmethod
-    def of(cls, times: NDArray[np.float64], rows: NDArray[np.void], *, own: bool = False) -> Self:
-        """Return the fields of the rows that the kernels fill; they share memory.
+    __slots__ = ("rows",)
 
-        Parameters
-        ----------
-        times : ndarray, shape (n,)
-            Model times in s.
-        rows : ndarray of `ROW`, shape (n,), of a batch (m, n)
-            What the kernels filled.
-        own : bool
-            Whether nobody else writes to the rows: a copy of one, field by field, takes as long as two advances.
-        """
-        made = cls.__new__(cls)
-        made.__dict__.update(t=times, _rows=rows, _own=own)
-        return made
+    q = _Column[np.float64]()
+    v = _Column[np.float64]()
+    penetration = _Column[np.float64]()
+    rate = _Column[np.float64]()
+    force = _Column[np.float64]()
+    peak = _Column[np.float64]()
+    impulse = _Column[np.float64]()
+    time_in_contact = _Column[np.float64]()
+    makes = _Column[np.int64]()
+    wear_depth = _Column[np.float64]()
+    steps = _Column[np.int64]()
+    status = _Column[np.int64]()
+    error_estimate_m = _Column[np.float64]("error_estimate")
 
-    def __getattr__(self, name: str) -> NDArray[Any]:
-        # fields of `of` are taken out of the rows when they are asked for: all of them take longer than one advance
-        if name not in _ROW_NAMES:
-            raise AttributeError(name)
-        found: NDArray[Any] = self.__dict__["_rows"][_ROW_NAMES[name]]
-        self.__dict__[name] = found
-        return found
-
-
-@dataclass(frozen=True)
-class AdvanceSeries(_Rows):
-    """Many advances at once: the fields of `Advance`, each with a leading axis of length n."""
+    def __init__(self, rows: NDArray[np.void]) -> None:
+        self.rows = rows
 
     def __len__(self) -> int:
-        return len(self.t)
+        return len(self.rows)
+
+
+class AdvanceSeries(_Rows):
+    """Many advances at once: the fields of `Advance`, each with a leading axis of length n, `status` as numbers.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Model times in s.
+    """
+
+    __slots__ = ()
+
+    t = _Column[np.float64]()
 
     def __getitem__(self, index: int) -> Advance:
-        rows = self.__dict__.get("_rows")
-        if rows is None:
-            row = tuple(getattr(self, name)[index] for name in _ROW_NAMES)
-        else:
-            # a copy: it does not keep all the rows, nor change with their memory
-            row = (rows[index] if self.__dict__["_own"] else rows[index].copy()).item()
-        made = Advance.__new__(Advance)  # all at once: a frozen class sets its fields one by one
-        made.__dict__.update(zip(_ROW_NAMES, row, strict=True), t=float(self.t[index]))
-        made.__dict__.update(steps=int(made.steps), status=_STATUS[made.status])
-        made.__dict__["error_estimate_m"] = float(made.error_estimate_m)
-        return made
+        return Advance(self.rows[index].copy())  # a copy does not keep all the rows
 
 
-@dataclass(frozen=True)
 class AdvanceBatch(_Rows):
     """Advances of m twins: the fields of `AdvanceSeries`, each but `t` with a leading axis of length m."""
 
-    def __len__(self) -> int:
-        return len(self.status)
+    __slots__ = ()
+
+    @property
+    def t(self) -> NDArray[np.float64]:
+        """Model times in s, shape (n,)."""
+        times: NDArray[np.float64] = self.rows["t"][0]
+        return times
 
     def __getitem__(self, member: int) -> AdvanceSeries:
-        return AdvanceSeries(self.t, *(getattr(self, field.name)[member] for field in fields(_Rows)[1:]))
+        return AdvanceSeries(self.rows[member])
 
 
-#: Names in the rows of the kernels, by field.
-_ROW_NAMES: Final = dict(zip((field.name for field in fields(_Rows)[1:]), ROW.names or (), strict=True))
 _STATUS: Final = {int(status): status for status in Status}
 
 
 def check_times(now: float, times: NDArray[np.float64]) -> None:
     """Raise `ArgumentError` for times that are not finite or go back."""
-    if times.shape == (1,) and now <= times[0] < math.inf:
-        return  # one after the other, as a live twin asks
     if times.ndim != 1 or not np.isfinite(times).all():
         raise ArgumentError(f"t: got {times!r}, expected finite times in s, shape (n,)")
     if len(times) and (times[0] < now or (times[1:] < times[:-1]).any()):

@@ -26,6 +26,7 @@ from plow_twin.solve.state import ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_
 __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
+_NO_MARKS = np.zeros(0, np.int64)
 #: Terms without which a scene computes the same as with them, where their numbers are zero.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
@@ -156,7 +157,7 @@ class TwinBatch:
         rows = np.zeros((len(self), len(times)), ROW)
         self._run(times, ends / self._masses, rows)
         self._wrench = ends[:, -1].copy()
-        return AdvanceBatch.of(times, rows)
+        return AdvanceBatch(rows)
 
     def reset(self, t: float) -> None:
         """Go back to the scenes' initial states, at model time `t`.
@@ -279,9 +280,10 @@ class TwinBatch:
     def _run(self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: NDArray[np.void]) -> None:
         def run(index: int) -> None:
             worker = self._workers[index]
-            worker.pace.run(lambda: loop.advance_batch(
+            worker.pace.run(loop.advance_rows, (
                 self._params, worker.parts, self._states, worker.pace.saved, worker.work, worker.totals,
-                *self._edges[index : index + 2], times, ends, self._max_steps, rows, None, worker.pace.record,
+                *self._edges[index : index + 2], times, ends, self._max_steps, rows, _NO_MARKS, self._states[:0], None,
+                worker.pace.record,
             ))  # fmt: skip
 
         before, begun = self._states.copy(), []

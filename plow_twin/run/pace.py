@@ -39,6 +39,8 @@ class Pace:
         self.record = first_of(self._records)
         #: the same for calls: of a record numba asks for an attribute, which numpy looks up in Python
         self.argument = self._records[0]
+        #: advances that have failed in the last call, shape (1,): a view of the record
+        self.failed = self._records["failed"]
         self.record.slice = _SLICE_IMPLICIT if implicit else _SLICE
         # as bytes: numpy copies a record field by field, five times as slowly
         self._bytes = self._records.view(np.uint8).data

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-import struct
 import time as _time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +22,7 @@ from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
+from plow_twin.solve.samples import lay_out
 from plow_twin.solve.state import (
     BOUND,
     ROW,
@@ -43,12 +43,9 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Steps one advance may take before it gives up.
 DEFAULT_BUDGET = 50_000_000
-#: Rows made at once for advances one by one: numpy takes as long for one as for hundreds.
-_STOCK = 256
-#: Time, load before and at a sample, as the kernels take them; a load.
-_SAMPLE, _LOAD = struct.Struct("=7d"), struct.Struct("=3d")
-#: Kernels by what the types of their arguments follow from: to look at these takes milliseconds.
+#: The kernel by what the types of its arguments follow from: numba takes milliseconds to look at these.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
+_NO_MARKS = np.zeros(0, np.int64)
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
 LEAST_EVALUATIONS = 16
 
@@ -118,18 +115,8 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
-        self._inertia_numbers = self._inertias.tolist()
-        #: rows for advances one by one, (1, 1) each
-        self._stock: list[NDArray[np.void]] = []
-        #: what advances to one sample, once its types are known, and what it is called with
-        self._advance_one: Callable[..., bool] | None = None
-        self._sample, self._load = np.zeros(7), np.zeros(3)
-        self._times, ends = self._sample[:1], self._sample[1:].reshape(1, 2, 3)
-        self._before_row = (
-            self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, self._times,
-            ends, self._budget,
-        )  # fmt: skip
-        self._after_row = self._bound, self._pace.argument
+        #: the kernel for loads from outside or the scene's own, with rows or without
+        self._kernels: dict[tuple[bool, bool], Callable[..., bool]] = {}
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
@@ -194,79 +181,14 @@ class Twin:
         ArgumentError
             For a time before the present one, or anything that is not finite; nothing has changed then.
         """
-        if self.excitation == "scene":
-            if wrench is not None:
-                raise ArgumentError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
-            return self._advance_scene(np.array([t], dtype=np.float64))[0]
+        if self.excitation == "scene" and wrench is not None:
+            raise ArgumentError(f"wrench: got {wrench!r}, expected None with excitation='scene'")
         sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
         if sample.shape != (3,):
             raise ArgumentError(f"wrench: got {sample!r}, expected 3 finite numbers")
-        return self.advance_sample(float(t), sample.tolist())[0]
-
-    def advance_sample(self, t: float, wrench: Sequence[float]) -> AdvanceSeries:
-        """Advance through one sample, as `advance_samples` does through many, in a third of its time.
-
-        Parameters
-        ----------
-        t : float
-            Model time in s, not before the present one.
-        wrench : sequence of float, length 3
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t`.
-
-        Returns
-        -------
-        AdvanceSeries
-            One row.
-
-        Raises
-        ------
-        ArgumentError
-            As `advance`; nothing has changed then.
-        """
-        rows = self.advance_row(t, wrench)
-        return AdvanceSeries.of(np.array([t]), rows[0], own=True)
-
-    def advance_row(self, t: float, wrench: Sequence[float]) -> NDArray[np.void]:
-        """Advance as `advance_sample` does, and tell no more than the kernels do.
-
-        Parameters
-        ----------
-        t : float
-            Model time in s, not before the present one.
-        wrench : sequence of float, length 3
-            Fx, Fy [N] and M [N m] about the cavity's centre at `t`.
-
-        Returns
-        -------
-        ndarray of `ROW`, shape (1, 1)
-            Nobody else writes to it.
-
-        Raises
-        ------
-        ArgumentError
-            As `advance`; nothing has changed then.
-        """
-        if self.excitation != "sampled":
-            raise ArgumentError("advance_sample: got excitation='scene', expected excitation='sampled'")
-        if not self._time.item() <= t < math.inf:
-            check_times(self.time, np.array([t]))
-        if len(wrench) != 3 or not all(map(math.isfinite, wrench)):
-            raise ArgumentError(f"wrench: got {wrench!r}, expected 3 finite numbers")
-        fx, fy, moment = wrench
-        fx0, fy0, moment0 = self._wrench.tolist()
-        mass, _, inertia = self._inertia_numbers
-        before = fx0 / mass, fy0 / mass, moment0 / inertia
-        _SAMPLE.pack_into(self._sample.data, 0, t, *before, fx / mass, fy / mass, moment / inertia)
-        if not self._stock:
-            self._stock = list(np.zeros((_STOCK, 1, 1), ROW))
-        rows = self._stock.pop()
-        arguments = *self._before_row, rows, *self._after_row
-        if self._advance_one is None:
-            self._advance_one = self._entry(loop.advance_batch, arguments)
-        self._in_slices(self._advance_one, arguments, self._times, None, rows[0])
-        _LOAD.pack_into(self._load.data, 0, fx, fy, moment)
-        self._wrench = self._load
-        return rows
+        rows = np.zeros(1, ROW)
+        self.advance_rows(np.array([t], dtype=np.float64), sample[None], rows)
+        return Advance(rows[0])
 
     def advance_samples(self, t: ArrayLike, wrench: ArrayLike) -> AdvanceSeries:
         """Advance through many samples; the same bits as one `advance` each.
@@ -290,71 +212,67 @@ class Twin:
         """
         if self.excitation != "sampled":
             raise ArgumentError("advance_samples: got excitation='scene', expected excitation='sampled'")
-        times, samples = np.asarray(t, dtype=np.float64), np.ascontiguousarray(wrench, dtype=np.float64)
-        check_times(self.time, times)
-        if samples.shape != (len(times), 3) or not np.isfinite(samples).all():
-            raise ArgumentError(f"wrench: got {samples!r}, expected finite numbers of shape ({len(times)}, 3)")
-        rows = np.zeros(len(times), ROW)
-        wrenches, members = self._per_inertia(samples)[None], rows[None]
-        self._in_slices(loop.advance_batch, (
-            self._params, self._parts, self._states, self._pace.saved, self._works, self._all_totals, 0, 1, times,
-            wrenches, self._budget, members, self._bound, self._pace.record,
-        ), times, samples, rows)  # fmt: skip
-        self._wrench = samples[-1].copy() if len(samples) else self._wrench
-        return AdvanceSeries.of(times, rows)
+        times = np.asarray(t, dtype=np.float64)
+        rows = np.zeros(times.size, ROW)
+        self.advance_rows(times, np.asarray(wrench, dtype=np.float64), rows)
+        return AdvanceSeries(rows)
 
-    def advance_marked(
+    def advance_rows(
         self,
         t: NDArray[np.float64],
         wrench: NDArray[np.float64],
-        marks: NDArray[np.int64],
-        *,
-        rows: bool | NDArray[np.void] = True,
-    ) -> MarkedAdvance:
-        """Advance through many samples as `advance_samples` does, and tell the digest at some of them.
+        rows: NDArray[np.void] | None,
+        marks: NDArray[np.int64] = _NO_MARKS,
+    ) -> Advanced:
+        """Advance to some times: the way of every advance.
 
         Parameters
         ----------
         t : ndarray, shape (n,)
             Model times in s, never falling.
         wrench : ndarray, shape (n, 3)
-            Fx, Fy [N] and M [N m] about the cavity's centre at each time.
+            Fx, Fy [N] and M [N m] about the cavity's centre at each time; not used with `excitation="scene"`.
+        rows : ndarray of `ROW`, shape (n,), or None
+            Receives a row for each time. Without rows the motion is the same, and no forces are computed for output.
         marks : ndarray of int64, shape (m,)
-            Rising numbers from 1 to n: a digest is wanted after so many samples.
-        rows : bool or ndarray of `ROW`, shape (k,)
-            Whether the rows are wanted; without them the motion is the same, but no forces are looked at for it.
-            Memory for at least n rows is written over: to make it anew for each call costs some 5 % of its time.
+            Rising numbers from 1 to n: a digest is wanted after so many advances.
 
         Returns
         -------
-        MarkedAdvance
-            Rows or None, status of each sample, shape (n,), the m digests, and the wear at the end.
+        Advanced
+            How many advances failed, and the m digests.
 
         Raises
         ------
         ArgumentError
-            As `advance_samples`; nothing has changed then.
+            As `advance`; nothing has changed then.
         """
-        if self.excitation != "sampled" or self._bound is not None:
-            raise ArgumentError("advance_marked: expected excitation='sampled' without max_evaluations")
-        check_times(self.time, t)
-        if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
-            raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
-        out = None if rows is False else np.zeros(len(t), ROW) if rows is True else rows[: len(t)]
-        times, marks = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(marks, np.int64)
-        totals = None if out is None else self._all_totals
-        status = np.zeros(len(t), np.int64)
-        snapshots = np.zeros(len(marks), self._states.dtype)
-        per = self._per_inertia(wrench)
+        sampled = self.excitation == "sampled"
+        t, wrench = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(wrench, np.float64)
+        if not (len(t) == 1 and self._time[0] <= t[0] < math.inf):
+            check_times(self.time, t)
+        per_inertia = None
+        if sampled:
+            per_inertia = np.empty((1, len(t) + 1, 3))
+            if wrench.shape != (len(t), 3) or not lay_out(self._wrench, wrench, self._inertias, per_inertia[0]):
+                raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
+        snapshots = np.zeros(len(marks), self._states.dtype) if len(marks) else self._states[:0]
         arguments = (
-            self._params, self._parts, self._states, self._pace.saved, self._works, totals, times, per,
-            self._budget, marks, snapshots, status, out, self._pace.argument,
+            self._params, self._parts, self._states, self._pace.saved, self._works,
+            None if rows is None else self._all_totals, 0, 1, t, per_inertia, self._budget,
+            None if rows is None else rows[None], marks, snapshots, self._bound, self._pace.argument,
         )  # fmt: skip
-        self._in_slices(self._entry(loop.advance_marked, arguments, out is None), arguments, times, wrench, out)
-        self._wrench = wrench[-1].copy() if len(wrench) else self._wrench
-        digests = self._digests(snapshots, wrench[marks - 1])
-        series = None if out is None else AdvanceSeries.of(t, out)
-        return MarkedAdvance(series, status, digests, self._state.wear_depth.copy())
+        kind = sampled, rows is not None
+        if kind not in self._kernels:
+            self._kernels[kind] = self._kernel(kind, arguments)
+        try:
+            self._pace.run(self._kernels[kind], arguments)
+        except (OutOfTimeError, KeyboardInterrupt) as stop:
+            self._stopped(stop, len(t), wrench if sampled else None, rows)
+        if sampled and len(wrench):
+            self._wrench = wrench[-1].copy()
+        digests = self._digests(snapshots, wrench[marks - 1]) if len(marks) else []
+        return Advanced(int(self._pace.failed[0]), digests)
 
     @property
     def wrench(self) -> NDArray[np.float64]:
@@ -444,6 +362,12 @@ class Twin:
         return _digest(self.snapshot())
 
     @property
+    def wear_depth(self) -> NDArray[np.float64]:
+        """Wear depth of each pad at the end of the last step [m], shape (8,): a sample ends a step."""
+        depth: NDArray[np.float64] = self._state.wear_depth.copy()
+        return depth
+
+    @property
     def frame(self) -> NDArray[np.float64] | None:
         """Displacement of a frame that gives way, x, y [m], theta [rad], and its rate, shape (6,); None without one."""
         state, work = self._state, self._work
@@ -471,20 +395,12 @@ class Twin:
         """Advances so far whose end was coarse because of `max_evaluations`."""
         return int(self._state.bounded)
 
-    def _entry(self, kernel: Callable[..., bool], arguments: tuple[Any, ...], *kind: bool) -> Callable[..., bool]:
-        """Return a kernel compiled for its arguments, whose types follow from the signature and `kind`."""
-        key = kernel, self.signature, kind
+    def _kernel(self, kind: tuple[bool, bool], arguments: tuple[Any, ...]) -> Callable[..., bool]:
+        """Return the kernel compiled for its arguments, whose types follow from the signature and `kind`."""
+        key = self.signature, kind
         if key not in _entries:
-            _entries[key] = for_arguments(kernel, arguments)
+            _entries[key] = for_arguments(loop.advance_rows, arguments)
         return _entries[key]
-
-    def _per_inertia(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the last sample and those that follow (n, 3) per mass and inertia, shape (n + 1, 3)."""
-        per = np.empty((len(samples) + 1, 3))
-        per[0], per[1:] = self._wrench, samples
-        for column, inertia in zip(per.T, self._inertia_numbers, strict=True):  # six times as fast as rows of three
-            column /= inertia
-        return per
 
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
         """Return what `digest` would be at some states with their last samples, shape (m, 3)."""
@@ -495,42 +411,19 @@ class Twin:
         rows[:, size + 24 :] = np.frombuffer(np.float64(self._travel_speed).tobytes(), np.uint8)
         return [_digest(row.data) for row in rows]
 
-    def _advance_scene(self, times: NDArray[np.float64]) -> AdvanceSeries:
-        check_times(self.time, times)
-        rows = np.zeros(len(times), ROW)
-        self._in_slices(loop.advance_times, (
-            self._compiled.params, self._parts, self._states, self._pace.saved, self._work, self._totals, times,
-            self._budget, rows, self._bound, self._pace.record,
-        ), times, None, rows)  # fmt: skip
-        return AdvanceSeries.of(times, rows)
-
-    def _in_slices(
-        self,
-        work: Callable[..., bool],
-        arguments: tuple[Any, ...],
-        times: NDArray[np.float64],
-        samples: NDArray[np.float64] | None,
-        rows: NDArray[np.void] | None,
-    ) -> None:
-        """Do the advances to `times`; stopped before the end, stand after the last one that was done.
-
-        Raises
-        ------
-        LimitError, RunInterrupted
-            With the rows of the advances that were done, where there are rows.
-        """
-        try:
-            self._pace.run(work, arguments)
-        except (OutOfTimeError, KeyboardInterrupt) as stop:
-            steps, done = self.steps, int(self._pace.record.row)
-            self._go_back()
-            if samples is not None and done > 0:
-                self._wrench = samples[done - 1].copy()
-            part = None if rows is None else AdvanceSeries.of(times[:done], rows[:done])
-            late = isinstance(stop, OutOfTimeError)
-            what = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
-            message = f"{what} at t = {self.time:.9g} s after {done} of {len(times)} advances, {steps} steps in all"
-            raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
+    def _stopped(
+        self, stop: BaseException, count: int, samples: NDArray[np.float64] | None, rows: NDArray[np.void] | None
+    ) -> NoReturn:
+        """Stand after the last advance that was done, of `count`, and raise."""
+        steps, done = self.steps, int(self._pace.record.row)
+        self._go_back()
+        if samples is not None and done > 0:
+            self._wrench = samples[done - 1].copy()
+        part = None if rows is None else AdvanceSeries(rows[:done])
+        late = isinstance(stop, OutOfTimeError)
+        what = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
+        message = f"{what} at t = {self.time:.9g} s after {done} of {count} advances, {steps} steps in all"
+        raise (LimitError if late else RunInterrupted)(message, part, self.time) from None
 
     def _go_back(self) -> None:
         """Take back the advance under way."""
@@ -552,18 +445,11 @@ class Twin:
             self._compiled.params.wear_per_impulse[:] = wear_rate(wear, speed)
 
 
-@dataclass(frozen=True)
-class MarkedAdvance:
-    """What `Twin.advance_marked` found.
+class Advanced(NamedTuple):
+    """How many advances of a call failed, and the digests at its marks."""
 
-    The rows or None, the status of each advance, the digests at the marks, and the wear depth of each pad in m after
-    the last one, shape (8,): a sample ends a step, so it is that of the state.
-    """
-
-    rows: AdvanceSeries | None
-    status: NDArray[np.int64]
+    failed: int
     digests: list[str]
-    wear_depth: NDArray[np.float64]
 
 
 def read_snapshot(data: bytes, dtype: np.dtype[np.void]) -> tuple[np.void, NDArray[np.float64], float]:

@@ -178,18 +178,6 @@ def _read_row(p, parts, state, w, totals, out) -> None:
     _clear(totals)
 
 
-@kernel()
-def _advance_row(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace, out) -> bool:
-    """Proceed to `target` and write all that a `ROW` tells of it; False where the slice ended before."""
-    out.status, out.steps = _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace)
-    if out.status == _PAUSED:
-        return False
-    if bound is not None:
-        out.error_estimate = bound.error
-    _read_row(p, parts, states[index], w, totals, out)
-    return True
-
-
 @kernel(inline="source")
 def _begin_slice(pace) -> None:
     pace.left = pace.slice
@@ -212,79 +200,66 @@ def _follow_line(piece, start, time, before, sample) -> None:
 
 
 @kernel(entry=True)
-def advance_times(p, parts, states, saved, w, totals, times, budget, rows, bound, pace) -> bool:
-    """Advance to each time under the scene's own loads and write a row for each; `states`, `saved` are arrays of one.
-
-    Returns whether all is done; else the caller looks at its limits and calls again with the same `pace`.
-    """
-    parts, states = _unowned_loads(parts), unowned(states)
-    _begin_slice(pace)
-    while pace.row < times.size:
-        i = pace.row
-        if _is_over(pace):
-            return False
-        if not _advance_row(p, parts, states, 0, saved, w, totals, times[i], np.inf, budget, bound, pace, rows[i]):
-            return False
-        pace.row = i + 1
-    return True
-
-
-@kernel(entry=True)
-def advance_batch(
-    params, parts, states, saved, work, totals, first, last, times, wrench, budget, rows, bound, pace
+def advance_rows(
+    params, parts, states, saved, work, totals, first, last, times, wrench, budget, rows, marks, snapshots, bound, pace
 ) -> bool:
-    """Advance members `first` to `last` - 1 to each time: arrays but times have an axis of members in front.
+    """Advance members `first` to `last` - 1 to each time; one twin is a member alone and has the same bits.
 
-    A wrench runs straight from one sample to the next; a sample ends a step. One twin is a member too: it has the same
-    bits alone. `saved`, `work` and `totals` are arrays of one. Returns whether all is done, as `advance_times`.
+    Parameters
+    ----------
+    params, states : ndarray of records, shape (m,)
+        Of all members.
+    saved, work, totals : ndarray of records, shape (1,)
+        The state before the advance under way, scratch space and sums. Without totals nothing is counted nor read out,
+        and the motion is the same.
+    times : ndarray, shape (n,)
+        Times in s, never falling.
+    wrench : ndarray, shape (m, n + 1, 3), or None
+        Load per mass and inertia: the last sample, then one at each time, joined by straight lines; each ends a step.
+        None: the scene's own loads.
+    rows : ndarray of `ROW`, shape (m, n), or None
+        Receives what is known at each time; None without totals.
+    marks, snapshots
+        Numbers of advances from 1 on, rising, shape (k,); after each of them the state is copied to `snapshots`, (k,).
+    bound
+        As of `_advance`.
+    pace
+        Where the call goes on.
+
+    Returns
+    -------
+    bool
+        Whether all is done; else the caller looks at its limits and calls again with the same `pace`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
-    w, sums, piece, count = work[0], totals[0], parts.segments[0], times.size
+    w, count = work[0], times.size
+    sums = None if totals is None else totals[0]
     _begin_slice(pace)
     while pace.row < (last - first) * count:
         m, i = first + pace.row // count, pace.row % count
         if _is_over(pace):
             return False
         p, state = params[m], states[m]
-        if pace.underway == 0:
-            state.piece = 0
-            _follow_line(piece, state.step_start, times[i], wrench[m, i], wrench[m, i + 1])
-        if not _advance_row(p, parts, states, m, saved, w, sums, times[i], times[i], budget, bound, pace, rows[m, i]):
+        stop_time = np.inf
+        if wrench is not None:
+            stop_time = times[i]
+            if pace.underway == 0:
+                state.piece = 0
+                _follow_line(parts.segments[0], state.step_start, times[i], wrench[m, i], wrench[m, i + 1])
+        status, steps = _advance(p, parts, states, m, saved, w, sums, times[i], stop_time, budget, bound, pace)
+        if status == _PAUSED:
             return False
-        pace.row += 1
-    return True
-
-
-@kernel(entry=True)
-def advance_marked(
-    params, parts, states, saved, work, totals, times, wrench, budget, marks, snapshots, status, rows, pace
-) -> bool:
-    """Advance one twin to each time, as `advance_batch` does, and save its state where `marks` say.
-
-    `marks` are numbers of advances, rising; `snapshots` has room for as many states. `rows` and `totals` may be None:
-    then nothing is read out, nor counted. Returns whether all is done, as `advance_times`.
-    """
-    parts, states = _unowned_loads(parts), unowned(states)
-    sums = None if totals is None else totals[0]
-    w, piece, p, state = work[0], parts.segments[0], params[0], states[0]
-    _begin_slice(pace)
-    while pace.row < times.size:
-        i = pace.row
-        if _is_over(pace):
-            return False
-        if pace.underway == 0:
-            state.piece = 0
-            _follow_line(piece, state.step_start, times[i], wrench[i], wrench[i + 1])
-        status[i] = _advance(p, parts, states, 0, saved, w, sums, times[i], times[i], budget, None, pace)[0]
-        if status[i] == _PAUSED:
-            return False
+        pace.failed += 1 if status != _OK else 0
         if rows is not None:
-            _read_row(p, parts, state, w, sums, rows[i])
-            rows[i].status = status[i]
-        while pace.mark < marks.size and marks[pace.mark] == i + 1:
-            snapshots[pace.mark] = states[0]
+            out = rows[m, i]
+            out.t, out.status, out.steps = times[i], status, steps
+            if bound is not None:
+                out.error_estimate = bound.error
+            _read_row(p, parts, state, w, sums, out)
+        pace.row += 1
+        while pace.mark < marks.size and marks[pace.mark] == pace.row:
+            snapshots[pace.mark] = states[m]
             pace.mark += 1
-        pace.row = i + 1
     return True
 
 

@@ -270,9 +270,10 @@ TOTALS: Final = np.dtype(
     ]
 )
 
-#: What an advance tells: the motion at its end, and what happened since the advance before (`run.advance.Advance`).
+#: The record that goes from the solver to the messages: the motion at a time, and what happened since the one before.
 ROW: Final = np.dtype(
     [
+        ("t", "f8"),
         ("q", "f8", (3,)),
         ("v", "f8", (3,)),
         *((name, "f8", (PAIR_COUNT,)) for name in ("penetration", "rate", "force", "peak", "impulse")),
@@ -282,6 +283,16 @@ ROW: Final = np.dtype(
         ("steps", "i8"),
         ("status", "i8"),
         ("error_estimate", "f8"),
+        # what follows is written where the row is published (`solve.totals.publish`): touches are then all so far,
+        # impulse and peak those since the publication before
+        ("stamp_ns", "i8"),
+        ("samples", "i8"),  # advances since then that ended at a sample
+        ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these
+        ("held", "i8"),  # 1 where the motion at the stamp was computed without a sample
+        ("corrected", "i8"),  # 1 where late samples have been worked in since then
+        ("marked", "i8"),  # 1 where one of the two is 1, here or in the publication before
+        ("orientation", "f8", (2,)),  # z and w of the head's quaternion
+        ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], about z [rad/s]
     ]
 )
 
@@ -360,6 +371,7 @@ PACE: Final = np.dtype(
         ("row", "i8"),  # the advance that comes next, members one after the other
         ("underway", "i8"),  # 1 where that one has begun
         ("mark", "i8"),  # the mark that comes next
+        ("failed", "i8"),  # advances that failed
     ]
 )
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.polynomial import maximum, shift_column
 from plow_twin.kernel.simd import magnitude, row, set_row, splat
@@ -10,60 +12,96 @@ from plow_twin.solve.dense_output import time_along
 from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 
-@kernel(entry=True)
-def add_up(rows, makes, impulse, peak) -> int:
-    """Let the `ROW` of an advance, (1, 1), tell of all since the last one told, of which the three sums know.
-
-    Makes go on counting, impulse and peak begin anew. Returns the advance's status; after a failed one nothing changes.
-    """
-    row_of = rows[0, 0]
-    if row_of.status != 0:
-        return row_of.status
+@kernel()
+def _seal(row_of, window) -> None:
+    """Let a row tell of its whole window, and begin the next one: touches go on counting."""
     for pair in range(PAIR_COUNT):
-        makes[pair] += row_of.makes[pair]
-        row_of.makes[pair] = makes[pair]
-        row_of.impulse[pair] = impulse[pair] + row_of.impulse[pair]
-        if row_of.peak[pair] < peak[pair]:
-            row_of.peak[pair] = peak[pair]
-        impulse[pair] = peak[pair] = 0.0
-    return 0
+        row_of.makes[pair], row_of.impulse[pair] = window.makes[pair], window.impulse[pair]
+        row_of.peak[pair], row_of.measured_peak[pair] = window.peak[pair], window.measured_peak[pair]
+        window.impulse[pair] = window.peak[pair] = window.measured_peak[pair] = 0.0
+    row_of.samples, window.samples = window.samples, 0
+    row_of.corrected = window.corrected
+    mark = max(row_of.held, row_of.corrected)
+    row_of.marked = max(mark, window.marked)
+    window.corrected, window.marked = 0, mark
+    theta = row_of.q[2]
+    cos, sin = math.cos(theta), math.sin(theta)
+    row_of.orientation[0], row_of.orientation[1] = math.sin(0.5 * theta), math.cos(0.5 * theta)
+    vx, vy = row_of.v[0], row_of.v[1]
+    row_of.twist[0], row_of.twist[1], row_of.twist[2] = cos * vx + sin * vy, cos * vy - sin * vx, row_of.v[2]
 
 
 @kernel(entry=True)
-def sum_windows(rows, taken, makes, impulse, peak, all_makes, impulses, peaks) -> None:
-    """Sum the rows of advances up to each of those `taken` (rising), after which a window begins.
+def publish(rows, stamps, held, taken, windows, waits) -> int:
+    """Sum up advances, and let those taken tell of all since the publication before.
+
+    A row taken that failed tells of the good ones before it; where there are none its stamp becomes 0.
 
     Parameters
     ----------
-    rows : tuple of ndarray, shape (n, 8)
-        Makes, impulse and peak of each advance.
-    makes, impulse, peak : ndarray, shape (8,)
-        Makes so far, impulse and peak of the window under way; they are brought up to the last row.
-    all_makes, impulses, peaks : ndarray, shape (m, 8)
-        Receive what they are at each row taken.
+    rows : ndarray of `ROW`, shape (n,)
+        One after the other; those that failed count for nothing.
+    stamps : ndarray of int64, shape (n,)
+        Their stamps [ns].
+    held : int
+        1 where they were computed without samples.
+    taken : ndarray of int64, shape (m,)
+        Rising numbers of the rows that are published.
+    windows : ndarray of `ROW`, shape (1,)
+        Sums since the publication before, and the motion of the newest good advance where one waits.
+    waits : int
+        1 where an advance waits to be published.
+
+    Returns
+    -------
+    int
+        1 where one waits now.
     """
-    made, pushed, reached = rows
-    window = 0
-    for n in range(len(made)):
-        for pair in range(PAIR_COUNT):
-            makes[pair] += made[n, pair]
-            impulse[pair] += pushed[n, pair]
-            peak[pair] = max(peak[pair], reached[n, pair])
-        if window < taken.size and taken[window] == n:
+    window, place, newest = windows[0], 0, -1
+    for n in range(rows.size):
+        row_of = rows[n]
+        row_of.stamp_ns, row_of.held = stamps[n], held
+        is_taken = place < taken.size and taken[place] == n
+        place += 1 if is_taken else 0
+        if row_of.status == 0:
             for pair in range(PAIR_COUNT):
-                all_makes[window, pair], impulses[window, pair] = makes[pair], impulse[pair]
-                peaks[window, pair] = peak[pair]
-                impulse[pair] = peak[pair] = 0.0
-            window += 1
+                window.makes[pair] += row_of.makes[pair]
+                window.impulse[pair] += row_of.impulse[pair]
+                window.peak[pair] = max(window.peak[pair], row_of.peak[pair])
+                if held == 0:
+                    window.measured_peak[pair] = max(window.measured_peak[pair], row_of.peak[pair])
+            window.samples += 1 - held
+            newest, waits = n, 1
+        elif is_taken and waits == 1:
+            _copy_motion(rows[newest] if newest >= 0 else window, row_of)
+        else:
+            row_of.stamp_ns = 0
+            for pair in range(PAIR_COUNT):
+                row_of.makes[pair] = window.makes[pair]
+        if is_taken and waits == 1:
+            _seal(row_of, window)
+            newest, waits = -1, 0
+    if newest >= 0:
+        _copy_motion(rows[newest], window)
+    return waits
+
+
+@kernel()
+def _copy_motion(row_of, target) -> None:
+    """Let another record show the motion of a row."""
+    target.t, target.stamp_ns, target.held = row_of.t, row_of.stamp_ns, row_of.held
+    for j in range(3):
+        target.q[j], target.v[j] = row_of.q[j], row_of.v[j]
+    for pair in range(PAIR_COUNT):
+        target.penetration[pair], target.rate[pair] = row_of.penetration[pair], row_of.rate[pair]
+        target.force[pair], target.wear_depth[pair] = row_of.force[pair], row_of.wear_depth[pair]
 
 
 @kernel(entry=True)
-def sum_makes(made, makes, all_makes) -> None:
-    """Sum the makes of advances, (n, 8), from those so far, (8,), on; write what they are after each, (n, 8)."""
-    for n in range(len(made)):
-        for pair in range(PAIR_COUNT):
-            makes[pair] += made[n, pair]
-            all_makes[n, pair] = makes[pair]
+def publish_window(windows, rows) -> None:
+    """Write what waits in a window, (1,), to a row, (1,), and begin the next one."""
+    rows[0] = windows[0]
+    _seal(rows[0], windows[0])
 
 
 @kernel(fast=True)

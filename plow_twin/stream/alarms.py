@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.outputs import Publication, Publications
+from plow_twin.stream.outputs import Published
 
 #: A level is left below this share of its threshold.
 HYSTERESIS: Final = 0.95
@@ -161,20 +161,32 @@ class Alarms:
         #: names of those that the latest take has latched at a higher level
         self.raised: list[str] = []
 
-    def take(self, publication: Publication) -> bool:
-        """Take in a publication; True when a level has changed. What had no sample says nothing of the machine."""
-        if publication.held and publication.measured_peak is None:
+    def take(self, published: Published) -> Iterator[int]:
+        """Take in what is published; yield the number of each row that has changed a level, right after it.
+
+        What had no sample says nothing of the machine.
+        """
+        if len(published.rows) > 1 and self._take_quiet(published):
+            return
+        slow = {int(found["row"]): found for found in published.slow} if len(published.slow) else {}
+        for number, row in enumerate(published.rows):
+            if self._take_one(row, slow.get(number)):
+                yield number
+
+    def _take_one(self, row: np.void, slow: np.void | None) -> bool:
+        """Take in one row, and its slow part if it has one; True when a level has changed."""
+        held = bool(row["held"])
+        if held and not row["samples"]:
             return False
-        self.raised, stamp_ns, changed = [], publication.stamp_ns, False
-        if self._model is not None and not publication.held:
-            for at_ns, residual in self._model.add(stamp_ns, *publication.q[:2].tolist()):
+        self.raised, stamp_ns, changed = [], int(row["stamp_ns"]), False
+        if self._model is not None and not held:
+            for at_ns, residual in self._model.add(stamp_ns, *row["q"][:2].tolist()):
                 changed |= self._take("residual", residual, at_ns)
-        peak = publication.peak if publication.measured_peak is None else publication.measured_peak
-        changed |= self._take("force", max(peak.tolist()), stamp_ns)
-        if publication.slow is not None:
-            clearance = float(publication.slow.clearance[:2].max())
+        changed |= self._take("force", max(row["measured_peak"].tolist()), stamp_ns)
+        if slow is not None:
+            clearance = float(slow["clearance"][:2].max())
             changed |= self._take("clearance", clearance, stamp_ns)
-            changed |= self._take("wear_rate", float(publication.slow.wear_rate.max()), stamp_ns)
+            changed |= self._take("wear_rate", float(slow["wear_rate"].max()), stamp_ns)
             changed |= self._take("clearance_rate", self._growth(stamp_ns, clearance), stamp_ns)
         return changed
 
@@ -183,17 +195,16 @@ class Alarms:
         """Whether measured poses matter."""
         return self._model is not None
 
-    def take_many(self, publications: Publications) -> Iterator[int]:
-        """Take in publications, none of them held; yield the index of each that has changed a level, right after it."""
-        values = {"force": publications.peak, "wear_rate": publications.wear_rate}
-        values["clearance"] = publications.clearance[:, :2]
-        quiet = publications.measured_peak is None
-        quiet &= all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms)
+    def _take_quiet(self, published: Published) -> bool:
+        """Take in many rows at once where none can change a level; else tell so, and take in nothing."""
+        rows, slow = published
         growth = self.alarms.get("clearance_rate")
-        if self._model is not None or not quiet or (growth is not None and growth.lowest < math.inf):
-            yield from (index for index in range(len(publications)) if self.take(publications[index]))
-            return
-        rate, stamps_ns = 0.0, publications.stamp_ns[publications.slow_index].tolist()
+        if self._model is not None or rows["held"].any() or (growth is not None and growth.lowest < math.inf):
+            return False
+        values = {"force": rows["measured_peak"], "wear_rate": slow["wear_rate"], "clearance": slow["clearance"][:, :2]}
+        if not all(self.alarms[name].stays(found) for name, found in values.items() if name in self.alarms):
+            return False
+        rate, stamps_ns = 0.0, slow["stamp_ns"].tolist()
         if stamps_ns:
             *earlier, clearance = values["clearance"].max(axis=1).tolist()
             if all(map(lt, stamps_ns, stamps_ns[1:])) and self._clearances and stamps_ns[0] > self._clearances[-1][0]:
@@ -206,7 +217,8 @@ class Alarms:
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
             if name in self.alarms:
-                self.alarms[name].take(value, int(publications.stamp_ns[-1]), self._duration_ns)
+                self.alarms[name].take(value, int(rows["stamp_ns"][-1]), self._duration_ns)
+        return True
 
     def take_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
         """Take in a measured pose (x, y [m], theta [rad]); True when a level has changed."""

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-import numpy as np
-
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.run.twin import Status
 from plow_twin.stream.health import RealTimeFactor
@@ -33,7 +31,7 @@ from plow_twin.stream.journal import (
     Travel,
     Unload,
 )
-from plow_twin.stream.outputs import Publication
+from plow_twin.stream.outputs import NOTHING, Published
 from plow_twin.stream.session import Session
 from plow_twin.stream.steps import Steps
 
@@ -47,6 +45,7 @@ _LONGEST_QUIET_NS: Final = NS_PER_S // 10
 #: At most so many resets by jumps and failures in that time [ns]: clocks out of step must not reset the model for ever.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
+_ALL_WELL: Final = (int(Status.OK),)
 
 
 class StreamState(Enum):
@@ -85,7 +84,7 @@ class Driver:
     session, intake, policy
         What is driven, what judges the samples, what rules over silence and failures.
     every_sample : bool
-        Return a publication for each advance; else only `due` returns one.
+        Publish after each advance; else only `due` publishes.
     """
 
     def __init__(self, session: Session, intake: Intake, policy: Policy, *, every_sample: bool = True) -> None:
@@ -124,90 +123,77 @@ class Driver:
         """Stamp of the newest sample used [ns]; None before the first and after a reset."""
         return self._newest_ns
 
-    def samples(self, arrived: Sequence[Arrival], now_ns: int) -> Iterable[Publication]:
-        """Judge samples in order of arrival, advance to those that are used, and return what is to be published.
+    def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
+        """Judge samples in order of arrival, advance to those that are used, and yield what is to be published.
 
-        The caller publishes each publication before it asks for the next, so that a recording holds them in order.
-        A sample whose stamp jumps waits for the next one.
+        The caller publishes it before it asks for more, so that a recording holds publications in order. A sample whose
+        stamp jumps waits for the next one.
         """
-        if len(arrived) == 1 and self.every_sample and not self._steps.waits:
-            sample = Sample(*arrived[0])
-            reached_ns = self.session.stamp_ns
-            if (
-                reached_ns is not None
-                and self.session.can_apply_directly(sample.stamp_ns)
-                and self.intake.goes_on(sample.stamp_ns, sample.wrench, reached_ns)
-            ):
-                return self._apply_directly(sample, now_ns)
-        return self._samples(self._settled(arrived, now_ns), now_ns)
-
-    def _apply_directly(self, sample: Sample, now_ns: int) -> Iterable[Publication]:
-        """Advance to a sample that nothing speaks against, which is what `_samples` would do in more steps."""
-        self.intake.accept(sample.stamp_ns, sample.wrench)
-        self._newest_ns, self._received_ns, self._zeroed = sample.stamp_ns, now_ns, False
-        status, publication = self.session.apply_directly(sample)
-        self._advanced(now_ns)
-        self._judge_advance(status, StreamState.RUNNING)
-        if publication is not None:
-            return (publication,)
-        self._give_up_after_failures(now_ns)
-        self._find_newest()
-        return ()
-
-    def _settled(self, arrived: Sequence[Arrival], now_ns: int) -> Iterator[Arrival]:
-        settle, session = self._steps.settle, self.session
-        for stamp_ns, wrench in arrived:
-            for settled in settle(stamp_ns, wrench, now_ns, session.stamp_ns):
-                yield settled[:2]
-
-    def _samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Publication]:
         run: list[Sample] = []
         for stamp_ns, wrench in arrived:
-            late = bool(run) and self._is_late(run[0])
-            # a stamp not after the last one's may be late or a jump back: that can be told once the run is applied
-            if run and not late and stamp_ns <= run[-1].stamp_ns:
-                yield from self._use(run, now_ns)
-                run, late = [], False
-            if late and any(sample.stamp_ns == stamp_ns for sample in run):
-                self.intake.refuse(Verdict.DUPLICATE, stamp_ns, wrench)
+            if self.every_sample and not run and self._goes_on(stamp_ns, wrench):  # as nearly always
+                self._newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
+                yield from self._use([Sample(stamp_ns, wrench)], now_ns)
                 continue
-            verdict = self._judge(stamp_ns, wrench, now_ns)
-            if not verdict.used:
-                continue
-            if run and (verdict.resets or (late and self.every_sample and verdict is Verdict.ACCEPTED)):
-                yield from self._use(run, now_ns)
-                run = []
-            if verdict.resets:
-                self._restart_model(stamp_ns, verdict.value, None if self.intake.returned else now_ns)
-            if self._newest_ns is None or stamp_ns > self._newest_ns:
-                self._newest_ns = stamp_ns
-            self._received_ns, self._zeroed = now_ns, False
-            insort(run, Sample(stamp_ns, wrench), key=_stamp)
+            for settled in self._steps.settle(stamp_ns, wrench, now_ns, self.session.stamp_ns):
+                yield from self._take_in(run, *settled[:2], now_ns)
         yield from self._use(run, now_ns)
 
-    def due(self) -> Publication | None:
-        """Return what is to be published of all since the last publication, or None when there was no advance since."""
+    def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
+        """Accept a sample against which nothing speaks; False: it has to be judged."""
+        reached_ns = self.session.stamp_ns
+        if reached_ns is None or self._steps.waits or not self.intake.goes_on(stamp_ns, wrench, reached_ns):
+            return False
+        self.intake.accept(stamp_ns, wrench)
+        return True
+
+    def _take_in(
+        self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
+    ) -> Iterator[Published]:
+        """Judge a sample, and add it to those that are applied together, `run`, which are applied first where due."""
+        late = bool(run) and self._is_late(run[0])
+        # a stamp not after the last one's may be late or a jump back: that is seen once the run is applied
+        if run and not late and stamp_ns <= run[-1].stamp_ns:
+            yield from self._use(run, now_ns)
+            late = False
+        if late and any(sample.stamp_ns == stamp_ns for sample in run):
+            self.intake.refuse(Verdict.DUPLICATE, stamp_ns, wrench)
+            return
+        verdict = self._judge(stamp_ns, wrench, now_ns)
+        if not verdict.used:
+            return
+        if run and (verdict.resets or (late and self.every_sample and verdict is Verdict.ACCEPTED)):
+            yield from self._use(run, now_ns)
+        if verdict.resets:
+            self._restart_model(stamp_ns, verdict.value, None if self.intake.returned else now_ns)
+        if self._newest_ns is None or stamp_ns > self._newest_ns:
+            self._newest_ns = stamp_ns
+        self._received_ns, self._zeroed = now_ns, False
+        insort(run, Sample(stamp_ns, wrench), key=_stamp)
+
+    def due(self) -> Published:
+        """Return what is to be published of all since the last publication."""
         return self.session.outputs.take()
 
-    def silence(self, now_ns: int) -> Publication | None:
+    def silence(self, now_ns: int) -> Published:
         """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
         if self._newest_ns is None:
-            return None
+            return NOTHING
         timeout_ns = round(self.policy.excitation_timeout_s * NS_PER_S)
         jumped = self._steps.unopposed(now_ns, timeout_ns)
         if jumped is not None:
-            published = list(self._samples([jumped[:2]], now_ns))
-            return published[-1] if published else None
+            run: list[Sample] = []
+            return Published.joined([*self._take_in(run, *jumped[:2], now_ns), *self._use(run, now_ns)])
         silent_ns = now_ns - self._received_ns - timeout_ns
         if silent_ns <= 0:
-            return None
+            return NOTHING
         limit_ns = round(self.policy.hold_limit_s * NS_PER_S)
         reached_ns = self.session.stamp_ns if self.session.stamp_ns is not None else self._newest_ns
         stamp_ns = min(self._newest_ns + min(silent_ns, limit_ns), reached_ns + _LARGEST_HOLD_NS)
         if stamp_ns <= reached_ns:
             if silent_ns > limit_ns:
                 self.state = StreamState.ENDED
-            return None
+            return NOTHING
         self.holds += 1
         if self.policy.hold == "zero" and not self._zeroed:
             self._zeroed = True
@@ -220,7 +206,7 @@ class Driver:
         left_ns = timeout_ns if self._newest_ns is None else self._received_ns + timeout_ns - now_ns
         return max(0, min(left_ns, _LONGEST_QUIET_NS))
 
-    def clock_tick(self, stamp_ns: int, now_ns: int) -> Publication | None:
+    def clock_tick(self, stamp_ns: int, now_ns: int) -> Published:
         """Advance under the scene's own loads to the time `stamp_ns` of the node's clock, less the time spent inactive.
 
         The first call after `resume` only finds out how long that was.
@@ -236,7 +222,7 @@ class Driver:
         if verdict is Verdict.UNSTEADY:
             self._unsteady_ns = now_ns
         if not verdict.used:
-            return None
+            return NOTHING
         if verdict.resets:
             # the model starts anew: on the clock itself
             stamp_ns += self._behind_ns
@@ -367,45 +353,32 @@ class Driver:
         self._newest_ns = self._counted_ns = None
         self.state = StreamState.WAITING
 
-    def _use(self, samples: list[Sample], now_ns: int) -> Iterator[Publication]:
-        """Advance to samples: one by one where each is published, else in one go, as late ones are in any case."""
-        late = sum(map(self._is_late, samples))
-        self.rolled_back += late
-        if self.every_sample and not late:
-            for sample in samples:
-                series = self.session.apply_sample(sample)
-                self._advanced(now_ns)
-                self._judge_advance(series.status[-1], StreamState.RUNNING)
-                self._give_up_after_failures(now_ns)
-                publication = self.due()
-                if publication is not None:
-                    yield publication
-            self._find_newest()
-            return
-        for series in self.session.apply_samples(samples):
+    def _use(self, run: list[Sample], now_ns: int) -> Iterator[Published]:
+        """Advance to samples, which are taken out of the list, and yield what is to be published."""
+        samples = run.copy()
+        run.clear()
+        for applied in self.session.samples(samples, each=self.every_sample):
+            self.rolled_back += applied.late
             self._advanced(now_ns)
-            # failures count in a row: where the last advance went well none counts
-            for status in series.status[-1:] if not series.status.any() else series.status:
+            # failures count in a row: where all went well one status is enough
+            for status in applied.rows["status"].tolist() if applied.failed else _ALL_WELL:
                 self._judge_advance(status, StreamState.RUNNING)
-            self._give_up_after_failures(now_ns)
-        self._find_newest()
-        publication = self.due() if self.every_sample else None
-        if publication is not None:
-            yield publication
-
-    def _find_newest(self) -> None:
-        """Let silence be seen after a reset between two samples of one batch."""
+            if applied.failed:
+                self._give_up_after_failures(now_ns)
+            if len(applied.published.rows):
+                yield applied.published
         if self._newest_ns is None:
+            # after a reset between two samples silence is to be seen
             self._newest_ns = self.session.stamp_ns
 
-    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Publication | None:
-        advance = self.session.apply(entry)
-        if advance is None:
-            return None
+    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Published:
+        """Advance without a sample."""
+        rows = self.session.apply(entry)
+        assert rows is not None, "such an entry makes an advance"
         self._advanced(now_ns)
-        self._judge_advance(advance.status, state)
+        self._judge_advance(int(rows["status"][0]), state)
         self._give_up_after_failures(now_ns)
-        return self.due() if self.every_sample else None
+        return self.due() if self.every_sample else NOTHING
 
     def _advanced(self, now_ns: int) -> None:
         """Count the model time since the last call."""
@@ -414,7 +387,7 @@ class Driver:
             self.real_time.advanced((reached_ns - self._counted_ns) * 1e-9, now_ns)
         self._counted_ns = reached_ns
 
-    def _judge_advance(self, status: int | np.int64, state: StreamState) -> None:
+    def _judge_advance(self, status: int, state: StreamState) -> None:
         if not status:
             self._failures_in_row = 0
             self.state = state
@@ -422,7 +395,7 @@ class Driver:
         self.failures += 1
         self._failures_in_row += 1
         self.state = StreamState.FAILED
-        self.failure = Status(int(status)).text
+        self.failure = Status(status).text
 
     def _give_up_after_failures(self, now_ns: int) -> None:
         if 0 < self.policy.failure_limit <= self._failures_in_row and self._may_reset(now_ns):

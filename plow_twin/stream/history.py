@@ -1,12 +1,13 @@
 """What a session remembers of its last seconds, so that a late sample can be worked in: snapshots and all since.
 
-What can be worked in follows from the journal alone. A replay, which advances many samples at once, has fewer
-snapshots; it notes where a live session has its own, by which both tell what is too old.
+What can be worked in follows from the journal alone, however many samples are advanced at once: a call of many has one
+snapshot, and notes where calls of single samples have theirs, by which all tell what is too old.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right, insort
+from collections import deque
 from typing import Final
 
 import numpy as np
@@ -31,7 +32,7 @@ class History:
         self._span_ns = span_ns
         self._spacing_ns = max(1, span_ns // SNAPSHOTS)
         self._snapshots: list[tuple[int, bytes]] = []
-        #: stamps at which a session that advances sample by sample has snapshots
+        #: stamps of the first sample in each span: calls of single samples have a snapshot at each
         self._kept_ns: list[int] = []
         #: largest stamp of these so far: running again up to there forgets nothing
         self._newest_kept_ns: int | None = None
@@ -39,7 +40,14 @@ class History:
         self._stamps_ns: list[int] = []
         self._travels: list[Travel] = []
         #: samples as arrays, made into samples when they are needed
-        self._later: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
+        self._later: deque[tuple[NDArray[np.int64], NDArray[np.float64]]] = deque()
+        #: whether a span has begun since the newest snapshot
+        self._due = True
+
+    @property
+    def is_due(self) -> bool:
+        """Whether a snapshot is wanted before the next sample."""
+        return self._due and self._span_ns > 0
 
     @property
     def oldest_ns(self) -> int | None:
@@ -61,22 +69,25 @@ class History:
 
     def clear(self) -> None:
         """Forget everything."""
-        for part in (self._snapshots, self._kept_ns, self._samples, self._stamps_ns, self._travels, self._later):
+        for part in (self._snapshots, self._kept_ns, self._samples, self._stamps_ns, self._travels):
             part.clear()
-        self._newest_kept_ns = None
+        self._later.clear()
+        self._newest_kept_ns, self._due = None, True
 
-    def add_later(self, before_ns: int, data: bytes, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
-        """Take in samples (n,), (n, 3) that have been applied at once, from the state `data` at `before_ns` on."""
+    def add(self, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
+        """Take in samples, shapes (n,), (n, 3), that have been applied; nobody may write to the arrays any more."""
         if not self._span_ns:
             return
-        self._add_data(before_ns, data)
         self._later.append((stamps_ns, wrench))
+        last_ns = self._kept_ns[-1] if self._kept_ns else None
+        if last_ns is not None and int(stamps_ns[-1]) // self._spacing_ns == last_ns // self._spacing_ns:
+            return  # as nearly always, for stamps do not fall
         cells = stamps_ns // self._spacing_ns
         begins = np.ones(len(cells), bool)
         begins[1:] = cells[1:] != cells[:-1]
-        if self._kept_ns:
-            last_ns = self._kept_ns[-1]
+        if last_ns is not None:
             begins &= (stamps_ns > last_ns) & (cells != last_ns // self._spacing_ns)
+        self._due = self._due or bool(begins.any())
         self._keep(stamps_ns[begins])
 
     def _keep(self, stamps_ns: NDArray[np.int64]) -> None:
@@ -103,14 +114,11 @@ class History:
             old += 1
         if old:
             del self._snapshots[:old]
-            self._later = [item for item in self._later if item[0][-1] > self._snapshots[0][0]]
+            while self._later and self._later[0][0][-1] <= self._snapshots[0][0]:
+                self._later.popleft()
             kept = bisect_right(self._stamps_ns, self._snapshots[0][0])
             del self._samples[:kept], self._stamps_ns[:kept]
             self._travels = [travel for travel in self._travels if travel.stamp_ns >= self._snapshots[0][0]]
-
-    def _add_data(self, stamp_ns: int, data: bytes) -> None:
-        if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
-            self._snapshots.append((stamp_ns, data))
 
     def _make_samples(self) -> None:
         oldest_ns = self._snapshots[0][0] if self._snapshots else 0
@@ -122,39 +130,6 @@ class History:
             self._stamps_ns += stamps
         self._later.clear()
 
-    def until_snapshot(self, samples: list[Sample]) -> int:
-        """Return how many samples can be applied before a snapshot is due."""
-        if not self._span_ns or len(samples) == 1:
-            return len(samples)
-        if not self._snapshots:
-            return 1
-        cell = self._snapshots[-1][0] // self._spacing_ns
-        stamps_ns = (sample.stamp_ns // self._spacing_ns != cell for sample in samples)
-        return next((count for count, due in enumerate(stamps_ns, 1) if due), len(samples))
-
-    def add(self, samples: list[Sample]) -> bool:
-        """Take in samples that have been applied; True when a snapshot is due."""
-        if not self._span_ns:
-            return False
-        self._make_samples()
-        self._samples += samples
-        self._stamps_ns += [sample.stamp_ns for sample in samples]
-        return not self.follows(self._stamps_ns[-1])
-
-    def follows(self, stamp_ns: int) -> bool:
-        """Tell whether a sample of that stamp asks for no snapshot."""
-        if not self._span_ns:
-            return True
-        return bool(self._snapshots) and stamp_ns // self._spacing_ns == self._snapshots[-1][0] // self._spacing_ns
-
-    def add_one(self, sample: Sample) -> None:
-        """Take in a sample that has been applied and that `follows`."""
-        if self._span_ns:
-            if self._later:
-                self._make_samples()
-            self._samples.append(sample)
-            self._stamps_ns.append(sample.stamp_ns)
-
     def add_travel(self, travel: Travel) -> None:
         """Take in a speed that has been applied; of those with one stamp the last one counts."""
         if not self._span_ns:
@@ -165,17 +140,14 @@ class History:
             del self._travels[place]
         self._travels.insert(place, travel)
 
-    def add_snapshot(self, stamp_ns: int, data: bytes, *, due: bool = False) -> None:
-        """Take in the state at `stamp_ns`, and forget what is older than the time remembered.
-
-        `due`: for no other reason than that `add` asked for it.
-        """
+    def add_snapshot(self, stamp_ns: int, data: bytes, *, kept: bool = True) -> None:
+        """Take in the state at `stamp_ns`; unless it is only due, the stamp is `kept` whatever span it lies in."""
         if not self._span_ns:
             return
-        self._add_data(stamp_ns, data)
-        last_ns = self._kept_ns[-1] if self._kept_ns else None
-        same_cell = last_ns is not None and stamp_ns // self._spacing_ns == last_ns // self._spacing_ns
-        if last_ns is None or (stamp_ns > last_ns and not (due and same_cell)):
+        if not self._snapshots or self._snapshots[-1][0] < stamp_ns:
+            self._snapshots.append((stamp_ns, data))
+        self._due = False
+        if kept and not (self._kept_ns and stamp_ns <= self._kept_ns[-1]):
             self._keep(np.array([stamp_ns]))
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:

@@ -67,6 +67,10 @@ class Verdict(Enum):
         self.used = self.resets or name in ("accepted", "worked_in")
 
 
+def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
+    """Let a sample go that is not used: it is counted."""
+
+
 class Intake:
     """Judge one stream of stamped samples, in order of arrival.
 
@@ -80,6 +84,8 @@ class Intake:
         Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: not known.
     limits
         What the values can be at most; None: anything finite.
+    on_unused
+        Receives reason, stamp [ns] and values of each sample that is not used.
     """
 
     def __init__(
@@ -89,14 +95,14 @@ class Intake:
         jump_forward_s: float = 10.0,
         expected_rate_hz: float = 0.0,
         limits: Limits | None = None,
+        on_unused: Callable[[Verdict, int, Sequence[float]], object] = _ignore,
     ) -> None:
+        self._on_unused = on_unused
         self.jump_back_s = jump_back_s
         self.jump_forward_s = jump_forward_s
         self.expected_rate_hz = expected_rate_hz
         self.limits = limits
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
-        #: receives reason, stamp [ns] and values of each sample that is not used
-        self.on_unused: Callable[[Verdict, int, Sequence[float]], object] = _ignore
         #: samples that were used although a component outside the plane was not zero
         self.out_of_plane = 0
         self._newest_ns: int | None = None
@@ -158,7 +164,7 @@ class Intake:
             verdict = Verdict.UNSTEADY
         self.counts[verdict] += 1
         if not verdict.used:
-            self.on_unused(verdict, stamp_ns, values)
+            self._on_unused(verdict, stamp_ns, values)
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
@@ -203,7 +209,7 @@ class Intake:
         if verdict.used:
             raise ValueError(f"verdict: got {verdict.value}, expected a reason to drop")
         self.counts[verdict] += 1
-        self.on_unused(verdict, stamp_ns, values)
+        self._on_unused(verdict, stamp_ns, values)
 
     def restart(self) -> None:
         """Forget the newest stamp: the next sample is a first one. The counts go on."""
@@ -244,7 +250,3 @@ class Intake:
         if self.limits is None or self._newest_ns is None:
             return False
         return self.limits.too_fast(self._newest_values, values, (stamp_ns - self._newest_ns) * 1e-9)
-
-
-def _ignore(verdict: Verdict, stamp_ns: int, values: Sequence[float]) -> None:
-    """Let a sample go that is not used: it is counted."""

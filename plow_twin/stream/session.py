@@ -7,7 +7,7 @@ import struct
 from bisect import insort
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +38,10 @@ from plow_twin.stream.journal import (
     Unused,
 )
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
-from plow_twin.stream.outputs import Outputs, Publication
+from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
 
 if TYPE_CHECKING:
-    from plow_twin.run.advance import Advance, AdvanceSeries
-    from plow_twin.run.twin import MarkedAdvance, Twin
+    from plow_twin.run.twin import Twin
 
 #: A digest follows each so many advances.
 DIGEST_INTERVAL: Final = 100
@@ -50,11 +49,25 @@ DIGEST_INTERVAL: Final = 100
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
-_NO_LOAD: Final = (0.0, 0.0, 0.0)
+_NO_LOAD: Final = np.zeros((1, 3))
+_NO_ROWS: Final = NOTHING.rows
 
 
 def _ignore(entry: Entry) -> None:
     """Drop an entry."""
+
+
+class Applied(NamedTuple):
+    """What became of samples.
+
+    A row of each, what is published, the digests asked for, how many advances failed, and how many samples were late.
+    """
+
+    rows: Rows
+    published: Published
+    digests: list[str]
+    failed: int
+    late: int = 0
 
 
 class Session:
@@ -103,8 +116,9 @@ class Session:
         #: the time that the model has reached [ns], None before the first stamp
         self.stamp_ns: int | None = None
         self.outputs = Outputs(twin.scene)
+        self._stock = Stock()
         #: the latest advance, while nobody has asked for the wear at its end
-        self._row: NDArray[np.void] | None = None
+        self._row: Rows | None = None
         scene, self._sampled = twin.scene, twin.excitation == "sampled"
         #: what late samples can be worked into
         self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
@@ -132,10 +146,11 @@ class Session:
         if self.stamp_ns is not None:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
 
-    def apply(self, entry: Entry) -> Advance | None:
-        """Emit one entry, apply it, and return the advance when it made one.
+    def apply(self, entry: Entry) -> Rows | None:
+        """Emit one entry, apply it, and return the row of the advance that it made, shape (1,), if it made one.
 
-        A digest or a loss says something about a journal and changes nothing: it is not emitted again.
+        `outputs` publishes it when it is asked to. A digest or a loss says something about a journal and changes
+        nothing: it is not emitted again.
 
         Raises
         ------
@@ -145,7 +160,7 @@ class Session:
         """
         match entry:
             case Sample():
-                return self.apply_sample(entry)[-1]
+                return next(self.samples([entry])).rows[-1:]
             case Hold() | Unload():
                 return self._apply_hold(entry)
             case Travel(_, speed):
@@ -180,26 +195,22 @@ class Session:
                 pass
         return None
 
-    def apply_sample(self, sample: Sample) -> AdvanceSeries:
-        """Apply one sample; return the advance that ended at it, or at the newest one where it was late.
+    def samples(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Applied]:
+        """Emit samples of rising stamps, and apply them: one by one, or as many at once as the digests allow.
 
-        Raises
+        Late ones are worked in together. The bits are the same, however many are applied at once.
+
+        Parameters
+        ----------
+        samples : sequence of Sample
+            At least one.
+        each : bool
+            Whether there is a publication after each, and of late ones after the last; else `outputs` sums up.
+
+        Yields
         ------
-        ValueError
-            As `apply`.
-        """
-        late = self._is_late(sample.stamp_ns)
-        if late:
-            self._check_late(sample.stamp_ns)
-        self._on_entry(sample)
-        series = self._work_in(sample.stamp_ns, [sample]) if late else self._run([sample])
-        self._count(1)
-        return series
-
-    def apply_samples(self, samples: Sequence[Sample]) -> Iterator[AdvanceSeries]:
-        """Apply samples of rising stamps in as few calls as digests allow; the same bits as `apply` for each.
-
-        Yields the advances of one call after the other, each once it has been made.
+        Applied
+            Of some of the samples, each time before the next ones are emitted.
 
         Raises
         ------
@@ -210,113 +221,111 @@ class Session:
             if later.stamp_ns < earlier.stamp_ns:
                 raise ValueError(f"stamp: got {later.stamp_ns} ns, expected at least {earlier.stamp_ns} ns")
         while samples:
-            late = self._is_late(samples[0].stamp_ns)
-            count = len(samples) if late else DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
-            part, samples = list(samples[:count]), samples[count:]
-            if late:
-                self._check_late(part[0].stamp_ns)
+            count, late = 1, 0
+            if self._is_late(samples[0].stamp_ns):
+                count, late = len(samples), sum(self._is_late(sample.stamp_ns) for sample in samples)
+                self._check_late(samples[0].stamp_ns)
+            elif not each:
+                count = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
+            part, samples = samples[:count], samples[count:]
             for sample in part:
                 self._on_entry(sample)
-            yield self._work_in(part[0].stamp_ns, part) if late else self._run(part)
+            if late:
+                applied = self._work_in(part[0].stamp_ns, part)
+                applied = applied._replace(published=self.outputs.take() if each else NOTHING, late=late)
+            else:
+                applied = self._run(part, THE_ONE if each else NONE)
+                if each and not applied.published.rows["stamp_ns"][0]:  # it failed
+                    applied = applied._replace(published=NOTHING)
             self._count(len(part))
+            yield applied
 
     @property
     def wear_depth(self) -> NDArray[np.float64]:
         """Wear depth of each pad [m], shape (8,)."""
         if self._row is not None:
-            self.wear_depth = self._row["wear_depth"][0, 0].copy()
+            self.wear_depth = self._row["wear_depth"][-1].copy()
         return self._wear_depth
 
     @wear_depth.setter
     def wear_depth(self, wear_depth: NDArray[np.float64]) -> None:
         self._wear_depth, self._row = wear_depth, None
 
-    def can_apply_directly(self, stamp_ns: int) -> bool:
-        """Tell whether a sample only moves the motion on and its publication tells of it alone: most are so."""
-        reached_ns = self.stamp_ns
-        return (
-            reached_ns is not None
-            and stamp_ns > reached_ns
-            and not self.held
-            and not self._travels
-            and self.twin.max_evaluations is None
-            and self.outputs.is_empty
-            and self.history.follows(stamp_ns)
-        )
-
-    def apply_directly(self, sample: Sample) -> tuple[int, Publication | None]:
-        """Apply a sample that `can_apply_directly`, and take what is to be published; the same bits as `apply_sample`.
-
-        Returns the status of the advance, and the publication or None when it failed.
-
-        Raises
-        ------
-        ValueError
-            As `apply`.
-        """
-        stamp_ns, origin_ns = sample.stamp_ns, self.origin_ns
-        assert origin_ns is not None, "a stamp has been reached"
-        self._on_entry(sample)
-        row = self.twin.advance_row((stamp_ns - origin_ns) * 1e-9, sample.wrench)
-        self.stamp_ns, self._row = stamp_ns, row
-        publication = self.outputs.publish_row(stamp_ns, row)
-        self.history.add_one(sample)
-        self._count(1)
-        return (0 if publication is not None else int(row["status"][0, 0])), publication
-
-    @property
-    def plain(self) -> bool:
-        """Whether samples only move the motion on: nothing is held, and no speed is to come."""
-        return not self.held and not self._travels
-
-    def advance_marked(
+    def advance(
         self,
         stamps: NDArray[np.int64],
         wrench: NDArray[np.float64],
-        marks: NDArray[np.int64],
-        *,
-        rows: bool | NDArray[np.void] = True,
-    ) -> MarkedAdvance:
-        """Apply many samples at once for a replay: nothing is emitted, and `outputs` is left to the caller.
-
-        Where one of them fails, they are not remembered: go back with `restore`, or remember nothing at all.
+        rows: Rows | None,
+        taken: NDArray[np.int64] = NONE,
+        marks: NDArray[np.int64] = NONE,
+    ) -> Applied:
+        """Advance to samples: the way of every sample, live or replayed. Nothing is emitted.
 
         Parameters
         ----------
         stamps : ndarray of int64, shape (n,)
-            Never falling, the first not before the time reached [ns].
+            Never falling, the first not late [ns].
         wrench : ndarray, shape (n, 3)
-        marks, rows
-            As of `Twin.advance_marked`.
+            Fx, Fy [N] and M [N m] at each.
+        rows : ndarray of `ROW`, shape (n,), or None
+            Receives the rows; None: nothing is read out, and `outputs` is told nothing.
+        taken : ndarray of int64
+            As of `Outputs.add`.
+        marks : ndarray of int64, shape (m,)
+            Rising numbers from 1 to n: a digest is wanted after so many samples.
 
         Raises
         ------
         ValueError
-            A sample cannot be applied, or the session is not `plain`; the motion is unchanged then.
+            A number is not finite, or a stamp falls; the motion is unchanged then.
         """
-        reached = self.stamp_ns if self.stamp_ns is not None else int(stamps[0])
-        if not self.plain or stamps[0] < reached or (stamps[1:] < stamps[:-1]).any():
-            raise ValueError(f"stamp: expected samples only, with stamps that do not fall, from {reached} ns on")
-        origin = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
-        before = self.snapshot().data
-        done = self.twin.advance_marked(np.multiply(stamps - origin, 1e-9), wrench, marks, rows=rows)
-        if not done.status.any():
-            self.history.add_later(
-                int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns, before, stamps, wrench
+        if self._is_late(int(stamps[0])) or (stamps[1:] < stamps[:-1]).any():
+            raise ValueError(
+                f"stamp: got {stamps[0]} ns first, expected stamps that do not fall, after {self.stamp_ns} ns"
             )
-        self.origin_ns, self.stamp_ns = origin, int(stamps[-1])
-        self.wear_depth = done.wear_depth
+        if self.held or self._travels:
+            found = self._advance_in_pieces(stamps, wrench, rows, taken, marks)
+        else:
+            found = self._advance(stamps, wrench, rows, taken, marks)
         self._advances += len(stamps)
-        return done
+        return found
 
-    def restore(self, snapshot: Snapshot, pending: tuple[int, Advance] | None, origin_ns: int | None) -> None:
-        """Go back to before an `advance_marked` that failed; nothing is emitted.
-
-        `pending` is what the next publication was to show (`Outputs.pending`).
-        """
-        self._restore(snapshot.data)
-        self.origin_ns = origin_ns
-        self.outputs.set_pending(pending)
+    def _advance_in_pieces(
+        self,
+        stamps: NDArray[np.int64],
+        wrench: NDArray[np.float64],
+        rows: Rows | None,
+        taken: NDArray[np.int64],
+        marks: NDArray[np.int64],
+    ) -> Applied:
+        """Advance where speeds along the face are to come, or the load was held until now."""
+        if not np.isfinite(wrench).all():
+            raise ValueError(f"wrench: got {wrench!r}, expected finite numbers")
+        resumed, begin, count = self._resume_wear(), 0, len(stamps)
+        parts: list[Applied] = []
+        while begin < count:
+            travel, end = self._travels[0] if self._travels else None, count
+            if travel is not None and travel.stamp_ns < stamps[begin]:
+                self._travel_on_the_way(travel, int(stamps[begin]), wrench[begin])
+                continue
+            if travel is not None:
+                end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
+            if resumed:  # what was computed without a sample is behind the first one: nobody goes back into it
+                end = begin + 1
+            here = slice(begin, end)
+            chosen = taken[(taken >= begin) & (taken < end)] - begin
+            marked = marks[(marks > begin) & (marks <= end)] - begin
+            parts.append(
+                self._advance(
+                    stamps[here], wrench[here], None if rows is None else rows[here], chosen, marked, resumed=resumed
+                )
+            )
+            if resumed:
+                self._remember()
+            begin, resumed = end, False
+        published = Published.joined([part.published for part in parts])
+        digests = [digest for part in parts for digest in part.digests]
+        return Applied(parts[-1].rows if rows is None else rows, published, digests, sum(part.failed for part in parts))
 
     def emit(self, entry: Entry) -> None:
         """Emit an entry that says something of the present state and changes nothing."""
@@ -356,57 +365,49 @@ class Session:
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)
 
-    def _run(self, samples: list[Sample]) -> AdvanceSeries:
-        """Advance to samples; a speed along the face is taken over at its stamp, on the load's straight line there."""
-        resumed = self._resume_wear()
-        series = None
-        while samples:
-            travel = self._travels[0] if self._travels else None
-            if travel is not None and travel.stamp_ns < samples[0].stamp_ns:
-                self._travel_on_the_way(travel, samples[0])
-                continue
-            # what was computed without a sample is behind the first one: nobody goes back into it
-            count = 1 if resumed else self.history.until_snapshot(samples)
-            if travel is not None:
-                count = min(count, sum(sample.stamp_ns <= travel.stamp_ns for sample in samples))
-            part, samples = samples[:count], samples[count:]
-            series = self._advance(part)
-            due = self.history.add(part)
-            if due or resumed:
-                self._remember(due=not resumed)
-            resumed = False
-        assert series is not None, "there is at least one sample"
-        return series
+    def _run(self, samples: Sequence[Sample], taken: NDArray[np.int64] = NONE) -> Applied:
+        """Advance to samples."""
+        stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
+        wrench = np.array([sample.wrench for sample in samples])
+        rows = self._stock.take(len(samples))
+        if self.held or self._travels:
+            return self._advance_in_pieces(stamps, wrench, rows, taken, NONE)
+        return self._advance(stamps, wrench, rows, taken, NONE)
 
-    def _advance(self, samples: list[Sample]) -> AdvanceSeries:
-        stamps_ns = [sample.stamp_ns for sample in samples]
-        if self.origin_ns is None:
-            self.origin_ns = self._begin(stamps_ns[0])
-        origin_ns = self.origin_ns
-        if len(samples) == 1:
-            series = self.twin.advance_sample((stamps_ns[0] - origin_ns) * 1e-9, samples[0].wrench)
-            advance = series[0]
-            self.wear_depth = advance.wear_depth.copy()
-            if not advance.status:
-                self.outputs.add(stamps_ns[0], advance, self.held)
-        else:
-            series = self.twin.advance_samples(
-                [(stamp_ns - origin_ns) * 1e-9 for stamp_ns in stamps_ns], [sample.wrench for sample in samples]
-            )
-            self.wear_depth = series.wear_depth[-1].copy()
-            self.outputs.add_series(stamps_ns, series)
-        self.stamp_ns = stamps_ns[-1]
+    def _advance(
+        self,
+        stamps: NDArray[np.int64],
+        wrench: NDArray[np.float64],
+        rows: Rows | None,
+        taken: NDArray[np.int64],
+        marks: NDArray[np.int64],
+        *,
+        resumed: bool = False,
+    ) -> Applied:
+        """Advance to samples between which nothing else happens; `resumed`: the first since a time without samples."""
+        origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
+        if self.history.is_due and not resumed:
+            before_ns = int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns
+            self.history.add_snapshot(before_ns, self.snapshot().data, kept=False)
+        failed, digests = self.twin.advance_rows(np.multiply(stamps - origin_ns, 1e-9), wrench, rows, marks)
+        self.origin_ns, self.stamp_ns = origin_ns, int(stamps[-1])
+        self.history.add(stamps, wrench)
+        if rows is None:
+            self.wear_depth = self.twin.wear_depth
+            return Applied(_NO_ROWS, NOTHING, digests, failed)
+        self._row = rows
         if self.twin.max_evaluations is not None:
-            self._largest_error_m = max(self._largest_error_m, float(series.error_estimate_m.max()))
-        return series
+            self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"].max()))
+        return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
-    def _travel_on_the_way(self, travel: Travel, sample: Sample) -> None:
+    def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
         """Advance to the stamp of a speed that comes before the next sample, and take it over."""
         self._travels.pop(0)
         if self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
-            share = (travel.stamp_ns - self.stamp_ns) / (sample.stamp_ns - self.stamp_ns)
+            share = (travel.stamp_ns - self.stamp_ns) / (stamp_ns - self.stamp_ns)
             load = self.twin.wrench
-            self._advance([Sample(travel.stamp_ns, tuple((load + share * (sample.wrench - load)).tolist()))])
+            on_the_way = (load + share * (wrench - load))[None]
+            self._move(np.array([travel.stamp_ns]), on_the_way, held=False)
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
@@ -422,7 +423,7 @@ class Session:
             bound_ns = self.stamp_ns if oldest_ns is None else oldest_ns
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least {limit}, {bound_ns} ns")
 
-    def _work_in(self, stamp_ns: int, late: list[Sample], *travels: Travel) -> AdvanceSeries:
+    def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
         """Go back to before a late stamp, and run again with late samples and speeds.
 
         The next publication tells of all from the first stamp worked in since the one before it.
@@ -432,6 +433,7 @@ class Session:
         known = [sample for sample in again if sample.stamp_ns < corrected_ns]
         if known:
             self._run(known)
+            self._remember(kept=False)
         self.outputs.begin_correction()
         return self._run(sorted([*again[len(known) :], *late], key=lambda sample: sample.stamp_ns))
 
@@ -449,7 +451,7 @@ class Session:
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
         return samples
 
-    def _apply_hold(self, entry: Hold | Unload) -> Advance:
+    def _apply_hold(self, entry: Hold | Unload) -> Rows:
         stamp_ns = entry.stamp_ns
         if self.stamp_ns is not None and stamp_ns < self.stamp_ns:
             raise ValueError(f"stamp: got {stamp_ns} ns, expected at least the time reached, {self.stamp_ns} ns")
@@ -461,19 +463,23 @@ class Session:
         while self._travels and self._travels[0].stamp_ns <= stamp_ns:
             travel = self._travels.pop(0)
             if not self._sampled and self.stamp_ns is not None and travel.stamp_ns > self.stamp_ns:
-                self._advance_without_sample(travel.stamp_ns, None)
+                self._move(np.array([travel.stamp_ns]), _NO_LOAD, held=self.held)
             self._set_speed(travel)
-        advance = self._advance_without_sample(stamp_ns, _NO_LOAD if isinstance(entry, Unload) else None)
+        load = _NO_LOAD if isinstance(entry, Unload) else self.twin.wrench[None]
+        rows = self._move(np.array([stamp_ns]), load, held=self.held)
         self._count(1)
-        return advance
+        return rows
 
-    def _advance_without_sample(self, stamp_ns: int, wrench: tuple[float, float, float] | None) -> Advance:
+    def _move(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, held: bool) -> Rows:
+        """Advance to a stamp, shape (1,), that is no sample's."""
         assert self.origin_ns is not None
-        advance = self.twin.advance((stamp_ns - self.origin_ns) * 1e-9, wrench)
-        self.stamp_ns, self.wear_depth = stamp_ns, advance.wear_depth.copy()
-        if not advance.status:
-            self.outputs.add(stamp_ns, advance, self.held)
-        return advance
+        rows = self._stock.take(1)
+        self.twin.advance_rows(np.multiply(stamps - self.origin_ns, 1e-9), wrench, rows)
+        self.stamp_ns, self._row = int(stamps[0]), rows
+        if self.twin.max_evaluations is not None:
+            self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"][0]))
+        self.outputs.add(rows, stamps, NONE, held=held)
+        return rows
 
     def _suspend_wear(self) -> None:
         if not self.held:
@@ -521,9 +527,9 @@ class Session:
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
 
-    def _remember(self, *, due: bool = False) -> None:
+    def _remember(self, *, kept: bool = True) -> None:
         if self.stamp_ns is not None:
-            self.history.add_snapshot(self.stamp_ns, self.snapshot().data, due=due)
+            self.history.add_snapshot(self.stamp_ns, self.snapshot().data, kept=kept)
 
     def _forget(self) -> None:
         """Forget all before the present state."""

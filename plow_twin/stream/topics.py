@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.solve.state import ROW
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, SLOW, Published
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
@@ -28,7 +36,7 @@ class Cadence(Enum):
     CHANGE = "on change"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Topic:
     """One topic.
 
@@ -46,6 +54,11 @@ class Topic:
         Whether a late reader gets what was sent before (`transient_local`).
     depth : int
         How many messages the publisher keeps.
+    names : tuple of str
+        Names in a `JointState`.
+    columns : mapping
+        Field of the message to fields of the record that stand in it and how many of their numbers, all in this order.
+        Without columns the message does not follow from a record alone.
     """
 
     name: str
@@ -55,40 +68,71 @@ class Topic:
     cumulative: bool = False
     latched: bool = False
     depth: int = _DEPTH
+    names: tuple[str, ...] = ()
+    columns: Mapping[str, tuple[tuple[str, int], ...]] = field(default_factory=dict)
+
+    @property
+    def parts(self) -> tuple[tuple[str, int], ...]:
+        """Fields of the record, and how many of their numbers, in the order in which they stand in the message."""
+        return tuple(part for parts in self.columns.values() for part in parts)
+
+    @property
+    def count(self) -> int:
+        """How many numbers of the record stand in a message."""
+        return sum(count for _, count in self.parts)
+
+    def record_of(self, published: Published) -> NDArray[np.void]:
+        """Return the records that its messages are made of."""
+        return published.slow if self.cadence is Cadence.SLOW else published.rows
+
+    @property
+    def record_type(self) -> np.dtype[np.void]:
+        """Type of these records."""
+        return SLOW if self.cadence is Cadence.SLOW else ROW
+
+    def numbers(self, records: NDArray[np.void]) -> list[NDArray[np.float64]]:
+        """Return the numbers of its messages part by part, shapes (n, count), as views where the record has floats."""
+        columns = ((records[name], count) for name, count in self.parts)
+        return [np.asarray(one[:, :count] if one.ndim > 1 else one[:, None], np.float64) for one, count in columns]
 
 
 TOPICS: Final = (
     Topic(
         "contact_forces", JOINT_STATE, Cadence.EACH,
         "position = penetration [m] (negative: gap), velocity = its rate [m/s], effort = force [N], all at the stamp",
+        names=PAIR_NAMES,
+        columns={"position": (("penetration", 8),), "velocity": (("rate", 8),), "effort": (("force", 8),)},
     ),
     Topic(
         "contact_peaks", JOINT_STATE, Cadence.EACH,
         "position = touches since configure, velocity = impulse [N s] and effort = largest force [N] since the last "
         "message; after late samples since the time that the model went back to",
+        names=PAIR_NAMES,
+        columns={"position": (("makes", 8),), "velocity": (("impulse", 8),), "effort": (("peak", 8),)},
         cumulative=True,
     ),
     Topic(
         "head_state", ODOMETRY, Cadence.EACH,
         "pose in `frame_id`, twist in the head's own axes; covariances zero: not known",
+        columns={"position": (("q", 2),), "orientation": (("orientation", 2),), "twist": (("twist", 3),)},
     ),
     Topic(
         "clearance", JOINT_STATE, Cadence.SLOW,
         "position [m] of `horizontal`, `vertical`, then `pad_<pair>` (wear depth), then `<name>/p05`, `<name>/p95` of "
         "each; first message in each 0.1 s of stamps",
-        cumulative=True,
+        names=CLEARANCE_NAMES, columns={"position": (("clearance", len(CLEARANCE_NAMES)),)}, cumulative=True,
     ),
     Topic(
         "wear_rate", JOINT_STATE, Cadence.SLOW,
         "velocity = growth of each pad's wear since the last such message [m/s]; with `clearance`",
-        cumulative=True,
+        names=PAD_NAMES, columns={"velocity": (("wear_rate", 8),)}, cumulative=True,
     ),
     Topic(
         "quality", JOINT_STATE, Cadence.MARKED,
         "position of `held` (the state at the stamp was computed without a sample) and `corrected` (late samples have "
         "been worked in), 1 or 0, with the stamp of the forces they speak of; sent with each such message and with the "
         "first one after",
-        latched=True,
+        names=("held", "corrected"), columns={"position": (("held", 1), ("corrected", 1))}, latched=True,
     ),
     Topic(
         "estimate", JOINT_STATE, Cadence.ESTIMATE,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 
 from plow_twin.live.load_model import LoadModel
@@ -11,6 +11,7 @@ from plow_twin.live.runtime import Runtime
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.map_file import ROLES
 from plow_twin.record.mapping import Role
+from plow_twin.record.messages import Message
 from plow_twin.record.sources import Arrived
 from plow_twin.stream.driver import Arrival
 from plow_twin.stream.intake import Intake, Verdict
@@ -34,12 +35,20 @@ class Feeder:
         The mapping; roles that a live twin does not use are ignored.
     runtime
         The live twin.
+    send
+        Sends a message that follows.
     model
         Model of the load from the drive's signals; None: the load is measured.
     """
 
-    def __init__(self, roles: Mapping[str, Role], runtime: Runtime, model: LoadModel | None = None) -> None:
-        self._model = model
+    def __init__(
+        self,
+        roles: Mapping[str, Role],
+        runtime: Runtime,
+        send: Callable[[str, memoryview | Message], None],
+        model: LoadModel | None = None,
+    ) -> None:
+        self._model, self._send = model, send
         self._deviation = (0.0, 0.0, 0.0)
         self._runtime = runtime
         self._by_topic: dict[str, list[tuple[str, Role]]] = {}
@@ -87,7 +96,8 @@ class Feeder:
         if samples:
             for stamp_ns, _ in samples:
                 self._follow_time(stamp_ns)
-            self._runtime.samples(samples)
+            for topic, message in self._runtime.step(samples):
+                self._send(topic, message)
 
     def _follow_time(self, stamp_ns: int) -> None:
         """Advance to the time of a sample; a sample far ahead counts only if the next one stays there."""
@@ -184,10 +194,10 @@ class Feeder:
         elif not role.plausible(found[1]):
             intake.refuse(Verdict.IMPLAUSIBLE, found[0], tuple(found[1].values()))
         elif name == "travel":
-            inputs.take_travel(found[0], found[1]["speed"])
+            self._runtime.take_travel(found[0], found[1]["speed"])
         elif name == "gaps":
-            measured = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
-            inputs.take_gaps(found[0], measured)
+            told = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
+            self._runtime.take_gaps(found[0], told)
         else:
             x, y, theta = (found[1].get(name, math.nan) for name in ROLES["head_pose"])
-            inputs.take_pose(found[0], (x, y, theta))
+            self._runtime.take_pose(found[0], (x, y, theta))

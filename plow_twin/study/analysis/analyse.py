@@ -79,11 +79,11 @@ class Prediction:
     def walked(self, part: Walked) -> None:
         """Take in a batch."""
         self.loads.add(part)
-        rows, published = part.rows, part.publications
+        rows, slow = part.rows, part.published.slow
         first, _ = self.spans.get(self.resets, (int(part.stamp_ns[0]), 0))
         self.spans[self.resets] = first, int(part.stamp_ns[-1])
         self.present.add(part.stamp_ns, np.hstack((rows.q, rows.force, -rows.penetration)))
-        self.clearance.add(published.stamp_ns[published.slow_index], published.clearance)
+        self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
         """Tell of each measured value whether it lies in the time of the load."""

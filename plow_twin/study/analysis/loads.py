@@ -108,7 +108,7 @@ class LoadTotals:
         if self._last is not None:
             steps[0] = max(0.0, (int(stamps[0]) - self._last[0]) * 1e-9)
         self.duration_s += float(steps.sum())
-        self.impacts += rows.makes.sum(axis=0)
+        self.impacts += walked.makes.sum(axis=0)
         self.impulse += rows.impulse.sum(axis=0)
         np.maximum(self.largest, rows.peak.max(axis=0), out=self.largest)
         self.contact_s += rows.time_in_contact[steps > 0.0].sum(axis=0)
@@ -164,7 +164,7 @@ class LoadTotals:
         here = self.passes[-1]
         here.end_s = (int(walked.stamp_ns[-1]) - (self._first_ns or 0)) * 1e-9
         here.end_m = self._place_m
-        here.impacts += int(walked.rows.makes.sum())
+        here.impacts += int(walked.makes.sum())
         here.largest_force_n = max(here.largest_force_n, float(largest.max()))
         here.contact_loss_j += float(loss.sum())
         if speed:

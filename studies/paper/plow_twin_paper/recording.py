@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from plow_twin.errors import SolverError
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
+from plow_twin.run.advance import Advance
 from plow_twin.run.simulate import output_times
 from plow_twin.run.twin import Twin
 from plow_twin.stream.journal import Entry, Sample
+from plow_twin.stream.outputs import NOTHING
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
@@ -97,14 +99,14 @@ def _drive(
     session = Session(Twin(scene, excitation="sampled"), on_entry=journal)
     session.start()
     for index, (stamp_ns, wrench) in enumerate(zip(stamps, compile_loads(scene.loads).at(times).tolist(), strict=True)):
-        advance = session.apply(Sample(stamp_ns, (wrench[0], wrench[1], wrench[2])))
-        assert advance is not None
+        rows = session.apply(Sample(stamp_ns, (wrench[0], wrench[1], wrench[2])))
+        assert rows is not None
+        advance = Advance(rows[0])
         if advance.status:
             raise SolverError(f"recorded run at t = {times[index]:.9g} s: {advance.status.text}")
         poses[index] = advance.q
-        frame = session.outputs.take() if index % MESSAGE_EVERY == 0 else None
-        messages = {} if frame is None else publication_messages(frame, header.frame_id, header.child_frame_id)
-        for name, message in messages.items():
+        published = session.outputs.take() if index % MESSAGE_EVERY == 0 else NOTHING
+        for name, message in publication_messages(published, header.frame_id, header.child_frame_id).items():
             writer.write_output(header.topic(name), sequence, stamp_ns, stamp_ns, message)
         if index % 1000 == 0:
             on_progress(index / len(times))

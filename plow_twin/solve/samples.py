@@ -1,0 +1,22 @@
+"""Samples of a load as the kernels take them: per mass and inertia."""
+
+from __future__ import annotations
+
+import math
+
+from plow_twin.kernel.compiler import kernel
+
+
+@kernel(entry=True)
+def lay_out(before, samples, inertias, per) -> bool:
+    """Write the sample before, shape (3,), and those that follow, (n, 3), per mass and inertia to `per`, (n + 1, 3).
+
+    Returns whether those that follow are finite.
+    """
+    finite = True
+    for j in range(3):
+        per[0, j] = before[j] / inertias[j]
+        for n in range(len(samples)):
+            finite = finite and math.isfinite(samples[n, j])
+            per[n + 1, j] = samples[n, j] / inertias[j]
+    return finite
