@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 from estimate import RESULTS, load_rows, summary
+from estimate_mismatch import KINDS
+from estimate_mismatch import summary as of_kind
 from estimate_truths import GROUPS
 from scipy.stats import beta
 
@@ -103,6 +105,29 @@ def coverage(held: Sequence[bool]) -> str:
     return f"{count / total:.2f} ({low:.2f} to {high:.2f})"
 
 
+def mismatch() -> str:
+    """Return what is published of machines that differ from the model, before and with the step beside the fit."""
+    now, before = (load_rows(RESULTS / f"estimate_mismatch{name}.jsonl") for name in ("", "_before"))
+    lines = [
+        "| what differs | clearances | published before | published | interval below 4 mm | RMSE [mm] | "
+        "90 % interval holds | median width [mm] | beyond 3 deviations |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name in (None, *KINDS):
+        rows, old = ([row for row in some if name in (None, row["kind"])] for some in (now, before))
+        if not rows:
+            continue
+        asked = {(row["kind"], row["seed"]) for row in rows}
+        before_it = of_kind([row for row in old if (row["kind"], row["seed"]) in asked])
+        one, title = of_kind(rows), "all" if name is None else KINDS[name].title
+        numbers = f"{one['rmse_mm']:.2f} | {one['coverage']:.2f} | {one['width_mm']:.2f} | {one['far_off']:.2f}"
+        lines.append(
+            f"| {title} | {one['clearances']} | {before_it['published']:.2f} | {one['published']:.2f} | "
+            f"{one['useful']:.2f} | {numbers.replace('nan', '-') if one['published'] else '- | - | - | -'} |"
+        )
+    return "\n".join(lines)
+
+
 def filter_table(rows: Sequence[dict[str, Any]]) -> str:
     """Return errors and coverage of the two filters, by group."""
     lines = ["| group | filter | truths | RMSE gx, gy [mm] | coverage gx, gy | CPU [s] |", "|---|---|---|---|---|---|"]
@@ -125,5 +150,5 @@ def filters() -> str:
 
 
 FIGURES: dict[str, Callable[[], str]] = {
-    "right_models": right_models, "wrong_models": wrong_models, "filters": filters,
+    "right_models": right_models, "wrong_models": wrong_models, "mismatch": mismatch, "filters": filters,
 }  # fmt: skip
