@@ -53,7 +53,7 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
         "samples sent 3000, used 3000, frames out 3000, lost 0",
         "contact sets ccw: ",
         "horizontal clearance 25.000",
-        " um, deepest pad",
+        " µm, deepest pad",
         "real-time factor ",
         "  look at it: ",
     ):
