@@ -234,7 +234,7 @@ def test_a_unit_of_stamps_that_would_be_left_out_is_refused(tmp_path: Path) -> N
         ("stamp: log, ", "none"),
     ):
         mapping.write_text(f"excitation: {{topic: load, {stamp}stamp_unit: ms}}")
-        with pytest.raises(RecordingError, match=f"excitation: stamp_unit: got 'ms', expected .*{said}"):
+        with pytest.raises(RecordingError, match=f"excitation.stamp_unit: got 'ms', expected .*{said}"):
             analyse(tmp_path, scene=PAPER, mapping=mapping)
     mapping.write_text("excitation: {topic: load, stamp: zeit, stamp_unit: ms}")
     assert analyse(tmp_path, scene=PAPER, mapping=mapping).predictions[0].loads.duration_s == pytest.approx(0.099)
