@@ -67,6 +67,11 @@ class LoadSet:
         wrench = self.constant + np.sin(angle) @ self.sine + np.cos(angle) @ self.cosine
         return wrench if self.pieces is None else wrench + self.pieces.at(t)[0]
 
+    def largest(self) -> Array:
+        """Return a bound of the magnitude of Fx, Fy [N] and M [N m] at any time, shape (3,)."""
+        amplitude: Array = np.abs(self.constant) + np.hypot(self.sine, self.cosine).sum(axis=0)
+        return amplitude if self.pieces is None else amplitude + np.abs(self.pieces.start).max(axis=0)
+
 
 def wrench_of(force: tuple[float, float], moment: float, at: tuple[float, float]) -> Array:
     """Return (Fx, Fy, M) of a force with its arm and a free moment, shape (3,):  M = x Fy - y Fx + moment."""

@@ -145,10 +145,7 @@ def _pose(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
 def _largest_force(scene: Scene) -> float:
     """Return the largest force [N] of the scene's loads, or the head's weight where that is larger."""
-    loads = compile_loads(scene.loads)
-    amplitude = np.abs(loads.constant) + np.hypot(loads.sine, loads.cosine).sum(axis=0)
-    if loads.pieces is not None:
-        amplitude = amplitude + np.abs(loads.pieces.start).max(axis=0)
+    amplitude = compile_loads(scene.loads).largest()
     return max(float(amplitude[:2].max()), scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2))
 
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from operator import gt, sub
 from typing import Final
 
-import numpy as np
-
 from plow_twin.model.geometry import half_diagonal
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
@@ -68,10 +66,7 @@ def excitation_limits(
     Derived are ten times the sum of all loads of the scene and the head's weight, at the arm of half the frame's
     diagonal for the moment, and that much within a millisecond.
     """
-    loads = compile_loads(scene.loads)
-    amplitude = np.abs(loads.constant) + np.hypot(loads.sine, loads.cosine).sum(axis=0)
-    if loads.pieces is not None:
-        amplitude = amplitude + np.abs(loads.pieces.start).max(axis=0)
+    amplitude = compile_loads(scene.loads).largest()
     total = float(amplitude[:2].sum()) + scene.head.mass_kg * abs(scene.gravity.acceleration_m_s2)
     force = force or _MARGIN * total
     moment = moment or _MARGIN * (float(amplitude[2]) + total * half_diagonal(scene))
