@@ -52,18 +52,19 @@ from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Gaps, PartOfPose, Pose
 from plow_twin.stream.limits import pose_limits, value_limits
+from plow_twin.view.run_curves import RunCurves
 
 ROOT = Path(__file__).resolve().parent.parent
 START_S = 200.0
 
 
-def _row(index: int) -> tuple[float, ...]:
-    phase = float(np.sin(2e-3 * index))
+def _row(index: int, times: float = 1.0) -> tuple[float, ...]:
+    phase = times * float(np.sin(2e-3 * index))
     return (index * 1e-3, *(phase * amplitude for amplitude in PAPER_AMPLITUDE))
 
 
-def _csv(path: Path, count: int, more: str = "") -> Path:
-    rows = "".join(",".join(map(repr, _row(index))) + "\n" for index in range(count))
+def _csv(path: Path, count: int, more: str = "", times: float = 1.0) -> Path:
+    rows = "".join(",".join(map(repr, _row(index, times))) + "\n" for index in range(count))
     path.write_text(f"t,fx,fy,m\n{rows}{more}", encoding="utf-8")
     return path
 
@@ -787,6 +788,25 @@ def test_an_input_without_a_sample_or_without_a_header_is_named(
     assert run_cli(["live", str(tmp_path / "load.csv"), "--quiet"]) == code
     shown = capsys.readouterr().err
     assert said in shown and "no --scene: the preset paper is used" in shown
+
+
+def test_failed_advances_are_no_success_in_any_view_of_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, run = _csv(tmp_path / "load.csv", 720, times=3.0), tmp_path / "run"
+    assert run_cli(["live", str(path), "--scene", "paper", "--record", str(run)]) == 3
+    said = capsys.readouterr().err
+    assert "10 advances failed, without forces from 0.681 s to 0.690 s: the head turned to -45.3 degrees" in said
+    assert "the model holds up to 45; then the head began again in the initial position, with its wear" in said
+    for arguments in (["info"], ["doctor"]):
+        code = run_cli([*arguments, str(run), "--json"])
+        assert (code, json.loads(capsys.readouterr().out)["failed_advances"]) == (3 * (arguments == ["info"]), 10)
+    for arguments in ([], ["--png", str(tmp_path / "run.png")]):
+        assert run_cli(["view", str(run), *arguments]) == 3
+        assert "10 advances failed" in capsys.readouterr().err
+    curves = RunCurves.of(RunReader(run))
+    assert np.allclose(curves.failed_s, [(0.681, 0.690)]) and curves.failed == 10
+    assert replay(run).exit_code == 0
 
 
 def test_a_stop_before_the_end_of_a_file_is_a_loss(tmp_path: Path) -> None:

@@ -8,13 +8,14 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from plow_twin.model.loads import compile_loads
 from plow_twin.record.sending import Messages
 from plow_twin.run.twin import DEFAULT_BUDGET, Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream.driver import Arrival, Driver, Policy, StreamState, counters
 from plow_twin.stream.intake import NS_PER_S, Intake
-from plow_twin.stream.journal import Digest, Entry, Hold, Reset, Sample, Unload
+from plow_twin.stream.journal import Digest, Entry, Failed, Hold, Reset, Sample, Unload
 from plow_twin.stream.limits import excitation_limits
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.session import Session
@@ -133,12 +134,42 @@ def test_a_failed_advance_publishes_nothing_and_after_the_limit_the_model_is_res
         assert (frame := bench.sample(T0 + index * MS, LOAD, now_ns=index * MS)) is not None and frame.finite
     for index in range(20, 23):
         assert bench.sample(T0 + index * MS, (1e200, -1e200, 1e200), now_ns=index * MS) is None
-    assert driver.failures == 3
-    assert driver.failure
+    assert driver.failed.count == 3
+    assert driver.failed.reason
     assert isinstance(bench.journal[-1], Reset)
     recovered = bench.sample(T0 + 30 * MS, LOAD, now_ns=30 * MS)
     assert recovered is not None and recovered.finite
     assert driver.state is StreamState.RUNNING
+
+
+def test_a_model_that_leaves_its_range_says_by_how_much_and_begins_again_as_soon_as_it_can() -> None:
+    bench, direct = Bench(), Twin(SCENE, excitation="sampled")
+    failed = bench.driver.failed
+    load = compile_loads(SCENE.loads).at(np.arange(4000) * 1e-3) * 3.0
+    for index, wrench in enumerate(load.tolist()):
+        bench.sample(T0 + index * MS, (wrench[0], wrench[1], wrench[2]), now_ns=0)  # time of the load, not of the clock
+        if failed.count == 1:
+            status = direct.advance_samples(np.arange(index + 1) * 1e-3, load[: index + 1]).status
+            assert failed.reason == direct.failure(status[-1]) and not status[:-1].any()
+            failed_ns = T0 + index * MS
+    angle = float(failed.reason.split()[4])
+    assert failed.reason.endswith("degrees; the model holds up to 45") and 45.0 < abs(angle) < 46.0
+    assert failed.count < 100 and counters(bench.driver)["resets"] == failed.stretches > 5 and not failed.lasts
+    entries = [entry for entry in bench.journal if isinstance(entry, Failed)]
+    assert sum(entry.advances for entry in entries) == failed.count
+    assert [(entry.stamp_ns, entry.since_ns, entry.advances) for entry in entries[:2]] == [
+        (failed_ns, failed_ns, 1),
+        (failed_ns + 9 * MS, failed_ns, 9),
+    ]
+
+
+def test_a_model_that_fails_at_once_after_each_restart_begins_again_ever_less_often() -> None:
+    bench, absurd, count = Bench(), (1e200, -1e200, 1e200), 3000
+    for index in range(count):
+        bench.sample(T0 + index * MS, absurd if index % 2 else LOAD, now_ns=0)
+    assert 5 < bench.kinds().count("Reset") < 12
+    back = next(index for index in range(count, 2 * count) if bench.sample(T0 + index * MS, LOAD, now_ns=0))
+    assert back - count < count
 
 
 def test_the_scenes_own_loads_follow_the_clock_that_is_passed_in() -> None:
@@ -257,7 +288,7 @@ def test_failures_within_a_batch_end_in_a_reset_and_count_for_nothing() -> None:
     bench = Bench(Policy(failure_limit=3), every_sample=False)
     absurd = (1e200, -1e200, 1e200)
     list(bench.driver.samples([(T0 + i * MS, absurd if 10 <= i < 13 else LOAD) for i in range(13)], now_ns=0))
-    assert (bench.driver.failures, bench.kinds()[-1]) == (3, "Reset")
+    assert (bench.driver.failed.count, bench.kinds()[-1]) == (3, "Reset")
     list(bench.driver.samples([(T0 + i * MS, LOAD) for i in range(13, 20)], now_ns=0))
     frame = bench.driver.due()
     assert len(frame.rows) and frame.finite and bench.driver.state is StreamState.RUNNING

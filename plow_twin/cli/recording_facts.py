@@ -8,10 +8,12 @@ from typing import Any
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.record.unused import InputCounts
+from plow_twin.stream.journal import Failed
 
 
 def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
-    """Read a recording from front to back; return its facts, and whether it has losses.
+    """Read a recording from front to back; return its facts, and whether anything is missing: it has losses, or
+    advances that failed.
 
     Raises
     ------
@@ -20,12 +22,13 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
     """
     reader = RunReader(path)
     first = last = None
-    inputs = InputCounts(reader.header.excitation_source)
+    inputs, failed = InputCounts(reader.header.excitation_source), 0
     for record in reader:
         first = record.log_time_ns if first is None else first
         last = record.log_time_ns
         if isinstance(record, EntryRecord):
             inputs.add_entry(record.entry)
+            failed += record.entry.advances if isinstance(record.entry, Failed) else 0
     header = reader.header
     facts: dict[str, Any] = {
         "file": str(reader.path),
@@ -34,6 +37,7 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
         "duration_s": 0.0 if first is None or last is None else (last - first) * 1e-9,
         "messages": dict(sorted(reader.counts.items())),
         "inputs": inputs.facts(),
+        "failed_advances": failed,
         "lost": {**reader.lost, **reader.lost_parts},
         "damaged_chunks": reader.damaged_chunks,
         "foreign_parts": {file.name: list(keys) for file, keys in reader.foreign.items()},
@@ -47,4 +51,4 @@ def read_recording(path: Path) -> tuple[dict[str, Any], bool]:
         "build": dict(header.build),
         "parameters": dict(header.parameters),
     }
-    return facts, bool(facts["lost"]) or reader.status is not FileStatus.COMPLETE
+    return facts, bool(facts["lost"] or failed) or reader.status is not FileStatus.COMPLETE

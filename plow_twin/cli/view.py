@@ -118,7 +118,7 @@ def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:
 
 def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> int:
     """Print the content of the drawing and the losses; return the exit code."""
-    lossy = _tell_loss(recording, summary.status, summary.lost)
+    lossy = _tell_loss(recording, summary.status, summary.lost, summary.failed)
     if not quiet:
         thinned = "" if summary.curve_rows == summary.rows else f" of {summary.rows} read"
         click.echo(
@@ -127,8 +127,8 @@ def _show(recording: Path, out: object, summary: ViewSummary, quiet: bool) -> in
     return DONE_WITH_LOSS if lossy else DONE
 
 
-def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int]) -> bool:
-    """Print the losses of a recording; return whether it has any."""
+def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int], failed: int) -> bool:
+    """Print the losses and failed advances of a recording; return whether it has any."""
     from plow_twin.record.reader import FileStatus
 
     whole = status in (FileStatus.COMPLETE, FileStatus.UNREAD)
@@ -136,7 +136,9 @@ def _tell_loss(recording: Path, status: FileStatus, lost: Mapping[str, int]) -> 
         say_error(f"plow-twin: {recording}: {status.value}")
     if lost:
         say_error(f"plow-twin: {recording}: lost {counts(lost)}")
-    return not whole or bool(lost)
+    if failed:
+        say_error(f"plow-twin: {recording}: {failed} advances failed: they have no forces")
+    return not whole or bool(lost or failed)
 
 
 def _serve(file: Path, port: int) -> int:

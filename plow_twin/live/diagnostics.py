@@ -120,6 +120,7 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "stale_inputs": "silent inputs, separated by commas",
     "clock": "running; under use_sim_time also waiting (for the first message on /clock) or paused",
     "recorder": "off, recording, or trouble (a loss, or it has stopped)",
+    "solver_failures": "failed advances: no forces were computed for their samples",
     "horizontal": "state of the interval of the horizontal clearance: prior, estimated, rough, not_observable or "
     "withdrawn",
     "vertical": "the same for the vertical clearance",
@@ -173,7 +174,8 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     if lifecycle != "active":
         return OK, lifecycle, values
     level = _LEVELS[state]
-    said = [f"{state.value}: {runtime.driver.failure}" if state is StreamState.FAILED else state.value]
+    values["solver_failures"] = str(runtime.driver.failed.count)
+    said = [state.value, *failures(runtime)]
     others = runtime.inputs.other_senders()
     troubles = [
         (ERROR, runtime.unsteady, "the stamps jump again and again: samples are dropped"),
@@ -198,6 +200,21 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     return level, "; ".join(said), values
 
 
+def failures(runtime: Runtime) -> list[str]:
+    """Return, in words, how many advances failed, why and when the newest did so, and whence the model went on."""
+    failed = runtime.driver.failed
+    if not failed.count:
+        return []
+    since, until = runtime.time_text(failed.since_ns), runtime.time_text(failed.until_ns)
+    begun = f"{failed.count} advances failed, without forces" + (
+        f", in {failed.stretches} stretches, the newest" if failed.stretches > 1 else ""
+    )
+    if failed.lasts:
+        return [f"{begun} since {since}: {failed.reason}"]
+    whence = "began again in the initial position, with its wear" if failed.restarts else "went on from where it was"
+    return [f"{begun} from {since} to {until}: {failed.reason}; then the head {whence}"]
+
+
 class Health:
     """The parts of `/diagnostics`; remembers counters to tell what has happened since the last report."""
 
@@ -217,21 +234,21 @@ class Health:
     def state(self, lifecycle: str, reason: str, runtime: Runtime | None, now_ns: int) -> Part:
         """Return lifecycle, stream and solver."""
         level, message, _ = summary(lifecycle, reason, runtime)
-        if runtime is not None and self._grown({"solver_failures": runtime.driver.failures}, ("solver_failures",)):
-            level, message = ERROR, f"{StreamState.FAILED.value}: {runtime.driver.failure}"
+        if runtime is not None and self._grown({"solver_failures": runtime.driver.failed.count}, ("solver_failures",)):
+            level, message = ERROR, "; ".join(failures(runtime))
         values = dict.fromkeys(KEYS["state"], "")
         values |= {"lifecycle": lifecycle, "reason": reason}
         if runtime is not None:
             driver = runtime.driver
             values |= {
                 "stream": driver.state.value,
-                "reason": driver.failure,
+                "reason": driver.failed.reason,
                 "scene": runtime.scene_name,
                 "compile_s": f"{runtime.compile_s:.3f}",
                 "model_time_s": f"{driver.real_time.model_s:.3f}",
                 "real_time_factor": f"{driver.real_time.recent(now_ns):.4f}",
                 "real_time_factor_mean": f"{driver.real_time.mean():.4f}",
-                "solver_failures": str(driver.failures),
+                "solver_failures": str(driver.failed.count),
                 "coarse_advances": str(driver.session.twin.bounded),
                 "error_estimate_m": f"{driver.session.take_error_estimate():.3g}",
                 "resets": str(driver.resets),

@@ -21,6 +21,7 @@ from plow_twin.live.timer import Timer
 from plow_twin.record.mapping import Role, read_map, stamps_by, with_units
 from plow_twin.record.messages import DiagnosticStatus, JointState, Message
 from plow_twin.record.sources import Arrived
+from plow_twin.record.times import time_text
 from plow_twin.record.unit_check import CHECKED, check_units
 from plow_twin.stream.topics import TOPICS
 
@@ -110,6 +111,10 @@ class BridgeFront:
         """Return the name of a sender of an input."""
         return sender.decode(errors="replace")
 
+    def time_text(self, stamp_ns: int) -> str:
+        """Return a stamp in words, as it stands in the input."""
+        return time_text(stamp_ns, own_start=True)
+
     def changed(self) -> None:
         """Say the status when it is another one."""
         level, message, values = diagnostics.summary("active", "", self.runtime)
@@ -132,7 +137,7 @@ class BridgeFront:
         finally:
             bridge.close()
             lost = runtime.close()
-        return [*self._not_read(stop_asked()), *lost]
+        return [*self._not_read(stop_asked()), *diagnostics.failures(runtime), *lost]
 
     def _not_read(self, stopped: bool) -> list[str]:
         """Return, in words, the input that never came or was left unread."""

@@ -58,6 +58,9 @@ class Front(Protocol):
     def changed(self) -> None:
         """Take note that the state of the stream may have changed."""
 
+    def time_text(self, stamp_ns: int) -> str:
+        """Return a stamp in words, as a person who knows the input writes it."""
+
     def say_error(self, text: str) -> None:
         """Log an error; may be called from another thread."""
 

@@ -221,6 +221,10 @@ class Runtime:
         """Periods left out between two reports from which on there is a warning; 0: none."""
         return self.settings.missed_periods
 
+    def time_text(self, stamp_ns: int) -> str:
+        """Return a stamp in words."""
+        return self._front.time_text(stamp_ns)
+
     def send_alarms(self) -> None:
         """Send the alarms as they are."""
         self._send([self.publishing.alarms_now(self.stamp_ns)])

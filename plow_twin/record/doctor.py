@@ -32,7 +32,7 @@ from plow_twin.record.metadata_yaml import (
 )
 from plow_twin.record.reader import FileStatus, RunReader, run_parts
 from plow_twin.record.unused import InputCounts
-from plow_twin.stream.journal import Digest, Sample, Snapshot
+from plow_twin.stream.journal import Digest, Failed, Sample, Snapshot
 
 _CHUNK_SIZE: Final = 2**20
 #: Key in the loss record of a repaired part.
@@ -77,6 +77,8 @@ class RunReport:
     repeated: int = 0
     lost: dict[str, int] = field(default_factory=dict)
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
+    #: advances that failed: their samples have no forces
+    failed_advances: int = 0
     span_s: float = 0.0
     problems: list[str] = field(default_factory=list)
 
@@ -105,6 +107,7 @@ class RunReport:
             "repeated_entries": self.repeated,
             "lost": self.lost,
             "inputs": self.inputs,
+            "failed_advances": self.failed_advances,
             "parts": parts,
         }
 
@@ -128,6 +131,7 @@ def examine(path: Path) -> RunReport:
     for batch in reader.batches(outputs=False):
         entries = batch.entries
         inputs.add(entries)
+        report.failed_advances += sum(entry.advances for entry in entries.rest.values() if isinstance(entry, Failed))
         for index, sequence in enumerate(entries.sequence.tolist()):
             if expected is not None and 0 < expected - sequence <= in_a_row:
                 report.repeated += 1

@@ -43,6 +43,14 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
 
 
+def time_text(stamp_ns: int, *, own_start: bool = False) -> str:
+    """Return a stamp as a date, or below `EPOCH_S` in seconds; `own_start`: as it stood there, before `time_ns`."""
+    if stamp_ns < EPOCH_S * 1e9:
+        return f"{(stamp_ns - (_ORIGIN_NS if own_start else 0)) * 1e-9:.3f} s"
+    date = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
+    return f"{date:%Y-%m-%d %H:%M:%S}.{stamp_ns // 10**6 % 1000:03d} UTC"
+
+
 def _within(stamp_ns: int | None) -> int | None:
     return None if stamp_ns is None or abs(stamp_ns) > _FARTHEST_NS else stamp_ns
 

@@ -16,6 +16,7 @@ from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import KeptWear
 from plow_twin.record.messages import Message
+from plow_twin.record.times import time_text
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.publishers import OutputPublishers
 from plow_twin.ros.subscriptions import Subscriptions
@@ -109,6 +110,10 @@ class RosFront:
     def sender_name(self, topic: str, sender: bytes) -> str:
         """Return node and identity of a publisher of an input."""
         return self.subscriptions.name_of(topic, sender)
+
+    def time_text(self, stamp_ns: int) -> str:
+        """Return a stamp in words."""
+        return time_text(stamp_ns)
 
     def changed(self) -> None:
         """Take note that the state of the stream may have changed."""

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.kernel.compiler import for_arguments
-from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Initial, Scene, check_travel_speed
 from plow_twin.run.advance import Advance, AdvanceSeries, check_times
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
@@ -22,6 +22,7 @@ from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
 from plow_twin.solve.method.rest import AT_REST
 from plow_twin.solve.method.step_size import PARTING_ORDER
+from plow_twin.solve.modes import LARGEST_ANGLE
 from plow_twin.solve.samples import lay_out
 from plow_twin.solve.state import (
     BOUND,
@@ -366,6 +367,30 @@ class Twin:
         """Wear depth of each pad at the end of the last step [m], shape (8,): a sample ends a step."""
         depth: NDArray[np.float64] = self._state.wear_depth.copy()
         return depth
+
+    def failure(self, status: int) -> str:
+        """Say why the newest advance that failed did so.
+
+        Parameters
+        ----------
+        status : int
+            Its status.
+
+        Returns
+        -------
+        str
+            For `OUT_OF_RANGE` the limit of the model, and how far the head went beyond it.
+        """
+        if status != Status.OUT_OF_RANGE:
+            return Status(status).text
+        angle, penetration, pair = self._work.beyond.tolist()
+        limit = float(self._compiled.params.half_cavity)
+        if abs(angle) <= LARGEST_ANGLE:
+            return (
+                f"{PAIR_NAMES[int(pair)]} penetrated {1e3 * penetration:.1f} mm deep; "
+                f"the model holds up to half the cavity, {1e3 * limit:.1f} mm"
+            )
+        return f"the head turned to {math.degrees(angle):.1f} degrees; the model holds up to 45"
 
     @property
     def frame(self) -> NDArray[np.float64] | None:

@@ -14,7 +14,7 @@ from plow_twin.solve.fixed_step import end_coarsely
 from plow_twin.solve.kinematics import pose_of
 from plow_twin.solve.method.flight import fly
 from plow_twin.solve.method.rest import write_rest
-from plow_twin.solve.modes import within_range
+from plow_twin.solve.modes import read_range, within_range
 from plow_twin.solve.state import Parts, Status
 from plow_twin.solve.step import complete_step, lay_out_step
 from plow_twin.solve.totals import add_to_totals
@@ -156,6 +156,9 @@ def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budge
         if code == _BUDGET:
             code = end_coarsely(p, parts, state, totals, target, bound)
     steps = state.steps - before
+    if code == _RANGE:
+        _present(p, parts.harmonics, parts.terms.flight, parts.terms.support, state, w, w.moved)
+        read_range(p, state, w.moved, w.beyond)
     if code != _OK:
         states[index] = saved[0]
         _undo(parts.terms.support, state, w, target)

@@ -205,6 +205,17 @@ def _all_shallow(p, state, y) -> bool:
 
 
 @kernel()
+def read_range(p, state, y, out) -> None:
+    """Write what `within_range` looks at: the angle [rad], the largest penetration [m] of a pair, and its number."""
+    out[0], out[1], out[2] = named_angle(p, y, y[THETA]), -np.inf, 0.0
+    for pair in range(PAIR_COUNT):
+        if p.enabled[pair] == 1:
+            penetration = penetration_of(p, state, pair, y)
+            if penetration > out[1]:
+                out[1], out[2] = penetration, pair
+
+
+@kernel()
 def within_range(p, state, y) -> bool:
     """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
     if _all_shallow(p, state, y):

@@ -255,6 +255,7 @@ WORK: Final = np.dtype(
         ("damping", "f8", (3, 3)),  # by rate, at rest under harmonics
         ("rub", "f8", (6, *_WIDE)),  # wear: s' / v, way per travel, force times it; running-in and its factors
         ("binomial", "f8", (_ROWS, _ROWS)),  # 1 / C(order, k)
+        ("beyond", "f8", (3,)),  # of the newest advance out of range: angle [rad], largest penetration [m], its pair
     ]
 )
 

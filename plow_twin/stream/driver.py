@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
+import numpy as np
+
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.run.twin import Status
+from plow_twin.stream.failures import Failures
 from plow_twin.stream.health import RealTimeFactor
 from plow_twin.stream.intake import NS_PER_S, Intake, Verdict
 from plow_twin.stream.journal import (
-    Entry,
     Hold,
     Mark,
     Parameter,
@@ -31,7 +32,7 @@ from plow_twin.stream.journal import (
     Travel,
     Unload,
 )
-from plow_twin.stream.outputs import NOTHING, Published
+from plow_twin.stream.outputs import NOTHING, Published, Rows
 from plow_twin.stream.session import Session
 from plow_twin.stream.steps import Steps
 
@@ -42,10 +43,9 @@ Arrival = tuple[int, tuple[float, float, float]]
 _LARGEST_HOLD_NS: Final = NS_PER_S
 #: Silence is looked for at least this often [ns]: the policy may change.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
-#: At most so many resets by jumps and failures in that time [ns]: clocks out of step must not reset the model for ever.
+#: At most so many resets by jumps in that time [ns]: clocks out of step must not reset the model for ever.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
-_ALL_WELL: Final = (int(Status.OK),)
 
 
 class StreamState(Enum):
@@ -65,7 +65,7 @@ class Policy:
     After `excitation_timeout_s` without a sample the model goes on by the steady clock, that far behind it, so that a
     sample late by less is still used. `hold` is `hold` (the last load stays) or `zero` (it falls to zero within the
     first call); after `hold_limit_s` of it the model stands still. After `failure_limit` failed advances in a row the
-    model is reset; 0: never.
+    model is reset (`Failures.wants_restart`); 0: never.
     """
 
     excitation_timeout_s: float = 0.5
@@ -94,9 +94,8 @@ class Driver:
         self.every_sample = every_sample
         self.real_time = RealTimeFactor()
         self.state = StreamState.WAITING
-        #: text of the last failed advance
-        self.failure = ""
-        self.failures = 0
+        #: failed advances
+        self.failed = Failures(session.emit)
         self.resets = 0
         self.holds = 0
         #: samples that were late and have been worked in by going back
@@ -108,7 +107,6 @@ class Driver:
         self._unsteady_ns: int | None = None
         self._steps = Steps(intake)
         self.clock = Intake(jump_back_s=intake.jump_back_s, jump_forward_s=intake.jump_forward_s)
-        self._failures_in_row = 0
         self._received_ns = 0
         self._newest_ns: int | None = None
         #: model time that has been counted [ns]
@@ -267,6 +265,7 @@ class Driver:
 
     def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
         """Go back to the motion of a snapshot; the next sample is that of its time, whatever its stamp."""
+        self.failed.end()
         self.session.apply(Restore(stamp_ns, snapshot.data))
         self._begin_again()
         self.intake.restart()
@@ -295,6 +294,7 @@ class Driver:
         depth = tuple(float(value) for value in depth_m)
         if len(depth) != PAIR_COUNT or not all(0.0 <= value < math.inf for value in depth):
             raise ValueError(f"wear depth: got {list(depth_m)!r}, expected {PAIR_COUNT} finite depths >= 0 in m")
+        self.failed.end()
         self.session.apply(SetWear(stamp_ns, depth, reason))
         self._begin_again()
         self.intake.restart()
@@ -322,6 +322,7 @@ class Driver:
 
     def close(self) -> None:
         """End the journal."""
+        self.failed.end()
         self.session.close()
 
     def _is_late(self, sample: Sample) -> bool:
@@ -341,15 +342,15 @@ class Driver:
         return len(self._resets_ns) < _MOST_RESETS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
-        """Reset the model; what was asked for, and a return (`now_ns` None), do not count against the limit."""
+        """Reset the model; what was asked for, returns and failures (`now_ns` None) do not count against the limit."""
         if now_ns is not None:
             self._resets_ns.append(now_ns)
+        self.failed.end()
         self.session.apply(Reset(stamp_ns, reason))
         self.resets += 1
         self._begin_again()
 
     def _begin_again(self) -> None:
-        self._failures_in_row = 0
         self._newest_ns = self._counted_ns = None
         self.state = StreamState.WAITING
 
@@ -360,24 +361,24 @@ class Driver:
         for applied in self.session.samples(samples, each=self.every_sample):
             self.rolled_back += applied.late
             self._advanced(now_ns)
-            # failures count in a row: where all went well one status is enough
-            for status in applied.rows["status"].tolist() if applied.failed else _ALL_WELL:
-                self._judge_advance(status, StreamState.RUNNING)
             if applied.failed:
-                self._give_up_after_failures(now_ns)
+                self._judge_rows(applied.rows)
+            else:
+                self.failed.end()
+                self.state = StreamState.RUNNING
             if len(applied.published.rows):
                 yield applied.published
         if self._newest_ns is None:
             # after a reset between two samples silence is to be seen
             self._newest_ns = self.session.stamp_ns
 
-    def _advance(self, entry: Entry, now_ns: int, state: StreamState) -> Published:
+    def _advance(self, entry: Hold | Unload, now_ns: int, state: StreamState) -> Published:
         """Advance without a sample."""
         rows = self.session.apply(entry)
         assert rows is not None, "such an entry makes an advance"
         self._advanced(now_ns)
-        self._judge_advance(int(rows["status"][0]), state)
-        self._give_up_after_failures(now_ns)
+        self._judge_advance(int(rows["status"][0]), entry.stamp_ns, state)
+        self._restart_after_failures()
         return self.due() if self.every_sample else NOTHING
 
     def _advanced(self, now_ns: int) -> None:
@@ -387,20 +388,24 @@ class Driver:
             self.real_time.advanced((reached_ns - self._counted_ns) * 1e-9, now_ns)
         self._counted_ns = reached_ns
 
-    def _judge_advance(self, status: int, state: StreamState) -> None:
-        if not status:
-            self._failures_in_row = 0
-            self.state = state
-            return
-        self.failures += 1
-        self._failures_in_row += 1
-        self.state = StreamState.FAILED
-        self.failure = Status(status).text
+    def _judge_rows(self, rows: Rows) -> None:
+        """Judge advances to samples, one of which has failed at least."""
+        stamps = (self.session.origin_ns or 0) + np.rint(rows["t"] * NS_PER_S).astype(np.int64)
+        for status, stamp_ns in zip(rows["status"].tolist(), stamps.tolist(), strict=True):
+            self._judge_advance(status, stamp_ns, StreamState.RUNNING)
+        self._restart_after_failures()
 
-    def _give_up_after_failures(self, now_ns: int) -> None:
-        if 0 < self.policy.failure_limit <= self._failures_in_row and self._may_reset(now_ns):
-            reason = f"{self._failures_in_row} failed advances: {self.failure}"
-            self._restart_model(self.session.stamp_ns or 0, reason, now_ns)
+    def _judge_advance(self, status: int, stamp_ns: int, state: StreamState) -> None:
+        if status:
+            self.failed.add(stamp_ns, self.session.twin.failure(status))
+            self.state = StreamState.FAILED
+        else:
+            self.failed.end()
+            self.state = state
+
+    def _restart_after_failures(self) -> None:
+        if self.failed.wants_restart(self.policy.failure_limit):
+            self._restart_model(self.session.stamp_ns or 0, self.failed.restarted(), None)
             self.intake.restart()
             self.clock.restart()
 
@@ -424,5 +429,5 @@ def counters(driver: Driver) -> dict[str, int]:
         "holds": driver.holds,
         "travel_misplaced": driver.travel_misplaced,
         "resets": driver.resets,
-        "solver_failures": driver.failures,
+        "solver_failures": driver.failed.count,
     }

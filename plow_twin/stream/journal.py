@@ -91,6 +91,19 @@ class Mark:
 
 
 @dataclass(frozen=True)
+class Failed:
+    """So many `advances` have failed up to `stamp_ns`, in a row that began at `since_ns`; moves nothing.
+
+    An entry comes at the first one of a row, and one for all others at its end: the sum of `advances` is their number.
+    """
+
+    stamp_ns: int
+    since_ns: int
+    advances: int
+    reason: str
+
+
+@dataclass(frozen=True)
 class Spread:
     """The load is known to these standard deviations, Fx, Fy [N] and M [N m], from `stamp_ns` on; moves nothing."""
 
@@ -205,6 +218,7 @@ Entry = (
     | SetModel
     | Restore
     | Mark
+    | Failed
     | Spread
     | Parameter
     | Pose

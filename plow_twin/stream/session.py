@@ -19,6 +19,7 @@ from plow_twin.stream.journal import (
     Digest,
     Entry,
     Estimated,
+    Failed,
     Gaps,
     Hold,
     Loss,
@@ -184,7 +185,7 @@ class Session:
             case Restore(_, data):
                 self._on_entry(entry)
                 self._restore_motion(data)
-            case Parameter() | Pose() | PartOfPose() | Gaps() | Mark() | Spread() | Unused():
+            case Parameter() | Pose() | PartOfPose() | Gaps() | Mark() | Failed() | Spread() | Unused():
                 # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):

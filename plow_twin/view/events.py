@@ -10,7 +10,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.alarms import ALARMS
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import DiagnosticStatus
-from plow_twin.stream.journal import Entry, Hold, Loss, Mark, Parameter, Reset, SetWear, Travel, Unload, Unused
+from plow_twin.stream.journal import Entry, Failed, Hold, Loss, Mark, Parameter, Reset, SetWear, Travel, Unload, Unused
 from plow_twin.view.columns import Array, Batches, Indexes, TimeAxis
 
 _LEVELS = ("INFO", "WARN", "ERROR", "WARN")
@@ -20,7 +20,8 @@ class Events:
     """Write the log; `count` is the number of its lines."""
 
     def __init__(self, stream: rr.RecordingStream, axis: TimeAxis) -> None:
-        self.count = 0
+        #: lines, and advances that failed
+        self.count = self.failed = 0
         self._lines = Batches(stream, axis, "events", rr.TextLog, ("text", "level"))
         self._makes_before: NDArray[np.float64] | None = None
         self._status: dict[str, tuple[int, str]] = {}
@@ -57,6 +58,10 @@ class Events:
                 self.add(stamp_ns, step, f"wear of the pads set: {reason}", "WARN")
             case Parameter(name, value):
                 self.add(stamp_ns, step, f"parameter {name} = {value}")
+            case Failed(stamp_ns, since_ns, advances, reason):
+                self.failed += advances
+                more = "an advance failed" if stamp_ns == since_ns else f"{advances} more advances failed after it"
+                self.add(stamp_ns, step, f"{more}: {reason}", "ERROR")
             case Mark(_, text):
                 self.add(stamp_ns, step, f"mark: {text}", "WARN")
             case Unused(topic, sender, reason, count):

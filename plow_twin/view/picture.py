@@ -15,6 +15,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.alarms import alarms_of
 from plow_twin.record.durable import whole_file
 from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.times import EPOCH_S
 from plow_twin.stream.alarms import Thresholds
 from plow_twin.view.envelope import Envelope
 from plow_twin.view.run_curves import Instant, RunCurves
@@ -25,8 +26,8 @@ _LABEL_ROOM_MM: Final = 50.0
 _LOAD_NAMES: Final = ("Fx [kN]", "Fy [kN]", "M [kN m]")
 
 
-def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int]]:
-    """Draw a recording into a PNG; return how the recording ended and the counts of its losses.
+def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
+    """Draw a recording into a PNG; return how the recording ended, counts of its losses, and failed advances.
 
     No line crosses missing entries or a reset. A long run is drawn as the envelope of its curves: the least and the
     largest value in bins of one width.
@@ -58,27 +59,32 @@ def to_png(path: Path, out: Path) -> tuple[FileStatus, dict[str, int]]:
     for axis in (force, load, clearance):
         for begin, end in curves.held_s:
             axis.axvspan(begin, end, color="0.85", lw=0, zorder=0)
-    clearance.set_xlabel("time since the first stamp [s]" + ("; grey: without samples" if curves.held_s else ""))
+        for begin, end in curves.failed_s:
+            axis.axvspan(begin, end, color="tab:red", alpha=0.25, zorder=0)
+    meanings = ("; grey: without samples" if curves.held_s else "") + ("; red: failed" if curves.failed_s else "")
+    clearance.set_xlabel("time since the first stamp [s]" + meanings)
     lost = {**reader.lost, **reader.lost_parts}
-    figure.suptitle(_title(reader, curves.first_ns, lost))
+    figure.suptitle(_title(reader, curves, lost))
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(out) as stream:
             FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
     except OSError as error:
         raise RecordingError(f"{out}: cannot be written: {error.strerror}") from error
-    return reader.status, lost
+    return reader.status, lost, curves.failed
 
 
-def _title(reader: RunReader, first_ns: int | None, lost: dict[str, int]) -> str:
+def _title(reader: RunReader, curves: RunCurves, lost: dict[str, int]) -> str:
     """Return file, scene, date and end of the recording."""
     parts = [reader.path.name]
     scene = reader.header.parameters.get("scene")
     if isinstance(scene, str) and scene:
         parts.append(f"scene {Path(scene).name}")
-    if first_ns is not None:
-        parts.append(datetime.fromtimestamp(first_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC"))
+    if curves.first_ns is not None and curves.first_ns >= EPOCH_S * 1e9:
+        parts.append(datetime.fromtimestamp(curves.first_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC"))
     losses = [f"lost {name.replace('_', ' ')}: {count}" for name, count in lost.items()]
+    if curves.failed:
+        losses.append(f"{curves.failed} advances failed: no forces")
     if reader.status is not FileStatus.COMPLETE or not losses:
         losses.insert(0, reader.status.value)
     return ", ".join(parts + losses)

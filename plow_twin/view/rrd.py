@@ -29,7 +29,8 @@ class ViewSummary:
     """Content of a .rrd: first stamp, rows of the curves, instants of the cross-section, events.
 
     `status` is how the recording ended. `lost` has the counts of its recorder by topic, of parts that are missing or of
-    another run, and of samples too late for other scenes. Of `rows` of the force curves `curve_rows` were sent.
+    another run, and of samples too late for other scenes. `failed` advances have no forces.
+    Of `rows` of the force curves `curve_rows` were sent.
     """
 
     path: Path
@@ -40,6 +41,7 @@ class ViewSummary:
     events: int
     status: FileStatus
     lost: Mapping[str, int]
+    failed: int = 0
 
     @classmethod
     def of(cls, path: Path, drawing: Drawing, reader: RunReader) -> ViewSummary:
@@ -54,6 +56,7 @@ class ViewSummary:
             drawing.events.count,
             reader.status,
             {**reader.lost, **reader.lost_parts, **drawing.what_if.lost},
+            drawing.events.failed,
         )
 
 

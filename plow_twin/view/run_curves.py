@@ -15,7 +15,7 @@ from plow_twin.record.entries import Batch, Holes
 from plow_twin.record.outputs import publication_templates
 from plow_twin.record.reader import RunReader
 from plow_twin.record.rows import Rows, rows_by_topic
-from plow_twin.stream.journal import Estimated, Hold, Reset, SetModel, SetWear, Unload
+from plow_twin.stream.journal import Estimated, Failed, Hold, Reset, SetModel, SetWear, Unload
 from plow_twin.stream.outputs import CLEARANCE_NAMES
 from plow_twin.view.envelope import Envelope
 
@@ -43,7 +43,8 @@ class RunCurves:
     """Largest forces [kN], load [kN, kN m] and clearances [mm] over time, and the instant of the largest force.
 
     Times count from `first_ns`, the first stamp of a sample or message [s]. `held_s` are the stretches computed without
-    samples; `changes` are the instants at which the clearance changed by something else than wear, with the reason.
+    samples, `failed_s` those of `failed` advances, which have no forces; `changes` are the instants at which the
+    clearance changed by something else than wear, with the reason.
     """
 
     first_ns: int | None = None
@@ -52,6 +53,8 @@ class RunCurves:
     clearance: Envelope = field(default_factory=lambda: Envelope(len(_CLEARANCE_COLUMNS)))
     instant: Instant | None = None
     held_s: list[tuple[float, float]] = field(default_factory=list)
+    failed_s: list[tuple[float, float]] = field(default_factory=list)
+    failed: int = 0
     changes: list[tuple[float, str]] = field(default_factory=list)
     _estimated: bool = False
     _held_since_ns: int | None = None
@@ -105,6 +108,8 @@ class RunCurves:
                 case Estimated(end_ns=end_ns) if not self._estimated:
                     self._estimated = True
                     self._change(end_ns, "first estimate")
+                case Failed(stamp_ns, since_ns, advances):
+                    self._failed(stamp_ns, since_ns, advances)
                 case SetModel(stamp_ns):
                     self._change(stamp_ns, "parameters set")
                 case SetWear(stamp_ns):
@@ -125,6 +130,16 @@ class RunCurves:
         if len(self.held_s) < _MOST_MARKS:
             self.held_s.append(((self._held_since_ns - first) * _NS, (stamp_ns - first) * _NS))
         self._held_since_ns = None
+
+    def _failed(self, stamp_ns: int, since_ns: int, advances: int) -> None:
+        """Take in the first failed advance of a row, or all others at its end."""
+        first = self.first_ns or 0
+        self.failed += advances
+        if stamp_ns == since_ns:
+            if len(self.failed_s) < _MOST_MARKS:
+                self.failed_s.append(((since_ns - first) * _NS,) * 2)
+        elif self.failed_s and self.failed_s[-1][0] == (since_ns - first) * _NS:
+            self.failed_s[-1] = (self.failed_s[-1][0], (stamp_ns - first) * _NS)
 
     def _change(self, stamp_ns: int, reason: str) -> None:
         if self.first_ns is not None and len(self.changes) < _MOST_MARKS:

@@ -1,0 +1,71 @@
+"""Advances that failed: counted, journalled by stretches, and when the model begins anew after them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from plow_twin.stream.journal import Failed
+
+
+class Failures:
+    """Failed advances of a run.
+
+    Parameters
+    ----------
+    emit
+        Receives a `Failed` at the first advance of a stretch, and another one at its end.
+    """
+
+    def __init__(self, emit: Callable[[Failed], object]) -> None:
+        self._emit = emit
+        #: failed advances, and stretches of them
+        self.count = self.stretches = 0
+        #: why the newest one failed; empty: none has
+        self.reason = ""
+        #: stamps of the first and the last advance of the newest stretch [ns]
+        self.since_ns = self.until_ns = 0
+        #: whether the motion began anew after the newest stretch
+        self.restarts = False
+        self._in_a_row = 0
+        #: length of the stretch before the newest restart, and the stamp of that [ns]
+        self._before_ns = 0
+        self._restarted_ns: int | None = None
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the newest advance failed."""
+        return self._in_a_row > 0
+
+    def add(self, stamp_ns: int, reason: str) -> None:
+        """Count a failed advance."""
+        self.count += 1
+        self._in_a_row += 1
+        self.reason, self.until_ns = reason, stamp_ns
+        if self._in_a_row == 1:
+            self.stretches += 1
+            self.since_ns, self.restarts = stamp_ns, False
+            self._emit(Failed(stamp_ns, stamp_ns, 1, reason))
+
+    def end(self) -> None:
+        """End the stretch, if there is one: an advance did not fail, or the motion begins anew."""
+        if self._in_a_row > 1:
+            self._emit(Failed(self.until_ns, self.since_ns, self._in_a_row - 1, self.reason))
+        self._in_a_row = 0
+
+    def wants_restart(self, limit: int) -> bool:
+        """Tell whether the model should begin anew, after `limit` failed advances in a row; 0: never.
+
+        Where it failed again at once after a restart, the next one waits twice as long as the stretch before it: the
+        number of restarts grows as the logarithm of the time, and at most half of the time in which the model could
+        move again is lost.
+        """
+        if not 0 < limit <= self._in_a_row:
+            return False
+        at_once = self._restarted_ns is not None and self.since_ns - self._restarted_ns < self._before_ns
+        return self.until_ns - self.since_ns >= (2 * self._before_ns if at_once else 0)
+
+    def restarted(self) -> str:
+        """Take note that the model begins anew; return the reason."""
+        self.restarts = True
+        self._before_ns, self._restarted_ns = self.until_ns - self.since_ns, self.until_ns
+        return f"{self._in_a_row} failed advances: {self.reason}"
