@@ -17,7 +17,7 @@ def members() -> list[Scene]:
     pairs = [(gx, gy) for gx in (0.020, 0.025, 0.030) for gy in (0.021, 0.028)]
     scenes = [dataclasses.replace(scene, clearance=Clearance(gx, gy)) for gx, gy in pairs]
     soft = dataclasses.replace(scene.contact, stiffness=3e7)
-    return [*scenes, dataclasses.replace(scene, contact=soft), preset("paper")]
+    return [*scenes, dataclasses.replace(scene, contact=soft)]
 
 
 @pytest.mark.parametrize("workers", [1, 3])

@@ -55,8 +55,12 @@ def draw(rng: np.random.Generator) -> Scene:
     mass, width, height = 10 ** rng.uniform(1.0, 3.5), *rng.uniform(0.1, 0.5, 2)
     stiffness = 10 ** rng.uniform(5.5, 10.0)
     damping = 2.0 * np.sqrt(stiffness * mass) * 10 ** rng.uniform(-3.0, 0.0)
-    undamped = rng.random() < 0.3
-    contact = Contact("hertz", stiffness, 1.0) if undamped else Contact("kelvin_voigt", stiffness, 1.0, damping=damping)
+    contact = [
+        Contact("hertz", stiffness, 1.0),
+        Contact("kelvin_voigt", stiffness, 1.0, damping=damping),
+        Contact("hunt_crossley", stiffness, 1.0, damping=10 ** rng.uniform(-1.0, 1.0)),
+        Contact("exact_restitution", stiffness, 1.0, restitution=rng.uniform(0.3, 0.95)),
+    ][rng.choice(4, p=[0.2, 0.4, 0.2, 0.2])]
     force, parallel = 4.0 * 9.81 * mass, rng.random() < 0.5
     directions = [rng.uniform(-1.0, 1.0, 2)] * 3 if parallel else list(rng.uniform(-1.0, 1.0, (3, 2)))
     loads = tuple(

@@ -73,7 +73,7 @@ class LaneRun:
         one, begin = self._compiled[waiting[0]], _time.perf_counter()
         terms = one.parts.terms
         run_lanes(
-            self._members, terms.harmonics, terms.second, terms.viscous, terms.flight, terms.rest,
+            self._members, terms.harmonics, terms.second, terms.viscous, terms.hysteretic, terms.flight, terms.rest,
             int(one.params.order), new_lanes(), work, waiting, self._t_end, self._max_steps, self._size, self._times,
         )  # fmt: skip
         self._size = next_slice(self._size, _time.perf_counter() - begin)

@@ -22,11 +22,11 @@ _MOST_CHANGES = 80
 
 
 @kernel()
-def _write_guards(lanes, order, viscous) -> None:
+def _write_guards(lanes, order, viscous, hysteretic) -> None:
     """Write the guards of all pairs, and to `lanes.todo` a bit for each that is not proved to stay positive.
 
-    off: -d; on: F / K = d + (C / K) d'; clipped: d, and -F / K. A guard g is positive on [0, h] where g_0 and
-    g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that bound is concave.
+    off: -d; on: F / K = d + (C / K) d', or d and 1 + lambda d'; clipped: d, and the force with the other sign. A guard
+    g is positive on [0, h] where g_0 and g_0 + g_1 h - sum over k > 1 of max(-g_k, 0) h^k are: that bound is concave.
     """
     live = 0
     for lane in range(WIDTH):
@@ -34,15 +34,21 @@ def _write_guards(lanes, order, viscous) -> None:
         live |= 1 << lane if lanes.member[lane] >= 0 else 0
     for pair in range(PAIR_COUNT):
         place, rate = (lanes.series[X], lanes.turning[DX]) if pair % 2 == 1 else (lanes.series[Y], lanes.turning[DY])
-        _note(lanes, _first_guard(lanes, pair, place, order) & live & ~lanes.on[pair], pair)
-        if viscous is not None and (lanes.on[pair] | lanes.clipped[pair]) & live != 0:
-            unsafe = _force_guards(lanes, pair, rate, order)
-            _note(lanes, unsafe & lanes.on[pair] & live, pair)
-            if lanes.clipped[pair] & live != 0:
-                lanes.leaves[pair] = _leaves(lanes, pair, order)
-                _note(lanes, _second_guard(lanes, pair, order) & lanes.clipped[pair] & live, SECOND + pair)
-        elif viscous is None:
-            _note(lanes, _unsafe(lanes.guard[pair], order, lanes.step) & lanes.on[pair] & live, pair)
+        unsafe, inside = _first_guard(lanes, pair, place, order) & live, (lanes.on[pair] | lanes.clipped[pair]) & live
+        if viscous is None:
+            _note(lanes, unsafe, pair)
+        else:
+            _note(lanes, unsafe & ~lanes.on[pair], pair)
+        if inside == 0:
+            continue
+        if viscous is not None:
+            _note(lanes, _force_guards(lanes, pair, rate, order) & lanes.on[pair] & live, pair)
+        if (viscous is not None or hysteretic is not None) and lanes.clipped[pair] & live != 0:
+            lanes.leaves[pair] = _leaves(lanes, pair, order)
+        if viscous is not None and lanes.clipped[pair] & live != 0:
+            _note(lanes, _second_guard(lanes, pair, order) & lanes.clipped[pair] & live, SECOND + pair)
+        if hysteretic is not None:
+            _note(lanes, _pull_guard(lanes, pair, rate, order) & inside, SECOND + pair)
 
 
 @kernel(inline="code")
@@ -123,6 +129,27 @@ def _second_guard(lanes, pair, order):
     start = exact_row(guard, 0)
     set_row(guard, 0, choose(below(zero, start), start, zero))
     return _unsafe(guard, order, lanes.step)
+
+
+@kernel()
+def _pull_guard(lanes, pair, rate, order):
+    """Write 1 + lambda d' of pairs that are on, with the other sign of clipped ones; return what `_unsafe` does."""
+    guard, rows, zero = lanes.guard[SECOND + pair], lanes.rows[pair], exact_splat(0.0)
+    sense = choose(lanes.on[pair], exact_splat(1.0), exact_splat(-1.0))
+    factor, cosine, sine = sense * exact_row(lanes.factor, pair), lanes.turning[DC], lanes.turning[DS]
+    a, b, n = exact_row(rows, 0) * factor, exact_row(rows, 1) * factor, exact_row(rows, 2) * factor
+    h, reach, term = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.0)
+    set_row(guard, order, zero)
+    for k in range(order - 1, -1, -1):
+        before = term
+        term = fused(a, exact_row(cosine, k), fused(b, exact_row(sine, k), n * exact_row(rate, k)))
+        set_row(guard, k, term)
+        if k > 1:
+            reach = _reach(reach, term, h)
+    first = term + sense
+    first = choose(below(zero, first), first, zero)
+    set_row(guard, 0, first)
+    return below(fused(before, h, first), reach * h)
 
 
 @kernel()
@@ -253,14 +280,14 @@ def _note_root(lanes, lane, root) -> None:
 
 
 @kernel()
-def first_events(states, lanes, w, order, viscous) -> None:
+def first_events(states, lanes, w, order, viscous, hysteretic) -> None:
     """Let each lane's step end at its first event; note the guard in `lanes.event`, -1 without one."""
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
         set_row(lanes.parted, pair, never)
     for lane in range(WIDTH):
         lanes.event[lane] = -1
-    _write_guards(lanes, order, viscous)
+    _write_guards(lanes, order, viscous, hysteretic)
     while True:
         bits = _next_columns(lanes, order)
         if bits == 0:
@@ -292,6 +319,12 @@ def _next_mode(mode, viscous):
     return CLIPPED if mode == ON and viscous is not None else OFF
 
 
+@kernel(inline="source")
+def _other_mode(mode):
+    """Return the mode that follows when a pair's second guard ends it."""
+    return CLIPPED if mode == ON else ON
+
+
 @kernel()
 def _ends_with(guard, order, at, within):
     """Return a bit for each lane whose guard turns negative no more than `within` after `at`."""
@@ -303,7 +336,7 @@ def _ends_with(guard, order, at, within):
 
 
 @kernel()
-def note_switches(lanes, order, viscous) -> None:
+def note_switches(lanes, order, viscous, hysteretic) -> None:
     """Write the modes that pairs take at the end of the steps to `lanes.switch`, -1 for those that stay.
 
     Events of one instant but for rounding happen together: a symmetric motion stays symmetric.
@@ -319,8 +352,13 @@ def note_switches(lanes, order, viscous) -> None:
         if ending == 0:
             continue
         first, again = _ends_with(lanes.guard[pair], order, at, within) & ending, 0
-        if viscous is not None and lanes.clipped[pair] & ending != 0:
-            again = _ends_with(lanes.guard[SECOND + pair], order, at, within) & lanes.clipped[pair] & ending
+        guarded = 0
+        if hysteretic is not None:
+            guarded = (lanes.on[pair] | lanes.clipped[pair]) & ending
+        elif viscous is not None:
+            guarded = lanes.clipped[pair] & ending
+        if guarded != 0:
+            again = _ends_with(lanes.guard[SECOND + pair], order, at, within) & guarded
         if first | again == 0:
             continue
         for lane in range(WIDTH):
@@ -329,10 +367,12 @@ def note_switches(lanes, order, viscous) -> None:
             if first >> lane & 1:
                 lanes.switch[pair, lane] = _next_mode(lanes.mode[pair, lane], viscous)
             elif again >> lane & 1:
-                lanes.switch[pair, lane] = ON
+                lanes.switch[pair, lane] = _other_mode(lanes.mode[pair, lane])
     for lane in range(WIDTH):
         event = lanes.event[lane]
-        if event >= SECOND:
-            lanes.switch[event % PAIR_COUNT, lane] = ON
+        if event >= AGAIN:
+            lanes.switch[event - AGAIN, lane] = ON
+        elif event >= SECOND:
+            lanes.switch[event - SECOND, lane] = _other_mode(lanes.mode[event - SECOND, lane])
         elif event >= 0:
             lanes.switch[event, lane] = _next_mode(lanes.mode[event, lane], viscous)

@@ -11,7 +11,7 @@ from plow_twin.kernel.arrays import unowned
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import below, exact_row, exact_splat, fused, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.solve.kinematics import pose_of
+from plow_twin.solve.kinematics import pose_of, rate_at
 from plow_twin.solve.lanes.events import first_events, note_switches
 from plow_twin.solve.lanes.record import (
     COMPONENTS,
@@ -159,7 +159,18 @@ def _part(state, sums, lanes, lane) -> None:
 
 
 @kernel()
-def _switch(state, sums, lanes, lane) -> None:
+def _touch(p, lanes, pair, lane) -> None:
+    """Start a contact: read its impact speed, lambda = D / v0 (`modes.touch`)."""
+    if p.damping_number >= 0.0:
+        y = lanes.y
+        rate = rate_at(
+            p, pair, y[COS, lane], y[SIN, lane], y[OMEGA, lane], y[X, lane], y[Y, lane], y[VX, lane], y[VY, lane]
+        )
+        lanes.factor[pair, lane] = p.damping_number / max(rate, p.speed_floor)
+
+
+@kernel()
+def _switch(p, state, sums, lanes, lane, hysteretic) -> None:
     """Let the pairs of a lane change their modes at the step's end."""
     for pair in range(PAIR_COUNT):
         new, old = lanes.switch[pair, lane], lanes.mode[pair, lane]
@@ -169,6 +180,8 @@ def _switch(state, sums, lanes, lane) -> None:
         state.events += 1
         if old == OFF:
             sums.makes[pair] += 1
+            if hysteretic is not None:
+                _touch(p, lanes, pair, lane)
         sums.logged += 1
 
 
@@ -181,7 +194,7 @@ def _end_of(lanes, lane, t_end):
 
 
 @kernel()
-def _complete(p, state, sums, lanes, lane, order, t_end) -> None:
+def _complete(p, state, sums, lanes, lane, order, t_end, hysteretic) -> None:
     """Move a lane to the end of its step: time, counts and modes; its state has been moved."""
     begin, parted = lanes.time[lane], False
     state.steps += 1
@@ -201,7 +214,7 @@ def _complete(p, state, sums, lanes, lane, order, t_end) -> None:
             return
     else:
         state.events_at_once = state.events_at_once + 1 if at_once else 0
-        _switch(state, sums, lanes, lane)
+        _switch(p, state, sums, lanes, lane, hysteretic)
     note_modes(p, lanes, lane)
     lanes.stale[0] = 1
 
@@ -262,7 +275,7 @@ def _unowned_members(members):
 
 @kernel(entry=True)
 def run_lanes(
-    members, waves, second, viscous, flight, rest, order, lanes, w, queue, t_end, budget, iterations, t
+    members, waves, second, viscous, hysteretic, flight, rest, order, lanes, w, queue, t_end, budget, iterations, t
 ) -> bool:
     """Take the members numbered in `queue` to `t_end`, eight at a time; return False where `iterations` are used up.
 
@@ -292,10 +305,10 @@ def run_lanes(
                 _leave(members, lanes, lane, code, t)
         if live == 0:
             return True
-        if lanes.stale[0] == 1:
+        if lanes.stale[0] == 1 and hysteretic is None:
             weigh_lanes(lanes)
             lanes.stale[0] = 0
-        _step(members, waves, second, viscous, order, lanes, w, t_end, t)
+        _step(members, waves, second, viscous, hysteretic, order, lanes, w, t_end, t)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0:
             _leave(members, lanes, lane, _PAUSED, t)
@@ -303,21 +316,21 @@ def run_lanes(
 
 
 @kernel()
-def _step(members, waves, second, viscous, order, lanes, w, t_end, t) -> None:
+def _step(members, waves, second, viscous, hysteretic, order, lanes, w, t_end, t) -> None:
     """Take one step in each lane."""
     if waves is not None:
         expand_loads(members.harmonics, members.extent, second, lanes, w, order)
-    expand(lanes, w, order, waves, second, viscous)
+    expand(lanes, w, order, waves, second, viscous, hysteretic)
     infinite = accurate_steps(members.params, lanes, order)
     if infinite != 0:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _leave(members, lanes, lane, _NON_FINITE, t)
-    first_events(members.states, lanes, w, order, viscous)
+    first_events(members.states, lanes, w, order, viscous, hysteretic)
     _go_past_an_instant(members, lanes)
-    note_switches(lanes, order, viscous)
+    note_switches(lanes, order, viscous, hysteretic)
     sum_step(lanes, w, order)
-    add_step(members.totals, lanes, w, order, viscous)
+    add_step(members.totals, lanes, w, order, viscous, hysteretic)
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and members.first[member] < t.size:
@@ -330,4 +343,7 @@ def _step(members, waves, second, viscous, order, lanes, w, t_end, t) -> None:
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0:
-            _complete(members.params[member], members.states[member], members.totals[member], lanes, lane, order, t_end)
+            _complete(
+                members.params[member], members.states[member], members.totals[member], lanes, lane, order, t_end,
+                hysteretic,
+            )  # fmt: skip

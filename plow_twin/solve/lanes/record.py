@@ -33,6 +33,8 @@ LANES: Final = np.dtype(
         ("turning", "f8", (4, _ROWS, WIDTH)),  # rates of cosine, sine, X, Y
         ("moment", "f8", (4, _ROWS, WIDTH)),  # what cosine, sine, X and Y are multiplied by in the contacts' moment
         ("load", "f8", (3, _ROWS, WIDTH)),  # S1, S2, M
+        ("depth", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # with lambda d': penetration of pairs that are on in some lane
+        ("push", "f8", (PAIR_COUNT, _ROWS, WIDTH)),  # and their F / K
         ("guard", "f8", (2 * PAIR_COUNT, _ROWS, WIDTH)),
         ("column", "f8", (_ROWS, WIDTH)),  # one guard of each lane
         ("bernstein", "f8", (_ROWS, WIDTH)),
@@ -40,6 +42,7 @@ LANES: Final = np.dtype(
         ("arms", "f8", (PAIR_COUNT, 2, WIDTH)),  # arm: factors of cosine and sine
         ("sign", "f8", _PAIRS),  # of the penetration in a pair's first guard, 0 for pairs that cannot touch
         ("ratio", "f8", _PAIRS),  # C / K of pairs that are on
+        ("factor", "f8", _PAIRS),  # lambda
         ("start", "f8", (4, WIDTH)),  # contact forces along X and Y, factors of c and s in the moment, at the start
         ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces: of c, s, X or Y, their rates
         ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment: of c, s, X, Y, their rates
@@ -86,13 +89,13 @@ LANES: Final = np.dtype(
 
 
 #: Terms that the lanes cover: the force is linear in penetration and rate, nothing but harmonics drives the head.
-_COVERED: Final = {"harmonics", "second", "viscous", "flight", "rest"}
+_COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "rest"}
 
 
 def fits_lanes(compiled: CompiledScene) -> bool:
     """Tell whether the lanes take the steps of a scene.
 
-    Its exponent is 1, it has no other term than Kelvin-Voigt damping and harmonics, and the head carries the walls.
+    Its exponent is 1, it has no other term than damping and harmonics, and the head carries the walls.
     """
     parts = compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
@@ -121,7 +124,7 @@ def load_lane(p, state, totals, lanes, lane, member) -> None:
         lanes.rows[pair, 2, lane] = p.penetration_rows[along, pair]
         lanes.rows[pair, 3, lane] = p.penetration_rows[4, pair] - state.wear_depth[pair]
         lanes.arms[pair, 0, lane], lanes.arms[pair, 1, lane] = p.arm_rows[0, pair], p.arm_rows[1, pair]
-        lanes.mode[pair, lane] = state.mode[pair]
+        lanes.mode[pair, lane], lanes.factor[pair, lane] = state.mode[pair], state.damping_factor[pair]
         lanes.peak[pair, lane], lanes.impulse[pair, lane] = totals.peak[pair], totals.impulse[pair]
         lanes.time_in_contact[pair, lane] = totals.time_in_contact[pair]
     for j in range(3):
@@ -144,7 +147,7 @@ def save_lane(state, totals, lanes, lane) -> None:
         state.y[i] = lanes.y[i, lane]
     state.step_start = state.time = lanes.time[lane]
     for pair in range(PAIR_COUNT):
-        state.mode[pair] = lanes.mode[pair, lane]
+        state.mode[pair], state.damping_factor[pair] = lanes.mode[pair, lane], lanes.factor[pair, lane]
         totals.peak[pair], totals.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
         totals.time_in_contact[pair] = lanes.time_in_contact[pair, lane]
     clear_lane(lanes, lane)

@@ -1,7 +1,8 @@
 """Taylor series of eight scenes side by side, contact modes frozen (equations in `method.series`).
 
 Where the contacts' force is linear in penetration and rate, all acting pairs of a scene are one affine map of the
-state: an order takes twelve Cauchy products, however many pairs act and whichever they are.
+state: an order takes twelve Cauchy products, however many pairs act and whichever they are. With lambda d' the force
+K d (1 + lambda d') is K (d + lambda / 2 (d^2)'): half a product more for each pair that acts in some lane.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
 
 
 @kernel()
-def expand(lanes, w, order, waves, second, viscous) -> None:
+def expand(lanes, w, order, waves, second, viscous, hysteretic) -> None:
     """Write the series of the state up to `order`, and those of `lanes.turning` up to the order before."""
     series, turning, moment = lanes.series, lanes.turning, lanes.moment
     zero = exact_splat(0.0)
@@ -117,7 +118,9 @@ def expand(lanes, w, order, waves, second, viscous) -> None:
                 ax = fused(exact_row(direction, 2), wc, fused(exact_row(direction, 3), ws, ax))
                 ay = fused(exact_row(direction, 3), wc, fused(exact_row(direction, 2), ws * -1.0, ay))
             turned_by = turned_by + exact_row(load[2], k)
-        if k == 0:
+        if hysteretic is not None:
+            fx, fy, gc, gs = _push(lanes, w, k, c, s, x, y, dc, ds, dx, dy)
+        elif k == 0:
             _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy)
             fx, fy, gc, gs = (
                 exact_row(lanes.start, 0), exact_row(lanes.start, 1), exact_row(lanes.start, 2),
@@ -198,6 +201,43 @@ def _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy) -> None:
         set_row(lanes.start, axis, fused(exact_row(lanes.rows[pair], 2) * -1.0, force, exact_row(lanes.start, axis)))
         for i in range(2):
             set_row(lanes.start, 2 + i, fused(exact_row(arms, i), force, exact_row(lanes.start, 2 + i)))
+
+
+@kernel(inline="code")
+def _push(lanes, w, k, c, s, x, y, dc, ds, dx, dy):
+    """Return order k of the forces along X and Y and of the factors of cosine and sine in the contacts' moment.
+
+    For F = K d (1 + lambda d'), pair by pair. Writes the penetrations of the next order and F / K.
+    """
+    fx = fy = gc = gs = exact_splat(0.0)
+    for pair in range(PAIR_COUNT):
+        on = lanes.on[pair]
+        if on == 0:
+            continue
+        rows, arms, depth = lanes.rows[pair], lanes.arms[pair], lanes.depth[pair]
+        place, rate = (x, dx) if pair % 2 == 1 else (y, dy)
+        if k == 0:
+            set_row(depth, 0, penetration_at(lanes, pair, c, s, place))
+        closing = fused(exact_row(rows, 0), dc, fused(exact_row(rows, 1), ds, exact_row(rows, 2) * rate))
+        deeper = closing * w.inverse[k + 1]
+        set_row(depth, k + 1, deeper)
+        half = exact_row(depth, 0) * deeper
+        for j in range(1, k // 2 + 1):
+            half = fused(exact_row(depth, j), exact_row(depth, k + 1 - j), half)
+        if k % 2 == 1:
+            middle = exact_row(depth, k // 2 + 1)
+            half = fused(middle * 0.5, middle, half)
+        damped = half * (k + 1.0)
+        push = choose(on, fused(exact_row(lanes.factor, pair), damped, exact_row(depth, k)), exact_splat(0.0))
+        set_row(lanes.push[pair], k, push)
+        force = exact_row(lanes.stiffness, 0) * push
+        along = exact_row(rows, 2) * -1.0
+        if pair % 2 == 1:
+            fx = fused(along, force, fx)
+        else:
+            fy = fused(along, force, fy)
+        gc, gs = fused(exact_row(arms, 0), force, gc), fused(exact_row(arms, 1), force, gs)
+    return fx, fy, gc, gs
 
 
 @kernel(inline="code")

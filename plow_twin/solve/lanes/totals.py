@@ -37,7 +37,7 @@ def sum_step(lanes, w, order) -> None:
 
 
 @kernel()
-def add_step(totals, lanes, w, order, viscous) -> None:
+def add_step(totals, lanes, w, order, viscous, hysteretic) -> None:
     """Add the steps that have been laid out to the totals."""
     h = exact_row(lanes.step, 0)
     for pair in range(PAIR_COUNT):
@@ -50,35 +50,44 @@ def add_step(totals, lanes, w, order, viscous) -> None:
         depth = penetration_at(lanes, pair, exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, which))
         swept = fused(a, exact_row(lanes.sum, 0), fused(b, exact_row(lanes.sum, 1), n * exact_row(lanes.sum, place)))
         impulse = exact_row(lanes.stiffness, 0) * fused(depth, h, swept)
-        if viscous is not None:
+        if viscous is not None or hysteretic is not None:
             way = fused(b, exact_row(lanes.change, SIN), n * exact_row(lanes.change, which))
-            impulse = fused(exact_row(lanes.viscous, 0), fused(a, exact_row(lanes.change, COS), way), impulse)
+            way = fused(a, exact_row(lanes.change, COS), way)
+            if viscous is not None:
+                impulse = fused(exact_row(lanes.viscous, 0), way, impulse)
+            else:
+                # lambda / 2 times what d^2 has changed by
+                damped = exact_row(lanes.factor, pair) * (way * fused(way, exact_splat(0.5), depth))
+                impulse = fused(exact_row(lanes.stiffness, 0), damped, impulse)
         impulse = choose(below(zero, impulse) & on, impulse, zero)
         set_row(lanes.impulse, pair, exact_row(lanes.impulse, pair) + impulse)
         time = exact_row(lanes.time_in_contact, pair)
         set_row(lanes.time_in_contact, pair, choose(on, time + h, time))
-        _raise_peaks(lanes, w, pair, order - 1, on)
+        if hysteretic is not None:
+            _raise_peaks(lanes, w, lanes.push[pair], pair, order - 1, on)
+        else:
+            _raise_peaks(lanes, w, lanes.guard[pair], pair, order - 1, on)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0 and lanes.carrying[lane] != 0:
             add_set_times(totals[lanes.member[lane]], lanes.carrying[lane], lanes.step[lane])
 
 
 @kernel()
-def _raise_peaks(lanes, w, pair, order, on) -> None:
-    """Raise the peaks of a pair, whose guard is F / K: first a bound, the maximum only where that exceeds the peak.
+def _raise_peaks(lanes, w, push, pair, order, on) -> None:
+    """Raise the peaks of a pair by the series of F / K: first a bound, the maximum only where that exceeds the peak.
 
     Between its ends a function exceeds them by h^2 / 8 times its largest curvature downward at most.
     """
-    guard, h, zero, half = lanes.guard[pair], exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
+    h, zero, half = exact_row(lanes.step, 0), exact_splat(0.0), exact_splat(0.5)
     end = fall = bend = zero
     for k in range(order, -1, -1):
-        term = exact_row(guard, k)
+        term = exact_row(push, k)
         fall = fused(fall, h, end)
         end = fused(end, h, term)
         if k > 1:
             downward = (magnitude(term) - term) * half
             bend = fused(downward, exact_splat(0.125 * k * (k - 1)), bend) * h
-    start, stiffness, peak = exact_row(guard, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.peak, pair)
+    start, stiffness, peak = exact_row(push, 0), exact_row(lanes.stiffness, 0), exact_row(lanes.peak, pair)
     most = choose(below(start, end), end, start)
     exceeds = below(peak, stiffness * fused(bend, h, most) * _ROUNDED) & on
     if exceeds == 0:
@@ -86,16 +95,16 @@ def _raise_peaks(lanes, w, pair, order, on) -> None:
     # convex terms count against the curvature, all against the slope
     curve, slope = zero, zero
     for k in range(order, 1, -1):
-        term = exact_row(guard, k)
+        term = exact_row(push, k)
         slope = fused(magnitude(term), exact_splat(1.0 * k), slope) * h
         upward = (magnitude(term) + term) * half if k > 2 else term
         curve = fused(upward, exact_splat(1.0 * k * (k - 1)), curve * h)
-    first = exact_row(guard, 1)
+    first = exact_row(push, 1)
     monotonic, concave = ~below(magnitude(first), slope), below(curve, zero)
     bulges = concave & below(zero, first) & below(fall, zero) & ~monotonic
     inside = bulges & exceeds
     if inside != 0:
-        most = choose(inside, _top(guard, order, h, first, fall, inside), most)
+        most = choose(inside, _top(push, order, h, first, fall, inside), most)
     known = exceeds & (monotonic | concave)
     reached = stiffness * most
     set_row(lanes.peak, pair, choose(known & below(peak, reached), reached, peak))
@@ -104,12 +113,12 @@ def _raise_peaks(lanes, w, pair, order, on) -> None:
             if (exceeds & ~known) >> lane & 1:
                 column, k = w.column[0], lanes.stiffness[lane]
                 for i in range(order + 1):
-                    column[i] = k * guard[i, lane]
+                    column[i] = k * push[i, lane]
                 lanes.peak[pair, lane] = maximum(column, order, lanes.step[lane], lanes.peak[pair, lane], w)
 
 
 @kernel()
-def _top(guard, order, h, rise, fall, bits):
+def _top(push, order, h, rise, fall, bits):
     """Return the maxima of concave polynomials that rise at 0 and fall at h, by Newton's method for the slope."""
     low, high, x = exact_splat(0.0), h, h * (rise / (rise - fall))
     top = exact_splat(0.0)
@@ -118,7 +127,7 @@ def _top(guard, order, h, rise, fall, bits):
         for k in range(order, -1, -1):
             bend = fused(bend, x, slope)
             slope = fused(slope, x, value)
-            value = fused(value, x, exact_row(guard, k))
+            value = fused(value, x, exact_row(push, k))
         # a chord's slope bounds what is left: once the change is small, its square does not count
         change = slope / (bend * -2.0)
         rises = below(exact_splat(0.0), slope)
