@@ -239,14 +239,17 @@ class Settings:
         0.0, "m/s^2", 0.0, 1e300, Effect.NOW, "largest plausible rate of that speed; 0: limit_travel in a millisecond"
     )
     limit_pose: float = _number(
-        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest plausible measured displacement; 0: half the frame's larger side"
+        0.0,
+        "m",
+        0.0,
+        1000.0,
+        Effect.NOW,
+        "largest plausible measured displacement; 0: half the larger side of the frame or clearance",
     )
     limit_pose_rate: float = _number(
         0.0, "m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a displacement; 0: limit_pose in a millisecond"
     )
-    limit_gap: float = _number(
-        0.0, "m", 0.0, 1000.0, Effect.NOW, "largest plausible measured gap; 0: half the frame's larger side"
-    )
+    limit_gap: float = _number(0.0, "m", 0.0, 1000.0, Effect.NOW, "largest plausible measured gap; 0: as limit_pose")
     limit_gap_rate: float = _number(
         0.0, "m/s", 0.0, 1e300, Effect.NOW, "largest plausible rate of a gap; 0: limit_gap in a millisecond"
     )

@@ -15,6 +15,7 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
+from plow_twin.stream.limits import largest_displacement
 
 Array = NDArray[np.float64]
 
@@ -131,14 +132,15 @@ def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
 
 def _pose(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
     doubts = []
-    half = 0.5 * max(scene.frame.width_m, scene.frame.height_m)
+    most = largest_displacement(scene)
     for (role, name), largest in magnitudes.items():
         if role == "head_pose" and name == "theta":
-            if _LARGEST_ANGLE_RAD < largest < np.degrees(_LARGEST_ANGLE_RAD):
+            tumbles = scene.head.carries == "corners"
+            if not tumbles and _LARGEST_ANGLE_RAD < largest < np.degrees(_LARGEST_ANGLE_RAD):
                 expected = f"less than {_LARGEST_ANGLE_RAD:.3g} rad"
                 doubts.append(UnitDoubt(role, (name,), f"{largest:.3g}", expected, "deg", True))
-        elif role in ("head_pose", "gaps") and half < largest < 1e3 * half:
-            expected = f"less than half the frame, {half:.3g} m"
+        elif role in ("head_pose", "gaps") and most < largest < 1e3 * most:
+            expected = f"less than half the frame or the clearance, {most:.3g} m"
             doubts.append(UnitDoubt(role, (name,), f"{largest:.3g}", expected, "mm", True))
     return doubts
 

@@ -45,12 +45,19 @@ class Limits:
 def pose_limits(scene: Scene, displacement: float = 0.0, rate: float = 0.0) -> Limits:
     """Return the limits of x, y [m] and theta [rad] of a measured pose and of their rates; 0: derived from the scene.
 
-    Derived are half the larger side of the frame, which no head in it reaches, and that much within a millisecond; an
-    angle may be half a turn, and change as fast.
+    Derived are `largest_displacement`, and that much within a millisecond; an angle may be half a turn, that of a block
+    any, and change by half a turn as fast.
     """
-    displacement = displacement or 0.5 * max(scene.frame.width_m, scene.frame.height_m)
+    displacement = displacement or largest_displacement(scene)
     rate = rate or displacement / _SHORTEST_S
-    return Limits((displacement, displacement, math.pi), (rate, rate, math.pi / _SHORTEST_S))
+    angle = math.inf if scene.head.carries == "corners" else math.pi
+    return Limits((displacement, displacement, angle), (rate, rate, math.pi / _SHORTEST_S))
+
+
+def largest_displacement(scene: Scene) -> float:
+    """Return a displacement in m that no head reaches: half the larger side of the frame, or of a clearance."""
+    frame, clearance = scene.frame, scene.clearance
+    return 0.5 * max(frame.width_m, frame.height_m, clearance.horizontal_m, clearance.vertical_m)
 
 
 def value_limits(largest: float, rate: float = 0.0) -> Limits:
