@@ -2,6 +2,8 @@
 
     python benchmark/measured.py            fits, errors, coverage: benchmark/results/measured.json
     python benchmark/measured.py --only square
+    python benchmark/measured.py --only fit      the square fitted to either half of its drops, errors on the other
+    python benchmark/measured.py --only table    height of the table by the estimate of each drop
     python benchmark/measured.py --plot     pictures of it in docs/images
 
 Parameters are fitted to one half of the data at a time, errors are those on the other half.
@@ -19,10 +21,13 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.model.contact_laws import LAWS
+from plow_twin.scene_file import load_scene
 from plow_twin.study.measured.drops import Drops
 from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, EllipseContact, contact_arms, impact
-from plow_twin.study.measured.square import SCATTER, SQUARE, ensemble, fit_flight, toss
+from plow_twin.study.measured.square import MARKER, RATE_HZ, SCATTER, SQUARE, Marker, ensemble, fit_flight, toss
 
 FOLDER = Path(__file__).resolve().parent
 DATA = FOLDER / "data" / "measured"
@@ -206,20 +211,100 @@ def sharp() -> np.ndarray:
     return block
 
 
+#: Numbers of the block that are fitted with the marker; the stiffness and gravity are not.
+FITTED = (
+    "half", "radius", "gyration", "table", "restitution", "restitution_fall", "friction", "friction_fall", "mass_power",
+    "tangential", "tangential_damping", "drag", "spin_drag",
+)  # fmt: skip
+
+
+class Square:
+    """The measured drops and what a block with a marker makes of them."""
+
+    def __init__(self, drops: Drops) -> None:
+        self.drops, self.usable = drops, np.array(drops.usable())
+        self.first = drops.flight_rows[self.usable] - 1
+        self.flights = np.array([fit_flight(drops.pose[i, : drops.flight_rows[i]]).state for i in self.usable])
+
+    def errors(self, block: np.ndarray, marker: Marker, chosen: np.ndarray, bounces: int) -> np.ndarray:
+        """Return mean distance in m and angle in rad over so many bounces, shape (k, 2), of drops that have them."""
+        enough = [n for n in chosen if len(self.drops.bounces[self.usable[n]]) > bounces]
+        last = [self.drops.bounces[self.usable[n]][bounces] for n in enough]
+        rows = max(np.array(last) - self.first[enough]) + 1
+        states = marker.state_of_block(self.flights[enough])
+        tossed = marker.measured(toss(states, rows, np.full(len(enough), block, block.dtype))[:, :, :3])
+        found = []
+        for n, end, motion in zip(enough, last, tossed, strict=True):
+            off = motion[: end - self.first[n]] - self.drops.pose[self.usable[n], self.first[n] : end]
+            found.append((np.hypot(off[:, 0], off[:, 1]).mean(), np.abs(off[:, 2]).mean()))
+        return np.array(found)
+
+    def fit(self, chosen: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, Marker]:
+        """Fit block and marker to the chosen drops: bounded distances over one bounce, and less those over two."""
+
+        def numbers(x: np.ndarray) -> tuple[np.ndarray, Marker]:
+            block = SQUARE.copy()
+            for name, value in zip(FITTED, x[3:], strict=True):
+                block[name] = value
+            return block, Marker(float(x[0]), (float(x[1]), float(x[2])))
+
+        def cost(x: np.ndarray) -> float:
+            block, marker = numbers(x)
+            if min(block[name] for name in FITTED if name != "table") <= 0.0:
+                return 9.0
+            (one, angle), (two, _) = (self.errors(block, marker, chosen, bounces).T for bounces in (1, 2))
+            distance = sum(share * (d / (1.0 + d / 0.02)).mean() for share, d in ((1.0, one), (0.3, two)))
+            return float(1e3 * distance + 0.3 * np.minimum(angle, 1.0).mean())
+
+        # angle and heights at rest give the marker to begin with
+        x = np.array([-0.0335, 3.4e-4, 5.2e-4, *(float(SQUARE[name]) for name in FITTED)])
+        step = np.array([0.005, 3e-4, 3e-4, *(0.12 * abs(float(SQUARE[name])) + 1e-4 for name in FITTED)])
+        for turn in range(rounds):
+            options = dict(maxfev=900, adaptive=True, initial_simplex=np.vstack([x, x + np.diag(step / (1 + turn))]))
+            x = minimize(cost, x, method="Nelder-Mead", options=options).x
+        return numbers(x)
+
+    def held_out(self) -> dict[str, Any]:
+        """Fit to either half and return the errors on the other one over 1, 2, 3 bounces."""
+        half = np.random.default_rng(1).permutation(len(self.usable)) % 2
+        far: list[list[np.ndarray]] = [[], [], []]
+        fitted = []
+        for one in (0, 1):
+            block, marker = self.fit(np.flatnonzero(half != one))
+            for bounces in (1, 2, 3):
+                far[bounces - 1].append(self.errors(block, marker, np.flatnonzero(half == one), bounces))
+            numbers = {name: round(float(block[name]), 6) for name in FITTED}
+            fitted.append({**numbers, "turn": round(marker.turn, 4), "lever": np.round(marker.lever, 6).tolist()})
+        every = [np.concatenate(one) for one in far]
+        return {
+            "drops": [len(one) for one in every],
+            "distance_mm": [round(1e3 * float(np.median(one[:, 0])), 1) for one in every],
+            "angle_rad": [round(float(np.median(one[:, 1])), 2) for one in every],
+            "fitted": fitted,
+        }
+
+
 def of_drops(drops: Drops) -> dict[str, Any]:
     """Return distances over 1, 2, 3 bounces, coverage by bounce and score of the bands, for both blocks."""
     found: dict[str, Any] = {}
-    for name, block in {"rounded corners, what falls": SQUARE, "sharp corners, nothing falls": sharp()}.items():
+    kinds = {
+        "rounded corners, what falls, marker": (SQUARE, MARKER),
+        "sharp corners, nothing falls": (sharp(), Marker()),
+    }
+    for name, (block, marker) in kinds.items():
         far: list[list[tuple[float, float]]] = [[], [], []]
         inside: list[list[np.ndarray]] = [[], [], []]
         scores = []
         for index in drops.usable():
             pose, given, lows = drops.pose[index], int(drops.flight_rows[index]), drops.bounces[index]
             flight = fit_flight(pose[:given], block)
-            rows = toss(flight.state[None], len(pose), np.array([block], block.dtype))[0]
+            begin = marker.state_of_block(flight.state[None])
+            rows = marker.measured(toss(begin, len(pose), np.array([block], block.dtype)))[0]
             start = given - 1
             until = drops.until(index, 2) + 1
-            members = ensemble(pose[:given], until, members=200, seed=index, block=block, scatter=SCATTER)
+            members = ensemble(
+                pose[:given], until, members=200, seed=index, block=block, scatter=SCATTER, marker=marker
+            )
             low, high = np.quantile(members, [0.05, 0.95], axis=0)
             holds = (pose[:until] >= low) & (pose[:until] <= high)
             scores.append(crps(members[:, given:], pose[given:until]).mean(axis=0))
@@ -242,6 +327,32 @@ def of_drops(drops: Drops) -> dict[str, Any]:
         }
         print(name, found[name], flush=True)
     return found
+
+
+def of_table(drops: Drops) -> dict[str, Any]:
+    """Return how the estimate finds the table of each drop, whose height the prior knows to 5 mm."""
+    square, rng = load_scene("measured_square"), np.random.default_rng(1)
+    marks = dict(square.marks)
+    marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=0.01)
+    true, t = square.clearance.vertical_m, np.arange(drops.pose.shape[1]) / RATE_HZ
+    nothing = Load(t[[0, -1]], np.zeros((2, 3)))
+    known = []
+    for pose in drops.pose:
+        clearance = replace(square.clearance, vertical_m=true + 0.01 * rng.standard_normal())
+        found = estimate(replace(square, clearance=clearance, marks=marks), nothing, Poses(t, pose - [0.0, 1.0, 0.0]))
+        if found.vertical_state.known:
+            known.append((found.vertical.mean, found.vertical.p05, found.vertical.p95))
+    mean, low, high = np.array(known).T
+    off = 0.5 * np.abs(mean - true)
+    return {
+        "drops": len(drops.pose),
+        "estimated": len(known),
+        "median_mm": round(1e3 * float(np.median(off)), 2),
+        "rms_mm": round(1e3 * float(np.sqrt((off**2).mean())), 2),
+        "within_half_mm": round(float((off < 5e-4).mean()), 2),
+        "coverage": round(float(((low < true) & (true < high)).mean()), 2),
+        "half_width_mm": round(0.25e3 * float(np.median(high - low)), 2),
+    }
 
 
 def plot(results: dict[str, Any], drops: Drops) -> None:
@@ -290,16 +401,24 @@ def plot(results: dict[str, Any], drops: Drops) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plot", action="store_true", help="draw the stored results")
-    parser.add_argument("--only", choices=("square", "ellipse"), help="compute one part, keep the other")
+    parser.add_argument(
+        "--only", choices=("square", "ellipse", "fit", "table"), help="compute one part, keep the other"
+    )
     chosen = parser.parse_args()
     drops = Drops.load(DATA / "square_drops.npz")
     results = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else {}
     if chosen.plot:
         plot(results, drops)
         return
-    if chosen.only != "ellipse":
+    if chosen.only in (None, "square"):
         results["square"] = of_drops(drops)
-    if chosen.only != "square":
+    if chosen.only in (None, "fit"):
+        results["square_held_out"] = Square(drops).held_out()
+        print(results["square_held_out"], flush=True)
+    if chosen.only in (None, "table"):
+        results["table"] = of_table(drops)
+        print(results["table"], flush=True)
+    if chosen.only in (None, "ellipse"):
         results["ellipse"] = by_law(Impacts())
     RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
