@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.block import estimate_block
 from plow_twin.estimate.bouncing import FITTED, SURE, Bounced, bias_of_hard, bounces, compare
 from plow_twin.estimate.discrepancy import Graded, graded, variants
 from plow_twin.estimate.fit import MOST_LEFT, Fit, Problem
@@ -155,6 +156,10 @@ def estimate_window(
 
     Where the fit from `guess` does not hold, all is searched as without one.
     """
+    if scene.head.carries == "corners":
+        span = (float(load.t[0]), float(load.t[-1]))
+        poses = poses.between(span[0], span[1] + 1e-9)
+        return estimate_block(scene, load, poses, prior_of(Unknowns(scene), span, lost)), ()
     units = Units.of(scene, load)
     if units == Units():
         return _estimate(scene, load, poses, lost, guess, gaps, forces)
@@ -509,7 +514,9 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
 
 
 def warm_up(scene: Scene) -> None:
-    """Compile the kernels that a scene needs, or load them from the cache on disk."""
+    """Compile the kernels that a scene needs, or load them from the cache on disk; a block needs none."""
+    if scene.head.carries == "corners":
+        return
     load = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
     other = with_other_law(Unknowns(scene))
     for one in (scene, *variants(scene), *(() if other is None else (other.scene,))):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 #: The machine of the paper: half of the frame's diagonal [m], mass [kg], period of the load [s].
-_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
+PAPER_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
 #: Factors in length, mass and time by which a machine may differ and be estimated in SI units.
 _ALIKE: Final = (2.5, 6.0, 4.0)
 
@@ -40,7 +40,7 @@ class Units:
     def of(scene: Scene, load: Load) -> Units:
         """Return units in which a machine is of the paper's size; SI units where it nearly is."""
         period = load.oscillation() or _PERIOD
-        sizes = geometry.half_diagonal(scene) / _LENGTH, scene.head.mass_kg / _MASS, period / _PERIOD
+        sizes = geometry.half_diagonal(scene) / PAPER_LENGTH, scene.head.mass_kg / _MASS, period / _PERIOD
         if scene.support is not None or all(
             1.0 / most <= size <= most for size, most in zip(sizes, _ALIKE, strict=True)
         ):

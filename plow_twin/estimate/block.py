@@ -1,0 +1,343 @@
+"""Clearances around a block (`carries: corners`) from its impacts: where two flights meet, a corner meets its wall.
+
+Between impacts the block flies: under load and gravity alone, up to drag and errors of the load. The flights before and
+after an impact are extrapolated to the time at which they are nearest to each other. The corner that is deepest then,
+toward the wall that pushed, is at the wall, deeper by its penetration. The places of all impacts are linear in the
+clearances and in the sensor's bias and lever arm. These are estimated together. The errors of the impacts have a
+Student-t distribution of unknown scale, so the intervals follow from the impacts' scatter.
+
+Reference: Lange, Little and Taylor, J. Am. Stat. Assoc. 84 (1989) 881 (Student-t errors by reweighting).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.discrepancy import UNSTATED
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.priors import deviation_of
+from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.estimate.similar import PAPER_LENGTH
+from plow_twin.estimate.start import noise_level
+from plow_twin.estimate.unknowns import BIAS, GX, GY, QUANTITIES
+from plow_twin.model import geometry
+from plow_twin.model.scene import Scene
+from plow_twin.solve.compiled_scene import inertias
+
+Array = NDArray[np.float64]
+
+#: Walls by name: the axis that they bound, and their outward normal.
+WALLS: Final = {
+    "right": (GX, np.array([1.0, 0.0])),
+    "left": (GX, np.array([-1.0, 0.0])),
+    "top": (GY, np.array([0.0, 1.0])),
+    "bottom": (GY, np.array([0.0, -1.0])),
+}
+#: Acceleration beside that of the free flight, in standard deviations, from which on a row is in no flight: one row in
+#: half a million by noise alone.
+_KINK: Final = 5.0
+#: Least and most rows of a flight that are fitted: one more than a parabola has numbers, and few enough for one.
+_FLIGHT_ROWS: Final = (4, 9)
+#: Standard deviation of an unknown acceleration in flight (drag, errors of the load), as a share of gravity on earth.
+_UNKNOWN_SHARE, _STANDARD_GRAVITY = 0.1, 9.81
+#: Flights meet at most so far outside of the rows between which they end, in rows.
+_BEYOND: Final = 0.25
+#: Degrees of freedom of the Student-t likelihood: robust against two impacts taken for one.
+_FREEDOM: Final = 4.0
+#: Scales of it that are tried, and rounds of reweighting for each.
+_SCALES, _ROUNDS = 40, 30
+#: Deviations of the prior from which on an impact is not on the wall: the block hit something else.
+_ELSEWHERE: Final = 5.0
+#: Largest deviation of an estimated clearance, as a share of the prior's.
+_OBSERVED_SHARE: Final = 0.5
+#: Places in the vector of the linear problem: clearances, bias of x, y and theta, lever arm.
+_CLEARANCES, _BIAS, _LEVER, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7
+
+
+@dataclass(frozen=True, eq=False)
+class Impact:
+    """One impact of a corner.
+
+    Attributes
+    ----------
+    t : float
+        Time in s.
+    wall : str
+        A name of `WALLS`.
+    distance : float
+        Distance of the wall from the middle of the guide in m.
+    restitution : float
+        Normal speed of the corner after the impact over that before.
+    turned : ndarray, shape (2,)
+        The wall's normal in the block's axes.
+    arm : float
+        Lever arm of the normal force about the centre of mass in m.
+    """
+
+    t: float
+    wall: str
+    distance: float
+    restitution: float
+    turned: Array
+    arm: float
+
+
+def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> Estimate:
+    """Estimate the clearances around a block from the places of its impacts.
+
+    Where an axis has impacts on one wall only, the poses are taken to be measured from its middle. A clearance that is
+    not known better than half the prior's deviation is not observable.
+
+    Parameters
+    ----------
+    scene : Scene
+        A scene with `carries: corners`.
+    load : Load
+        The load believed.
+    poses : Poses
+        The measured poses, in the axes of the guide.
+    known : Estimate
+        The prior.
+    """
+    whole = np.isfinite(poses.q).all(axis=1)
+    poses = Poses(poses.t[whole], poses.q[whole], poses.deviation)
+    level = noise_level(poses.q)
+    unseen = State.NOT_OBSERVABLE
+    if len(poses.t) < 2 * _FLIGHT_ROWS[0] or not level.all():
+        why = f"poses: got {len(poses.t)} whole ones, noise {level.tolist()}, expected {2 * _FLIGHT_ROWS[0]} and noise"
+        return replace(known, horizontal_state=unseen, vertical_state=unseen, reasons=(why,))
+    met, reasons = _on_walls(scene, impacts(scene, load, poses, level), known)
+    value, deviation = _solve(scene, met, known, level)
+    clearances, states = [], []
+    for axis, (name, before) in enumerate((("horizontal", known.horizontal), ("vertical", known.vertical))):
+        count = {wall: sum(one.wall == wall for one in met) for wall, (its, _) in WALLS.items() if its == axis}
+        share = float(deviation[axis]) / max(before.deviation, 1e-300)
+        observed = share < _OBSERVED_SHARE
+        clearances.append(Interval.normal(value[axis], deviation[axis]).above(0.0) if observed else before)
+        states.append(State.ESTIMATED if observed else unseen)
+        counts = ", ".join(f"{number} impacts on the {wall} wall" for wall, number in count.items())
+        if not observed:
+            reasons.append(f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most 50%")
+        elif not all(count.values()):
+            reasons.append(f"{name}: {counts}: the poses are taken to be measured from the middle")
+    bias = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
+    restitution = {"restitution": float(np.median([one.restitution for one in met]))} if met else {}
+    return replace(
+        known,
+        horizontal=clearances[0],
+        vertical=clearances[1],
+        horizontal_state=states[0],
+        vertical_state=states[1],
+        bias_x=bias[0],
+        bias_y=bias[1],
+        bias_theta=bias[2],
+        noise=(float(level[0]), float(level[1]), float(level[2])),
+        reasons=tuple(reasons),
+        figures={"impacts": float(len(met)), **restitution},
+    )
+
+
+def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[Impact], list[str]]:
+    """Return the impacts that are where a wall can be, and a reason for each wall that lacks some."""
+    met: list[Impact] = []
+    reasons = []
+    for wall, (axis, _) in WALLS.items():
+        clearance = (known.horizontal, known.vertical)[axis]
+        expected = 0.5 * ((scene.frame.width_m, scene.frame.height_m)[axis] + clearance.mean)
+        most = 0.5 * _ELSEWHERE * clearance.deviation
+        own = [one for one in every if one.wall == wall]
+        near = [one for one in own if abs(one.distance - expected) < most]
+        if len(near) < len(own):
+            far = max((one.distance for one in own), key=lambda distance: abs(distance - expected))
+            reasons.append(
+                f"{wall} wall: {len(own) - len(near)} impacts left out, got one at {far:.4g} m from the middle, "
+                f"expected {expected:.4g} m within {most:.2g} m"
+            )
+        met += near
+    return met, reasons
+
+
+def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tuple[Array, Array]:
+    """Return means and standard deviations of the vector of the linear problem, shape (7,) each."""
+    mean = np.zeros(_SIZE)
+    mean[_CLEARANCES] = known.horizontal.mean, known.vertical.mean
+    prior = np.zeros(_SIZE)
+    prior[_CLEARANCES] = known.horizontal.deviation, known.vertical.deviation
+    prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
+    # stated for a machine of the paper's size
+    prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
+    for axis in (GX, GY):
+        if len({one.wall for one in met if WALLS[one.wall][0] == axis}) < 2:
+            prior[_BIAS][axis] = 0.0
+    if not met:
+        return mean, prior
+    design, off = np.zeros((len(met), _SIZE)), np.zeros(len(met))
+    sides = np.array([scene.frame.width_m, scene.frame.height_m])
+    for row, one in enumerate(met):
+        axis, normal = WALLS[one.wall]
+        off[row] = one.distance - 0.5 * (sides[axis] + mean[axis])
+        design[row, axis] = 0.5
+        design[row, _BIAS] = *normal, one.arm
+        design[row, _LEVER] = one.turned
+    # a number held at zero takes no part
+    free = prior > 0.0
+    # corners are not points: each impact is off by how well the frame is known, at least
+    least = max(float(level[:2].max()), *(deviation_of(scene, f"frame.{side}") for side in ("width_m", "height_m")))
+    scales = np.geomspace(least, max(float(prior[_CLEARANCES].max()), 2.0 * least), _SCALES)
+    step, spread = np.zeros(_SIZE), np.zeros(_SIZE)
+    step[free], spread[free] = _student(design[:, free], off, prior[free], scales)
+    return mean + step, spread
+
+
+def _student(design: Array, off: Array, prior: Array, scales: Array) -> tuple[Array, Array]:
+    """Return mean and deviations of x in off = design x + errors, x normal with deviations `prior`, errors Student-t.
+
+    The scale is log-uniform over `scales`: for each one the mode by reweighting, its covariance, and its evidence by
+    Laplace's approximation.
+    """
+    modes, variances, log = [], [], []
+    precision = np.diag(prior**-2.0)
+    for scale in scales:
+        x = np.zeros(len(prior))
+        for _ in range(_ROUNDS):
+            weight = (_FREEDOM + 1.0) / (_FREEDOM * scale**2 + (off - design @ x) ** 2)
+            covariance = np.linalg.inv(design.T @ (weight[:, None] * design) + precision)
+            x = covariance @ (design.T @ (weight * off))
+        left = (off - design @ x) / scale
+        fits = -0.5 * (_FREEDOM + 1.0) * float(np.log1p(left**2 / _FREEDOM).sum()) - len(off) * math.log(scale)
+        log.append(fits - 0.5 * ((x / prior) ** 2).sum() + 0.5 * float(np.linalg.slogdet(covariance)[1]))
+        modes.append(x)
+        variances.append(np.diag(covariance))
+    share = np.exp(np.array(log) - max(log))
+    share /= share.sum()
+    mean = share @ np.array(modes)
+    variance = share @ (np.array(variances) + (np.array(modes) - mean) ** 2)
+    return mean, np.sqrt(variance)
+
+
+def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> list[Impact]:
+    """Return the impacts between flights that are long enough to be fitted.
+
+    Parameters
+    ----------
+    scene, load : Scene, Load
+        The block, and the load believed.
+    poses : Poses
+        Whole poses.
+    level : ndarray, shape (3,)
+        Noise of a row in m, m, rad.
+    """
+    t, q = poses.t, _of_mass(scene, poses.q)
+    inertia = np.asarray(inertias(scene))
+    free = _free_acceleration(scene, load, t) / inertia
+    unknown = _UNKNOWN_SHARE * _STANDARD_GRAVITY * np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
+    ends = _kinks(t, q, free, level, unknown)
+    found = []
+    for index, (first, last) in enumerate(ends):
+        begin = ends[index - 1][1] if index else 0
+        end = ends[index + 1][0] if index + 1 < len(ends) else len(t) - 1
+        before = np.arange(max(begin, first + 1 - _FLIGHT_ROWS[1]), first + 1)
+        after = np.arange(last, min(end, last - 1 + _FLIGHT_ROWS[1]) + 1)
+        if last - first > 1 or min(len(before), len(after)) < _FLIGHT_ROWS[0]:
+            continue
+        middle = 0.5 * (t[first] + t[last])
+        flights = [
+            _flight(t[rows] - middle, q[rows], free[rows].mean(axis=0), level, unknown) for rows in (before, after)
+        ]
+        room = 0.5 * (t[last] - t[first]) + _BEYOND * float(np.median(np.diff(t)))
+        met = _meeting(scene, inertia, flights, room)
+        if met is not None:
+            found.append(replace(met, t=met.t + middle))
+    return found
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return first and last place of each run of true flags."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
+    return [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
+
+
+def _of_mass(scene: Scene, q: Array) -> Array:
+    """Return poses (n, 3) of the centre of mass."""
+    x, y = scene.head.com_offset_m
+    c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
+    theta = np.unwrap(q[:, 2])
+    return np.stack([q[:, 0] + c * x - s * y, q[:, 1] + s * x + c * y, theta], axis=1)
+
+
+def _free_acceleration(scene: Scene, load: Load, t: Array) -> Array:
+    """Return the load with the weight at some times, shape (n, 3), in N, N, N m."""
+    wrench = np.stack([np.interp(t, load.t, column) for column in load.wrench.T], axis=1)
+    weight = scene.head.mass_kg * scene.gravity.acceleration_m_s2
+    return wrench - weight * np.array([0.0, 1.0, scene.gravity.arm_m])
+
+
+def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> list[tuple[int, int]]:
+    """Return first and last row of each stretch of rows whose acceleration is not that of a free flight."""
+    one, two = np.diff(t)[:-1, None], np.diff(t)[1:, None]
+    way = np.diff(q, axis=0)
+    acceleration = 2.0 * (way[1:] / two - way[:-1] / one) / (one + two)
+    noise = 2.0 * level * np.sqrt(one**-2 + two**-2 + (1.0 / one + 1.0 / two) ** 2) / (one + two)
+    off: NDArray[np.bool_] = np.abs(acceleration - free[1:-1]) > _KINK * np.hypot(noise, unknown)
+    return [(first + 1, last + 1) for first, last in _runs(np.asarray(off.any(axis=1)))]
+
+
+def _flight(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> Array:
+    """Return the coefficients of a flight's parabolas, shape (3, 3): by component, then by power of t."""
+    basis = np.vander(t, 3, increasing=True)
+    out = np.zeros((3, 3))
+    for j in range(3):
+        # the acceleration is known up to its deviation
+        rows = np.vstack([basis / level[j], [0.0, 0.0, 2.0 / unknown[j]]])
+        out[j] = np.linalg.lstsq(rows, np.append(q[:, j] / level[j], free[j] / unknown[j]), rcond=None)[0]
+    return out
+
+
+def _meeting(scene: Scene, inertia: Array, flights: list[Array], room: float) -> Impact | None:
+    """Return the impact between two flights; None where they do not meet within `room` s, or no corner is pushed."""
+    apart = flights[1] - flights[0]
+    change = apart[:, 1]
+    t = -float((inertia * apart[:, 0] * change).sum() / (inertia * change * change).sum())
+    if abs(t) > room:
+        return None
+    power, rate = np.array([1.0, t, t * t]), np.array([0.0, 1.0, 2.0 * t])
+    q = 0.5 * (flights[0] + flights[1]) @ power
+    v = np.stack([flight @ rate for flight in flights])
+    impulse = (inertia * (v[1] - v[0]))[:2]
+    wall, (_, normal) = max(WALLS.items(), key=lambda item: -float(item[1][1] @ impulse))
+    c, s = math.cos(q[2]), math.sin(q[2])
+    corners = np.array([[c, -s], [s, c]]) @ _corners(scene)
+    deepest = int(np.argmax(normal @ corners))
+    corner = corners[:, deepest]
+    arm = float(corner[0] * normal[1] - corner[1] * normal[0])
+    rates = v[:, :2] @ normal + arm * v[:, 2]
+    before, after = float(rates[0]), -float(rates[1])
+    if before <= 0.0 or after < 0.0:
+        return None
+    mass = 1.0 / (1.0 / inertia[0] + arm**2 / inertia[2])
+    distance = float(normal @ (q[:2] + corner)) - _deeper(scene, mass, before, after)
+    turned = np.array([c * normal[0] + s * normal[1], -s * normal[0] + c * normal[1]])
+    return Impact(t, wall, distance, after / before, turned, arm)
+
+
+def _corners(scene: Scene) -> Array:
+    """Return the corners from the centre of mass in the block's axes, shape (2, 4)."""
+    corners = np.stack(geometry.corner_positions(scene))[:, ::2]
+    found: Array = corners - np.array(scene.head.com_offset_m)[:, None]
+    return found
+
+
+def _deeper(scene: Scene, mass: float, before: float, after: float) -> float:
+    """Return how much deeper than the wall two flights meet that a compliant contact joins, in m.
+
+    Straight lines with the normal speeds v and e v before and after meet at v e T / (1 + e). The contact lasts
+    T = pi u / v with the largest penetration u (exact for a spring).
+    """
+    exponent = scene.contact.exponent
+    largest = ((exponent + 1.0) * mass * before**2 / (2.0 * scene.contact.stiffness)) ** (1.0 / (exponent + 1.0))
+    return float(math.pi * largest * after / (before + after))

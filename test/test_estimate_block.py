@@ -1,0 +1,129 @@
+"""Clearances around a block from its impacts: measured drops, and a simulated block between four walls."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import plow_twin as run_command
+
+from plow_twin import Clearance, Contact, Frame, Head, Initial, Scene, dump_scene, load_scene, simulate
+from plow_twin.estimate.estimate import estimate
+from plow_twin.estimate.measurements import Load, Poses
+from plow_twin.estimate.result import Estimate, State
+from plow_twin.model.scene import Harmonic
+from plow_twin.study.measured.drops import Drops
+
+DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
+SQUARE = load_scene("measured_square")
+#: The prior of the clearance is that of a table whose height is known to 5 mm.
+DEVIATION = 0.01
+
+
+@pytest.fixture(scope="module")
+def drops() -> Drops:
+    return Drops.load(DATA)
+
+
+def unknown_table(off: float) -> Scene:
+    """Return the square's scene with its table `off` metres lower."""
+    marks = dict(SQUARE.marks)
+    marks["clearance.vertical_m"] = replace(marks["clearance.vertical_m"], deviation=DEVIATION)
+    clearance = Clearance(SQUARE.clearance.horizontal_m, SQUARE.clearance.vertical_m + 2.0 * off)
+    return replace(SQUARE, clearance=clearance, marks=marks)
+
+
+def of_drop(drops: Drops, index: int, off: float = 0.0) -> Estimate:
+    pose = drops.pose[index] - [0.0, 1.0, 0.0]
+    t = np.arange(len(pose)) / 250.0
+    return estimate(unknown_table(off), Load(t[[0, -1]], np.zeros((2, 3))), Poses(t, pose))
+
+
+def test_height_of_the_table_follows_from_measured_drops(drops) -> None:
+    rng = np.random.default_rng(4)
+    found = [of_drop(drops, index, 0.005 * rng.standard_normal()) for index in range(0, 250, 4)]
+    known = [one for one in found if one.vertical_state is State.ESTIMATED]
+    assert len(known) > 0.9 * len(found)
+    true = SQUARE.clearance.vertical_m
+    # the height is half of the clearance
+    off = 0.5 * np.array([one.vertical.mean - true for one in known])
+    assert np.median(np.abs(off)) < 5e-4
+    inside = np.mean([one.vertical.p05 < true < one.vertical.p95 for one in known])
+    assert 0.8 < inside < 0.99
+
+
+def test_walls_that_are_never_met_are_not_observable(drops) -> None:
+    found = of_drop(drops, 0)
+    assert found.horizontal_state is State.NOT_OBSERVABLE
+    assert found.horizontal.mean == SQUARE.clearance.horizontal_m
+    assert any("0 impacts on the right wall" in reason for reason in found.reasons)
+
+
+def test_impact_on_something_else_is_left_out_and_named(drops) -> None:
+    # the block hits an obstacle 0.7 m from the origin
+    found = of_drop(drops, 10)
+    assert found.horizontal_state is State.NOT_OBSERVABLE
+    assert any(reason.startswith("left wall: 1 impacts left out, got one at 0.69") for reason in found.reasons)
+
+
+def test_block_between_four_walls_with_a_turned_sensor_is_estimated() -> None:
+    side, true = 0.2, np.array([0.030, 0.022])
+    guide = Scene(
+        Head(5.0, 5.0 * side**2 / 6.0, carries="corners"),
+        Frame(side, side),
+        Clearance(*true.tolist()),
+        Contact("exact_restitution", stiffness=1e8, restitution=0.8),
+        loads=(
+            Harmonic("x", (60.0, 0.0), omega_rad_s=7.0),
+            Harmonic("y", (0.0, 55.0), omega_rad_s=11.0, phase_rad=1.0),
+            Harmonic("m", (0.0, 0.0), omega_rad_s=5.0, moment_n_m=1.0),
+        ),
+        initial=Initial(v=(0.3, 0.2, 0.1)),
+    )  # fmt: skip
+    motion = simulate(guide, t_end=20.0, output_dt=0.004, tol=1e-6)
+    rng = np.random.default_rng(2)
+    measured = motion.q + np.array([1.5e-3, -1e-3, 8e-3]) + rng.normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
+    t = np.arange(0.0, 20.0, 0.01)
+    wrench = np.stack([60.0 * np.sin(7.0 * t), 55.0 * np.sin(11.0 * t + 1.0), np.sin(5.0 * t)], axis=1)
+    nominal = replace(guide, clearance=Clearance(*(true + np.array([4e-3, -3e-3])).tolist()), loads=())
+    found = estimate(nominal, Load(t, wrench), Poses(motion.t, measured))
+    for value, clearance, state in zip(
+        (found.horizontal, found.vertical), true, (found.horizontal_state, found.vertical_state), strict=True
+    ):
+        assert state is State.ESTIMATED, found.reasons
+        assert abs(value.mean - clearance) < 1e-3
+        assert value.p05 < clearance < value.p95
+    assert found.bias_x is not None and found.bias_x.p05 < 1.5e-3 < found.bias_x.p95
+    assert found.bias_theta is not None and found.bias_theta.p05 < 8e-3 < found.bias_theta.p95
+
+
+@pytest.mark.parametrize(
+    ("change", "word"), [((slice(0, 5), slice(None)), "whole ones"), ((slice(None), 2), "whole ones")]
+)
+def test_poses_that_cannot_do_are_named(drops, change, word) -> None:
+    pose = drops.pose[0] - [0.0, 1.0, 0.0]
+    t = np.arange(len(pose)) / 250.0
+    if change[1] == 2:
+        pose[:, 2] = np.nan
+    else:
+        pose, t = pose[change[0]], t[change[0]]
+    found = estimate(unknown_table(0.0), Load(np.array([0.0, 0.8]), np.zeros((2, 3))), Poses(t, pose))
+    assert found.vertical_state is State.NOT_OBSERVABLE
+    assert word in found.reasons[0]
+
+
+def test_command_estimates_a_drop(drops, tmp_path) -> None:
+    pose = drops.pose[8] - [0.0, 1.0, 0.0]
+    t = np.arange(len(pose)) / 250.0
+    (tmp_path / "scene.yaml").write_text(dump_scene(unknown_table(0.003)), encoding="utf-8")
+    np.savetxt(tmp_path / "pose.csv", np.column_stack([t, pose]), delimiter=",", header="t,x,y,theta", comments="")
+    np.savetxt(tmp_path / "load.csv", [[0, 0, 0, 0], [0.8, 0, 0, 0]], delimiter=",", header="t,fx,fy,m", comments="")
+    done = run_command("estimate", str(tmp_path), "--json")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["vertical"]["state"] == "estimated"
+    assert abs(0.5 * (found["vertical"]["mean_m"] - SQUARE.clearance.vertical_m)) < 2e-3
+    assert found["figures"]["restitution"] == pytest.approx(0.5, abs=0.3)
