@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from plow_twin.live.parameters import Settings
 from plow_twin.record.alarms import ALARMS, alarms_message
 from plow_twin.record.messages import Message
+from plow_twin.solve.totals import summary
 from plow_twin.stream.alarms import Alarms
 from plow_twin.stream.health import DurationHistogram
-from plow_twin.stream.outputs import Published
+from plow_twin.stream.outputs import Published, Rows
 
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
@@ -105,8 +106,12 @@ class Publishing:
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0: it answers no message
         self.received_ns = 0
-        #: newest pose that was published
-        self.q: NDArray[np.float64] | None = None
+        self._newest: Rows | None = None
+
+    @property
+    def q(self) -> NDArray[np.float64] | None:
+        """Newest pose that was published: x, y [m], theta [rad]."""
+        return None if self._newest is None else self._newest["q"][0]
 
     @property
     def memory(self) -> Mapping[str, memoryview]:
@@ -130,10 +135,10 @@ class Publishing:
         if self.received_ns:
             self.latency.add((time.monotonic_ns() - self.received_ns) * 1e-9)
         yield from sent[1:]
-        self.q, stamp_ns = rows["q"][0], int(rows["stamp_ns"][0])
+        self._newest, (stamp_ns, marked, held, *_) = rows, summary(rows, 0)
         self.published += 1
-        if rows["marked"][0]:
-            self.held_frames += int(rows["held"][0])
+        if marked:
+            self.held_frames += held
             self.corrected_frames += int(rows["corrected"][0])
         changed = list(self.alarms.take(published))
         if self.received_ns and not self._front.follows_samples:

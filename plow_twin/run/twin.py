@@ -116,11 +116,13 @@ class Twin:
         self._work, self._totals = first_of(self._works), first_of(self._all_totals)
         self._states[0] = compiled.initial_state(start)
         self._inertias = inertias(scene)
-        #: the kernel for loads from outside or the scene's own, with rows or without
-        self._kernels: dict[tuple[bool, bool], Callable[..., bool]] = {}
+        #: the kernel with rows and without
+        self._kernels: dict[bool, Callable[..., bool]] = {}
         #: model time, as a view of the state
         self._time = self._states["time"]
         self._wrench = np.zeros(3)
+        #: loads of one sample per mass and inertia, and no snapshots: made once, for live samples come one by one
+        self._one_load, self._no_snapshots = np.empty((1, 2, 3)), self._states[:0]
         self._travel_speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
 
     @property
@@ -248,32 +250,31 @@ class Twin:
         ArgumentError
             As `advance`; nothing has changed then.
         """
-        sampled = self.excitation == "sampled"
+        sampled, count, with_rows = self.excitation == "sampled", len(t), rows is not None
         t, wrench = np.ascontiguousarray(t, np.float64), np.ascontiguousarray(wrench, np.float64)
-        if not (len(t) == 1 and self._time[0] <= t[0] < math.inf):
+        if not (count == 1 and self._time.item() <= t.item() < math.inf):
             check_times(self.time, t)
         per_inertia = None
         if sampled:
-            per_inertia = np.empty((1, len(t) + 1, 3))
-            if wrench.shape != (len(t), 3) or not lay_out(self._wrench, wrench, self._inertias, per_inertia[0]):
-                raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
-        snapshots = np.zeros(len(marks), self._states.dtype) if len(marks) else self._states[:0]
+            per_inertia = self._one_load if count == 1 else np.empty((1, count + 1, 3))
+            if wrench.shape != (count, 3) or not lay_out(self._wrench, wrench, self._inertias, per_inertia[0]):
+                raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({count}, 3)")
+        snapshots = np.zeros(len(marks), self._states.dtype) if len(marks) else self._no_snapshots
         arguments = (
             self._params, self._parts, self._states, self._pace.saved, self._works,
             None if rows is None else self._all_totals, 0, 1, t, per_inertia, self._budget,
             None if rows is None else rows[None], marks, snapshots, self._bound, self._pace.argument,
         )  # fmt: skip
-        kind = sampled, rows is not None
-        if kind not in self._kernels:
-            self._kernels[kind] = self._kernel(kind, arguments)
+        if with_rows not in self._kernels:
+            self._kernels[with_rows] = self._kernel((sampled, with_rows), arguments)
         try:
-            self._pace.run(self._kernels[kind], arguments)
+            self._pace.run(self._kernels[with_rows], arguments)
         except (OutOfTimeError, KeyboardInterrupt) as stop:
-            self._stopped(stop, len(t), wrench if sampled else None, rows)
-        if sampled and len(wrench):
-            self._wrench = wrench[-1].copy()
+            self._stopped(stop, count, wrench if sampled else None, rows)
+        if sampled and count:
+            self._wrench[:] = wrench[-1]
         digests = self._digests(snapshots, wrench[marks - 1]) if len(marks) else []
-        return Advanced(int(self._pace.failed[0]), digests)
+        return Advanced(self._pace.failed.item(), digests)
 
     @property
     def wrench(self) -> NDArray[np.float64]:

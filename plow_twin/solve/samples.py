@@ -1,4 +1,4 @@
-"""Samples of a load as the kernels take them: per mass and inertia."""
+"""Samples as the kernels take them: model times, and loads per mass and inertia."""
 
 from __future__ import annotations
 
@@ -20,3 +20,10 @@ def lay_out(before, samples, inertias, per) -> bool:
             finite = finite and math.isfinite(samples[n, j])
             per[n + 1, j] = samples[n, j] / inertias[j]
     return finite
+
+
+@kernel(entry=True)
+def model_times(stamps, origin_ns, times) -> None:
+    """Write the model times [s] of stamps [ns], shape (n,), to `times`."""
+    for n in range(len(stamps)):
+        times[n] = (stamps[n] - origin_ns) * 1e-9

@@ -17,8 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.solve.totals import summary
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.outputs import Published
+from plow_twin.stream.outputs import Published, Rows
 
 #: A level is left below this share of its threshold.
 HYSTERESIS: Final = 0.95
@@ -169,20 +170,20 @@ class Alarms:
         if len(published.rows) > 1 and self._take_quiet(published):
             return
         slow = {int(found["row"]): found for found in published.slow} if len(published.slow) else {}
-        for number, row in enumerate(published.rows):
-            if self._take_one(row, slow.get(number)):
+        for number in range(len(published.rows)):
+            if self._take_one(published.rows, number, slow.get(number)):
                 yield number
 
-    def _take_one(self, row: np.void, slow: np.void | None) -> bool:
+    def _take_one(self, rows: Rows, number: int, slow: np.void | None) -> bool:
         """Take in one row, and its slow part if it has one; True when a level has changed."""
-        held = bool(row["held"])
-        if held and not row["samples"]:
+        stamp_ns, _, held, samples, x, y, force, _ = summary(rows, number)
+        if held and not samples:
             return False
-        self.raised, stamp_ns, changed = [], int(row["stamp_ns"]), False
+        self.raised, changed = [], False
         if self._model is not None and not held:
-            for at_ns, residual in self._model.add(stamp_ns, *row["q"][:2].tolist()):
+            for at_ns, residual in self._model.add(stamp_ns, x, y):
                 changed |= self._take("residual", residual, at_ns)
-        changed |= self._take("force", max(row["measured_peak"].tolist()), stamp_ns)
+        changed |= self._take("force", force, stamp_ns)
         if slow is not None:
             clearance = float(slow["clearance"][:2].max())
             changed |= self._take("clearance", clearance, stamp_ns)

@@ -131,11 +131,14 @@ class Driver:
         for stamp_ns, wrench in arrived:
             if self.every_sample and not run and self._goes_on(stamp_ns, wrench):  # as nearly always
                 self._newest_ns, self._received_ns, self._zeroed = stamp_ns, now_ns, False
-                yield from self._use([Sample(stamp_ns, wrench)], now_ns)
+                published = self._apply([Sample(stamp_ns, wrench)], now_ns)
+                if len(published.rows):
+                    yield published
                 continue
             for settled in self._steps.settle(stamp_ns, wrench, now_ns, self.session.stamp_ns):
                 yield from self._take_in(run, *settled[:2], now_ns)
-        yield from self._use(run, now_ns)
+        if run or self._newest_ns is None:
+            yield from self._use(run, now_ns)
 
     def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
         """Accept a sample against which nothing speaks; False: it has to be judged."""
@@ -358,19 +361,25 @@ class Driver:
         """Advance to samples, which are taken out of the list, and yield what is to be published."""
         samples = run.copy()
         run.clear()
-        for applied in self.session.samples(samples, each=self.every_sample):
-            self.rolled_back += applied.late
-            self._advanced(now_ns)
-            if applied.failed:
-                self._judge_rows(applied.rows)
-            else:
-                self.failed.end()
-                self.state = StreamState.RUNNING
-            if len(applied.published.rows):
-                yield applied.published
+        for part in self.session.parts(samples, each=self.every_sample):
+            published = self._apply(part, now_ns)
+            if len(published.rows):
+                yield published
         if self._newest_ns is None:
             # after a reset between two samples silence is to be seen
             self._newest_ns = self.session.stamp_ns
+
+    def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
+        """Advance to samples that are applied at once, and return what is to be published."""
+        applied = self.session.apply_samples(samples, each=self.every_sample)
+        self.rolled_back += applied.late
+        self._advanced(now_ns)
+        if applied.failed:
+            self._judge_rows(applied.rows)
+        else:
+            self.failed.end()
+            self.state = StreamState.RUNNING
+        return applied.published
 
     def _advance(self, entry: Hold | Unload, now_ns: int, state: StreamState) -> Published:
         """Advance without a sample."""

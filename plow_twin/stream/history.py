@@ -80,7 +80,7 @@ class History:
             return
         self._later.append((stamps_ns, wrench))
         last_ns = self._kept_ns[-1] if self._kept_ns else None
-        if last_ns is not None and int(stamps_ns[-1]) // self._spacing_ns == last_ns // self._spacing_ns:
+        if last_ns is not None and stamps_ns.item(-1) // self._spacing_ns == last_ns // self._spacing_ns:
             return  # as nearly always, for stamps do not fall
         cells = stamps_ns // self._spacing_ns
         begins = np.ones(len(cells), bool)

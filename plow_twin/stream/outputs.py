@@ -5,7 +5,6 @@ A publication is a function of the journal alone, so that a replay forms the sam
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Final, NamedTuple
@@ -18,7 +17,7 @@ from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.running_in import with_running_in, without_running_in
 from plow_twin.model.scene import Scene
 from plow_twin.solve.state import ROW
-from plow_twin.solve.totals import publish, publish_window
+from plow_twin.solve.totals import publish, publish_window, summary
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.void]
@@ -65,10 +64,12 @@ class Published(NamedTuple):
     @property
     def finite(self) -> bool:
         """Whether every number is finite."""
-        parts = [self.rows[name].ravel() for name in _NUMBERS]
-        if len(self.slow):
-            parts += [self.slow[name].ravel() for name in ("clearance", "wear_rate")]
-        return math.isfinite(np.add.reduce(np.concatenate(parts)))
+        for number in range(len(self.rows)):
+            if not summary(self.rows, number)[-1]:
+                return False
+        return not len(self.slow) or all(
+            bool(np.isfinite(self.slow[name]).all()) for name in ("clearance", "wear_rate")
+        )
 
     def at(self, index: int) -> Published:
         """Return what is published with one row."""
@@ -93,7 +94,6 @@ class Published(NamedTuple):
 
 
 NOTHING: Final = Published(_NO_ROWS, _NO_SLOW)
-_NUMBERS: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
 
 
 def _numbered_from(slow: Rows, first: int) -> Rows:
@@ -276,7 +276,7 @@ class Outputs:
         stamps, before_ns = rows["stamp_ns"], self._slow_ns
         if before_ns is not None:
             before = before_ns // SLOW_PERIOD_NS
-            if before == int(stamps[0]) // SLOW_PERIOD_NS == int(stamps[-1]) // SLOW_PERIOD_NS:
+            if before == stamps.item(0) // SLOW_PERIOD_NS == stamps.item(-1) // SLOW_PERIOD_NS:
                 return _NO_SLOW  # as nearly always
         good = np.flatnonzero(stamps)
         spans = stamps[good] // SLOW_PERIOD_NS
@@ -343,6 +343,7 @@ def warm_up() -> None:
     _publish()
     rows = np.zeros(1, ROW)
     publish_window(rows.copy(), rows)
+    summary(rows, 0)
 
 
 @cache

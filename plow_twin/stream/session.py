@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
+from plow_twin.solve.samples import model_times
 from plow_twin.stream.history import History
 from plow_twin.stream.journal import (
     Digest,
@@ -161,7 +162,7 @@ class Session:
         """
         match entry:
             case Sample():
-                return next(self.samples([entry])).rows[-1:]
+                return self.apply_samples([entry]).rows[-1:]
             case Hold() | Unload():
                 return self._apply_hold(entry)
             case Travel(_, speed):
@@ -196,10 +197,30 @@ class Session:
                 pass
         return None
 
-    def samples(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Applied]:
-        """Emit samples of rising stamps, and apply them: one by one, or as many at once as the digests allow.
+    def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
+        """Yield the parts of samples that `apply_samples` takes at once; the one before has to be applied by then.
 
-        Late ones are worked in together. The bits are the same, however many are applied at once.
+        Late samples are one part; of others there are as many as the digests allow, or one where `each` is published.
+
+        Raises
+        ------
+        ValueError
+            A stamp falls.
+        """
+        for earlier, later in pairwise(samples):
+            if later.stamp_ns < earlier.stamp_ns:
+                raise ValueError(f"stamp: got {later.stamp_ns} ns, expected at least {earlier.stamp_ns} ns")
+        while samples:
+            count = 1
+            if self._is_late(samples[0].stamp_ns):
+                count = len(samples)
+            elif not each:
+                count = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
+            yield samples[:count]
+            samples = samples[count:]
+
+    def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
+        """Emit one of the `parts` of samples and apply it; the bits are the same, however many there are at once.
 
         Parameters
         ----------
@@ -208,38 +229,26 @@ class Session:
         each : bool
             Whether there is a publication after each, and of late ones after the last; else `outputs` sums up.
 
-        Yields
-        ------
-        Applied
-            Of some of the samples, each time before the next ones are emitted.
-
         Raises
         ------
         ValueError
             As `apply`.
         """
-        for earlier, later in pairwise(samples):
-            if later.stamp_ns < earlier.stamp_ns:
-                raise ValueError(f"stamp: got {later.stamp_ns} ns, expected at least {earlier.stamp_ns} ns")
-        while samples:
-            count, late = 1, 0
-            if self._is_late(samples[0].stamp_ns):
-                count, late = len(samples), sum(self._is_late(sample.stamp_ns) for sample in samples)
-                self._check_late(samples[0].stamp_ns)
-            elif not each:
-                count = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
-            part, samples = samples[:count], samples[count:]
-            for sample in part:
-                self._on_entry(sample)
-            if late:
-                applied = self._work_in(part[0].stamp_ns, part)
-                applied = applied._replace(published=self.outputs.take() if each else NOTHING, late=late)
-            else:
-                applied = self._run(part, THE_ONE if each else NONE)
-                if each and not applied.published.rows["stamp_ns"][0]:  # it failed
-                    applied = applied._replace(published=NOTHING)
-            self._count(len(part))
-            yield applied
+        late, first_ns = 0, samples[0].stamp_ns
+        if self._is_late(first_ns):
+            late = sum(self._is_late(sample.stamp_ns) for sample in samples)
+            self._check_late(first_ns)
+        for sample in samples:
+            self._on_entry(sample)
+        if late:
+            applied = self._work_in(first_ns, samples)
+            applied = applied._replace(published=self.outputs.take() if each else NOTHING, late=late)
+        else:
+            applied = self._run(samples, THE_ONE if each else NONE)
+            if each and applied.failed and not applied.published.rows["stamp_ns"][0]:
+                applied = applied._replace(published=NOTHING)
+        self._count(len(samples))
+        return applied
 
     @property
     def wear_depth(self) -> NDArray[np.float64]:
@@ -390,8 +399,10 @@ class Session:
         if self.history.is_due and not resumed:
             before_ns = int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns
             self.history.add_snapshot(before_ns, self.snapshot().data, kept=False)
-        failed, digests = self.twin.advance_rows(np.multiply(stamps - origin_ns, 1e-9), wrench, rows, marks)
-        self.origin_ns, self.stamp_ns = origin_ns, int(stamps[-1])
+        times = np.empty(len(stamps))
+        model_times(stamps, origin_ns, times)
+        failed, digests = self.twin.advance_rows(times, wrench, rows, marks)
+        self.origin_ns, self.stamp_ns = origin_ns, stamps.item(-1)
         self.history.add(stamps, wrench)
         if rows is None:
             self.wear_depth = self.twin.wear_depth
