@@ -38,6 +38,7 @@ from plow_twin.live.load_model import read_load_model
 from plow_twin.live.part import Part
 from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Preparation
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.doctor import examine
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.mapping import read_map
@@ -50,7 +51,7 @@ from plow_twin.record.unused import unused_messages
 from plow_twin.record.writer import RunWriter
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import Verdict
-from plow_twin.stream.journal import Gaps, PartOfPose, Pose
+from plow_twin.stream.journal import Gaps, Mark, Parameter, PartOfPose, Pose
 from plow_twin.stream.limits import pose_limits, value_limits
 from plow_twin.view.run_curves import RunCurves
 
@@ -388,6 +389,7 @@ class Live:
             env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
         )  # fmt: skip
         self.heard: dict[str, dict[str, Any]] = {}
+        self.alarms: list[dict[str, Any]] = []
 
     def until(self, reached: Callable[[dict[str, dict[str, Any]]], bool], what: str) -> dict[str, str]:
         """Read what it says until something is true; return the values of its input part."""
@@ -399,7 +401,8 @@ class Live:
             assert line, f"{what}: ended: {self.process.communicate()[1].decode()}; {self.heard}"
             said = json.loads(line)
             self.heard[said["topic"]] = said
-        return dict(self.heard["input"]["values"])
+            self.alarms += [said] if said["topic"] == "alarms" else []
+        return {key: str(found) for key, found in self.heard["input"]["values"].items()}
 
     def until_count(self, key: str, count: int) -> dict[str, str]:
         return self.until(lambda heard: int(heard["input"]["values"][key]) >= count, f"{count} {key}")
@@ -441,6 +444,36 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
         assert live.stop(signal.SIGHUP) == 0  # of a terminal that is closed
     report = replay(run)
     assert (report.samples, report.exit_code) == (300, 0)
+
+
+def test_an_alarm_is_said_once_with_value_pad_threshold_and_time_and_acknowledged_without_ros(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, control = _csv(tmp_path / "load.csv", 5000), tmp_path / "twin.socket"
+    control.touch()
+    assert run_cli(["live", str(path), "--control", str(control)]) == 1  # what is there is no socket of a twin
+    assert "cannot be a socket" in capsys.readouterr().err
+    control.unlink()
+    thresholds = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.002")
+    arguments = (str(path), "--follow", "--control", str(control), "--set", "excitation_timeout=3600", *thresholds)
+    with _live(*arguments, "--record", str(tmp_path / "run")) as live:
+        live.until_count("samples_used", 5000)
+        (said,) = live.alarms  # in five seconds the force passes the threshold again and again
+        values = said["values"]
+        assert values["force_raised"] > values["force_threshold"] == 20e3 and values["force_place"] in PAIR_NAMES
+        assert said["stamp_ns"] >= values["force_stamp_ns"] > 1_000_000_000
+        assert f"kN at {values['force_place']}, warning threshold 20 kN, at 0." in said["message"]
+        again = sum(record.topic == "/alarms" for record in RunReader(tmp_path / "run") if hasattr(record, "topic"))
+        assert again > 4
+        mark, acknowledge = ["call", str(control), "mark", "new pads"], ["call", str(control), "acknowledge_alarms"]
+        assert [run_cli(mark), run_cli(acknowledge)] == [0, 0]
+        assert run_cli(["call", str(control), "restore"]) == 1 and "no snapshot" in capsys.readouterr().err
+        assert live.stop() == 0
+    assert not control.exists() and run_cli(acknowledge) == 1
+    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    marks = [entry.text for entry in entries if isinstance(entry, Mark)]
+    assert marks == ["alarm: force", "new pads"]
+    assert [entry.name for entry in entries if isinstance(entry, Parameter)] == ["alarms_acknowledged"]
 
 
 def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_takes_its_place(tmp_path: Path) -> None:

@@ -65,6 +65,12 @@ class Front:
     def now_ns(self) -> int:
         raise NotImplementedError
 
+    def say_alarm(self, level: int, text: str) -> None:
+        assert level and text
+
+    def time_text(self, stamp_ns: int) -> str:
+        return str(stamp_ns)
+
     def say_error(self, text: str) -> None:
         pytest.fail(text)
 

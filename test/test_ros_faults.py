@@ -41,9 +41,9 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
+from plow_twin.live.service_names import SERVICES
 from plow_twin.model.scene import Wear
 from plow_twin.record.replay import replay
-from plow_twin.ros.front import SERVICES
 from plow_twin.ros.messages import set_stamp, stamp_ns
 from plow_twin.ros.node import TwinNode
 from plow_twin.scene_file import dump_scene, load_scene

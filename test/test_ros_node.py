@@ -272,7 +272,9 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(t
             send(T0 + index * MS, (32e3, 0.0, -45e3))
             probe.pace(index)
         probe.until(lambda: alarms, "an alarm")
-        assert alarms[0].level == b"\x01" and alarms[0].message == "force"
+        assert alarms[0].level == b"\x01" and alarms[0].message.startswith("force ")
+        logged = "plow_twin]: " + alarms[0].message  # value, pad, threshold and time
+        probe.until(lambda: logged in running.twin.output(), "the alarm in the log")
         assert value(alarms[0], "force_level") == "warn"
         send(T0 + 600 * MS, (0.0, 0.0, 0.0))
         answer = probe.call(Trigger, f"{running.namespace}/plow_twin/acknowledge_alarms", Trigger.Request())

@@ -13,6 +13,7 @@ import click
 
 from plow_twin.build import package_version
 from plow_twin.cli.analyse import analyse
+from plow_twin.cli.call import call
 from plow_twin.cli.compare import compare
 from plow_twin.cli.console import FAILED, WRONG_INPUT, say_error
 from plow_twin.cli.demo import demo
@@ -68,6 +69,7 @@ for _verb in (
     simulate,
     demo,
     live,
+    call,
     estimate,
     forecast,
     record,

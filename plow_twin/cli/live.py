@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,13 +25,15 @@ from plow_twin.cli.console import (
     show_facts,
     unit_option,
 )
+from plow_twin.cli.live_report import Report
 
 if TYPE_CHECKING:
     from plow_twin.live.bridge.source import Bridge
+    from plow_twin.live.control import Control
+    from plow_twin.live.front import BridgeFront
     from plow_twin.live.parameters import Settings
     from plow_twin.live.stop import StopSignals
 
-_LEVELS = ("OK", "WARN", "ERROR")
 #: Counters of input that was not used.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
@@ -58,6 +60,9 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option("--client-id", default="plow_twin", show_default=True, help="Name under which the broker keeps messages.")
 @click.option("--plain", is_flag=True, help="Allow a broker on another machine without TLS.")
 @click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
+@click.option(
+    "--control", type=click.Path(path_type=Path), help="Socket to open, for plow-twin call SOCKET acknowledge_alarms."
+)
 @json_option
 @quiet_option
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
@@ -93,29 +98,23 @@ def _live(
         with busy("preparing the solver", quiet or not error_console().is_terminal):
             prepared = Preparation(settings).result(lambda: stop.stopped)
 
-        lines_lost = 0
-
-        def say(name: str, part: tuple[int, str, dict[str, str]]) -> None:
-            nonlocal lines_lost
-            level, message, values = part
-            if lines:
-                said = {"topic": name, "level": level, "message": message, "values": values}
-                lines_lost += not _said(json.dumps(said))
-            elif name in ("status", "alarms") and not quiet:
-                say_error(f"{_LEVELS[level]} {name}: {message}")
+        report = Report(lines=lines, quiet=quiet, stamp_ns=lambda: front.runtime.stamp_ns)
 
         def on_error(text: str) -> None:
             say_error(f"plow-twin: {text}")
 
-        front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error, options["units"])
-        stop.interrupt = False
-        lost = front.run(lambda: stop.stopped, seconds or float("inf"))
+        with _control(options["control"]) as control:
+            front = BridgeFront(bridge, options["mapping"], settings, prepared, report.say, on_error, options["units"])
+            if control is not None:
+                _answer_on(control, front)
+            stop.interrupt = False
+            lost = front.run(lambda: stop.stopped, seconds or float("inf"))
     except StopRequested:
         return leave(DONE)
     parts = front.parts()
     facts = {name: values for name, (_, _, values) in parts.items()}
-    if lines_lost:
-        lost = [*lost, f"standard output took {lines_lost} lines not, or in part"]
+    if report.lost:
+        lost = [*lost, f"standard output took {report.lost} lines not, or in part"]
     for text in lost:
         on_error(text)
     if as_json:
@@ -126,16 +125,23 @@ def _live(
     return leave(DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE)
 
 
-def _said(line: str) -> bool:
-    """Print a line; return False where standard output fails, as on a full disk: the twin goes on."""
-    try:
-        click.echo(line)
-        sys.stdout.flush()
-    except BrokenPipeError:  # no reader any more
-        raise
-    except OSError:
-        return False
-    return True
+def _answer_on(control: Control, front: BridgeFront) -> None:
+    """Let a running twin answer on a socket."""
+    from plow_twin.live.control import TURN_S
+    from plow_twin.live.services import Services
+    from plow_twin.live.timer import Timer
+
+    control.services = Services(front.runtime, front.changed)
+    front.timers.append(Timer(TURN_S, control.turn))
+
+
+def _control(path: Path | None) -> AbstractContextManager[Control | None]:
+    """Return the socket that is asked for, which is removed at the end."""
+    if path is None:
+        return nullcontext()
+    from plow_twin.live.control import Control
+
+    return Control(path)
 
 
 def _shown(values: dict[str, str]) -> list[str]:

@@ -89,6 +89,8 @@ class BridgeFront:
         self.runtime = Runtime(self, settings, prepared)
         self._feeder = Feeder(self.roles, self.runtime, self.send, model if "drive" in self.roles else None)
         self._health = diagnostics.Health()
+        #: what has its turn while the source is read
+        self.timers: list[Timer] = []
 
     def now_ns(self) -> int:
         """Return the system's time, or that of the samples where they bring their own [ns]."""
@@ -110,6 +112,9 @@ class BridgeFront:
     def sender_name(self, topic: str, sender: bytes) -> str:
         """Return the name of a sender of an input."""
         return sender.decode(errors="replace")
+
+    def say_alarm(self, level: int, text: str) -> None:
+        """Do nothing: `say` gets the alarms."""
 
     def time_text(self, stamp_ns: int) -> str:
         """Return a stamp in words, as it stands in the input."""
@@ -157,6 +162,7 @@ class BridgeFront:
     def _loop(self, stop_asked: Callable[[], bool], give_up: float) -> None:
         inputs, bridge, trouble = self.runtime.inputs, self._bridge, ""
         periodic = [Timer(1.0 / rate, do) for rate, do in self.runtime.periodic()] + [Timer(_REPORT_S, self._report)]
+        periodic += self.timers
         while not stop_asked() and (self._first or not bridge.finished) and time.monotonic() < give_up:
             next_due = min(timer.due for timer in periodic)
             messages = self._messages(max(0.0, min(_POLL_S, next_due - time.monotonic())))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.live.parameters import Settings
-from plow_twin.record.alarms import ALARMS, alarms_message
+from plow_twin.record.alarms import ALARMS, alarm_texts, alarms_message
 from plow_twin.record.messages import Message
 from plow_twin.solve.totals import summary
 from plow_twin.stream.alarms import Alarms
@@ -61,6 +61,9 @@ class Front(Protocol):
 
     def time_text(self, stamp_ns: int) -> str:
         """Return a stamp in words, as a person who knows the input writes it."""
+
+    def say_alarm(self, level: int, text: str) -> None:
+        """Log an alarm that has been raised to a level."""
 
     def say_error(self, text: str) -> None:
         """Log an error; may be called from another thread."""
@@ -153,6 +156,12 @@ class Publishing:
         yield self.alarms_now(stamp_ns)
         if self.alarms.raised:
             self._on_alarm(f"alarm: {', '.join(self.alarms.raised)}")
+            for name in self.alarms.raised:
+                self._front.say_alarm(self.alarms.alarms[name].latched, self._text(name))
+
+    def _text(self, name: str) -> str:
+        status = alarms_message(self.alarms, self._front.name, self._head)
+        return next(text for text in alarm_texts(dict(status.values)) if text.startswith(name.replace("_", " ") + " "))
 
     def alarms_now(self, stamp_ns: int) -> Outgoing:
         """Return the alarms as they are."""

@@ -26,9 +26,9 @@ class Services:
         self._runtime, self._changed = runtime, changed
         self._kept: Snapshot | None = None
 
-    def mark(self) -> tuple[bool, str]:
-        """Put the text of the parameter `mark` into the journal and have the ring written, if there is one."""
-        return self._runtime.mark(self._runtime.settings.mark or "service")
+    def mark(self, text: str = "") -> tuple[bool, str]:
+        """Put a text, or else that of the parameter `mark`, into the journal and have the ring written, if any."""
+        return self._runtime.mark(text or self._runtime.settings.mark or "service")
 
     def reset(self) -> tuple[bool, str]:
         """Put the motion back to its initial state; return whether that was done, and a text for who asked."""

@@ -9,10 +9,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.cdr import decode, encode
 from plow_twin.record.entries import OutputRecord
 from plow_twin.record.header import RunHeader
 from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.times import time_text
 from plow_twin.stream.alarms import Alarms, Thresholds
 from plow_twin.stream.journal import Parameter, Pose
 from plow_twin.stream.outputs import Published
@@ -21,6 +23,14 @@ from plow_twin.stream.outputs import Published
 ALARMS: Final = "alarms"
 #: Name under which an acknowledgement stands in the journal as a parameter.
 ACKNOWLEDGED: Final = "alarms_acknowledged"
+#: Factor and unit of each quantity in words.
+_UNITS: Final = {
+    "force": (1e-3, "kN"),
+    "clearance": (1e3, "mm"),
+    "clearance_rate": (3.6e6, "mm/h"),
+    "wear_rate": (3.6e6, "mm/h"),
+    "residual": (1e3, "mm"),
+}
 _NAMES: Final = ("force", "clearance", "clearance_rate", "wear_rate")
 
 #: Step, stamp [ns], topic, field, recorded and computed value of a difference.
@@ -37,19 +47,41 @@ def alarms_of(parameters: Mapping[str, Any]) -> Alarms:
 
 
 def alarms_message(alarms: Alarms, node: str, hardware_id: str) -> DiagnosticStatus:
-    """Return the message with the level of each alarm."""
-    each = alarms.alarms.items()
-    there = [name for name, alarm in each if alarm.level or alarm.latched]
-    values = tuple(
-        (key, text)
-        for name, alarm in each
-        for key, text in (
-            (name, f"{alarm.value:.6g}"),
-            (f"{name}_level", alarm.level.name.lower()),
-            (f"{name}_latched", alarm.latched.name.lower()),
-        )
-    )
-    return DiagnosticStatus(int(alarms.worst), f"{node}: {ALARMS}", ", ".join(there) or "none", hardware_id, values)
+    """Return the message with the level of each alarm, and how the latched ones were raised."""
+    values: dict[str, str] = {}
+    for name, alarm in alarms.alarms.items():
+        raised = alarm.raised
+        values |= {
+            name: f"{alarm.value:.6g}",
+            f"{name}_level": alarm.level.name.lower(),
+            f"{name}_latched": alarm.latched.name.lower(),
+            f"{name}_raised": f"{raised.value:.6g}" if raised else "",
+            f"{name}_threshold": f"{raised.threshold:.6g}" if raised else "",
+            f"{name}_place": raised.place if raised else "",
+            f"{name}_stamp_ns": str(raised.stamp_ns) if raised else "",
+        }
+    text = "; ".join(alarm_texts(values)) or "none"
+    return DiagnosticStatus(int(alarms.worst), f"{node}: {ALARMS}", text, hardware_id, tuple(values.items()))
+
+
+def alarm_texts(values: Mapping[str, str], *, own_start: bool = False) -> list[str]:
+    """Return a sentence for each latched alarm: level, value, pad, threshold and time.
+
+    `values` are those of `alarms_message`; `own_start` as of `time_text`.
+    """
+    found = []
+    for name, (factor, unit) in _UNITS.items():
+        stamp = values.get(f"{name}_stamp_ns")
+        if not stamp:
+            continue
+        raised, threshold = (float(values[f"{name}_{key}"]) * factor for key in ("raised", "threshold"))
+        place, level = values[f"{name}_place"], values[f"{name}_latched"]
+        place = f" {'at' if place in PAIR_NAMES else 'along'} {place}" if place else ""
+        title = "error" if level == "error" else "warning"
+        time = time_text(int(stamp), own_start=own_start)
+        limit = f"{title} threshold {threshold:.4g} {unit}"
+        found.append(f"{name.replace('_', ' ')} {raised:.4g} {unit}{place}, {limit}, at {time}")
+    return found
 
 
 class AlarmCheck:

@@ -6,7 +6,6 @@ import traceback
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from types import MappingProxyType
-from typing import Final
 
 from rclpy.node import Node
 
@@ -20,19 +19,8 @@ from plow_twin.record.times import time_text
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.publishers import OutputPublishers
 from plow_twin.ros.subscriptions import Subscriptions
+from plow_twin.stream.alarms import Level
 from plow_twin.stream.topics import TOPICS
-
-#: Services by name, each a method of `Services`.
-SERVICES: Final = (
-    "reset",
-    "switch_publisher",
-    "set_wear",
-    "acknowledge_alarms",
-    "snapshot",
-    "restore",
-    "mark",
-    "forecast",
-)
 
 
 class RosFront:
@@ -110,6 +98,14 @@ class RosFront:
     def sender_name(self, topic: str, sender: bytes) -> str:
         """Return node and identity of a publisher of an input."""
         return self.subscriptions.name_of(topic, sender)
+
+    def say_alarm(self, level: int, text: str) -> None:
+        """Log an alarm."""
+        log = self._node.get_logger()
+        if level >= Level.ERROR:
+            log.error(text)
+        else:
+            log.warning(text)
 
     def time_text(self, stamp_ns: int) -> str:
         """Return a stamp in words."""

@@ -22,12 +22,13 @@ from plow_twin.live import diagnostics
 from plow_twin.live.parameters import Settings
 from plow_twin.live.realtime import apply_realtime
 from plow_twin.live.runtime import Runtime
+from plow_twin.live.service_names import SERVICES
 from plow_twin.live.solver_start import Preparation, key
 from plow_twin.live.wear_keeper import KeptWear
 from plow_twin.record import messages as plain
 from plow_twin.record import sending
 from plow_twin.ros.connections import LOOK_S, Connections, WithoutEvents
-from plow_twin.ros.front import SERVICES, RosFront
+from plow_twin.ros.front import RosFront
 from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS

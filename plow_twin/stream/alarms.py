@@ -9,7 +9,7 @@ import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from operator import lt
 from typing import Final
@@ -17,9 +17,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.solve.totals import summary
 from plow_twin.stream.intake import NS_PER_S
-from plow_twin.stream.outputs import Published, Rows
+from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 
 #: A level is left below this share of its threshold.
 HYSTERESIS: Final = 0.95
@@ -56,6 +57,16 @@ class Thresholds:
         return found
 
 
+@dataclass(frozen=True)
+class Raised:
+    """How an alarm came to its latched level: value, threshold, stamp, and the pair or axis, empty without one."""
+
+    value: float
+    threshold: float
+    stamp_ns: int
+    place: str = ""
+
+
 @dataclass
 class Alarm:
     """One quantity: its value, its level now, and the highest one since it was acknowledged."""
@@ -64,6 +75,8 @@ class Alarm:
     value: float = 0.0
     level: Level = Level.NONE
     latched: Level = Level.NONE
+    #: how the latched level was raised; None: no level is latched
+    raised: Raised | None = None
     _since_ns: int | None = None
     #: value below which there is no level
     lowest: float = field(init=False)
@@ -91,7 +104,10 @@ class Alarm:
         if stamp_ns - self._since_ns < duration_ns:
             return False
         self.level, self._since_ns = level, None
-        self.latched = max(self.latched, level)
+        if level > self.latched:
+            self.latched = level
+            threshold = self.thresholds.error if level is Level.ERROR else self.thresholds.warn
+            self.raised = Raised(value, threshold, stamp_ns)
         return True
 
     def stays(self, values: NDArray[np.float64]) -> bool:
@@ -189,7 +205,21 @@ class Alarms:
             changed |= self._take("clearance", clearance, stamp_ns)
             changed |= self._take("wear_rate", float(slow["wear_rate"].max()), stamp_ns)
             changed |= self._take("clearance_rate", self._growth(stamp_ns, clearance), stamp_ns)
+        if self.raised:
+            self._place(rows[number], slow)
         return changed
+
+    def _place(self, row: np.void, slow: np.void | None) -> None:
+        """Note at which pair or along which axis the alarms were raised."""
+        where = {"force": PAIR_NAMES[int(row["measured_peak"].argmax())]}
+        if slow is not None:
+            axis = CLEARANCE_NAMES[int(slow["clearance"][:2].argmax())]
+            pad = PAIR_NAMES[int(slow["wear_rate"].argmax())]
+            where |= {"clearance": axis, "clearance_rate": axis, "wear_rate": pad}
+        for name in self.raised:
+            alarm = self.alarms[name]
+            if alarm.raised is not None and name in where:
+                alarm.raised = replace(alarm.raised, place=where[name])
 
     @property
     def follows_poses(self) -> bool:
@@ -264,4 +294,6 @@ class Alarms:
         """Let go what is latched; return the names of the alarms that are still there."""
         for alarm in self.alarms.values():
             alarm.latched = alarm.level
+            if not alarm.level:
+                alarm.raised = None
         return [name for name, alarm in self.alarms.items() if alarm.level]

@@ -160,7 +160,8 @@ TOPICS: Final = (
     Topic(
         "alarms", STATUS, Cadence.CHANGE,
         "the alarms: value, `<name>_level` and `<name>_latched` of `force` [N], `clearance` [m], `clearance_rate`, "
-        "`wear_rate` [m/s], and `residual` [m] where it has a threshold",
+        "`wear_rate` [m/s], and `residual` [m] where it has a threshold; of a latched alarm `<name>_raised` (value), "
+        "`<name>_threshold`, `<name>_place` (pad or axis) and `<name>_stamp_ns`; message = the same in words",
         latched=True, depth=1,
     ),
     Topic("status", STATUS, Cadence.CHANGE, "what the node is doing", latched=True, depth=1),

@@ -1,0 +1,29 @@
+"""`plow-twin call`: a service of a twin that runs without ROS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from plow_twin.cli.console import DONE, FAILED, say_error
+from plow_twin.live.service_names import SERVICES
+
+
+@click.command(
+    short_help="Ask a running `plow-twin live` to acknowledge its alarms, set a mark, reset, ...",
+    epilog="Exit codes: 0 done, 1 refused or no answer, 2 wrong usage.",
+)
+@click.argument("socket", type=click.Path(path_type=Path))
+@click.argument("service", type=click.Choice(SERVICES))
+@click.argument("text", default="")
+def call(socket: Path, service: str, text: str) -> int:
+    """Ask the twin of `plow-twin live --control SOCKET` for a SERVICE of the node; TEXT is that of a mark."""
+    from plow_twin.live.control import call as ask
+
+    done, answer = ask(socket, service, text)
+    if not done:
+        say_error(f"plow-twin: {service}: {answer}")
+        return FAILED
+    click.echo(answer)
+    return DONE

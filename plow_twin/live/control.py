@@ -1,0 +1,135 @@
+"""A local socket through which a running twin without ROS can be asked for what the node's services do.
+
+A request and its answer are one datagram each, so that no client can hold up the twin.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.live.service_names import SERVICES
+
+if TYPE_CHECKING:
+    from plow_twin.live.services import Services
+
+_LARGEST: Final = 65536
+#: Requests answered in one turn.
+_MOST: Final = 8
+#: How long a client waits for the answer [s].
+_PATIENCE_S: Final = 5.0
+#: Time between two turns [s].
+TURN_S: Final = 0.1
+
+
+class ControlError(PlowTwinError):
+    """The socket cannot be opened, or nobody answers on it."""
+
+
+class Control:
+    """The socket of a running twin, for its user alone; a context that removes it.
+
+    Parameters
+    ----------
+    path
+        Where to put the socket.
+
+    Attributes
+    ----------
+    services : Services or None
+        What can be asked for, once the twin is there.
+
+    Raises
+    ------
+    ControlError
+        The path is taken or cannot be used.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.services: Services | None = None
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            if path.is_socket() and not _answers(path):
+                path.unlink()
+            before = os.umask(0o177)
+            try:
+                self._socket.bind(str(path))
+            finally:
+                os.umask(before)
+        except OSError as error:
+            self._socket.close()
+            raise ControlError(f"{path}: cannot be a socket: {error.strerror or error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+
+    def turn(self) -> None:
+        """Answer the requests that have come."""
+        for _ in range(_MOST):
+            try:
+                data, client = self._socket.recvfrom(_LARGEST)
+            except BlockingIOError:
+                return
+            done, message = self._answer(data)
+            try:
+                self._socket.sendto(json.dumps({"success": done, "message": message}).encode(), client or b"")
+            except OSError:
+                continue  # it has gone, or takes nothing
+
+    def _answer(self, data: bytes) -> tuple[bool, str]:
+        try:
+            asked: Any = json.loads(data)
+        except ValueError:
+            asked = None
+        name = asked.get("service") if isinstance(asked, dict) else None
+        text = asked.get("text") if isinstance(asked, dict) else None
+        if name not in SERVICES or self.services is None:
+            return False, f"service: got {name!r}, expected one of {', '.join(SERVICES)}"
+        if name == "mark":
+            return self.services.mark(text if isinstance(text, str) else "")
+        done: tuple[bool, str] = getattr(self.services, name)()
+        return done
+
+
+def call(path: Path, service: str, text: str = "") -> tuple[bool, str]:
+    """Ask the twin behind a socket for a service; return whether it was done, and its answer.
+
+    Raises
+    ------
+    ControlError
+        Nobody answers.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+        client.bind("")  # a name of its own, outside of the file system
+        client.settimeout(_PATIENCE_S)
+        try:
+            client.connect(str(path))
+            client.send(json.dumps({"service": service, "text": text}).encode())
+            answer = json.loads(client.recv(_LARGEST))
+        except OSError as error:
+            reason = "no answer" if isinstance(error, TimeoutError) else error.strerror or error
+            raise ControlError(f"{path}: no twin answers: {reason}") from error
+    return bool(answer["success"]), str(answer["message"])
+
+
+def _answers(path: Path) -> bool:
+    """Tell whether a process holds a socket open."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+        try:
+            client.connect(str(path))
+        except ConnectionRefusedError:
+            return False
+    return True
