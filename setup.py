@@ -17,6 +17,7 @@ EXTRAS = {
     # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
     "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18", "lz4>=4.3", "zstandard>=0.22", "isal>=1.6"],
     "mqtt": ["paho-mqtt>=2.0"],
+    "opcua": ["asyncua>=2.1"],
     "view": ["rerun-sdk>=0.41", "matplotlib>=3.8"],
     "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1", "rainflow>=3.2"],
     "dask": ["distributed>=2024.1"],

@@ -29,8 +29,9 @@ from record_support import PAPER_AMPLITUDE, rewrite
 from plow_twin.cli.app import run as run_cli
 from plow_twin.errors import RecordingError
 from plow_twin.live import parameters
+from plow_twin.live.bridge.access import Access
 from plow_twin.live.bridge.files import Files, StandardInput
-from plow_twin.live.bridge.mqtt import Access, Mqtt
+from plow_twin.live.bridge.mqtt import Mqtt
 from plow_twin.live.bridge.source import BridgeError
 from plow_twin.live.front import BridgeFront
 from plow_twin.live.inputs import Inputs

@@ -77,7 +77,7 @@ LIBRARIES = {
         "rerun",
         "rainflow",
     },
-    "live": {"scipy", "yaml", "paho"},
+    "live": {"scipy", "yaml", "paho", "asyncua", "cryptography"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", *MESSAGES},
     "demo": {"rclpy", "rich", *MESSAGES},
     "cli": {"click", "rich"},
@@ -187,7 +187,10 @@ def _imported_names(path: Path) -> set[str]:
             {*SCIPY, "click", "rich", "mcap", "rosbags", "rerun", "rclpy"},
         ),
         ("import plow_twin.cli.app, plow_twin.record.replay", {*SCIPY, "mcap", "rosbags", "rerun", "rclpy"}),
-        ("import plow_twin.cli.live, plow_twin.live.front", {*SCIPY, "mcap", "rosbags", "rerun", "rclpy", "paho"}),
+        (
+            "import plow_twin.cli.live, plow_twin.live.front",
+            {*SCIPY, "mcap", "rosbags", "rerun", "rclpy", "paho", "asyncua"},
+        ),
         ("import plow_twin.ros.node", {*SCIPY, "mcap", "rosbags", "rerun"}),
         (
             "import plow_twin.run.twin, plow_twin.cli.app, plow_twin.study",

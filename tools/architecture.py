@@ -26,7 +26,7 @@ SUBPACKAGES = (
 )
 CORE = {"kernel", "model", "solve", "run"}
 SAMPLE = (
-    ("ros/input_loop, input_queue", "messages as they come | live/bridge: files, MQTT"),
+    ("ros/input_loop, input_queue", "messages as they come | live/bridge: files, MQTT, OPC UA"),
     ("ros/subscriptions, live/inputs", "stamp and wrench; loss counted"),
     ("live/runtime: step", "samples in, messages out"),
     ("stream/driver, intake", "used, or dropped by a counted reason"),

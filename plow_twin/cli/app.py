@@ -46,6 +46,7 @@ EXTRA_OF_MODULE: Final = {
     "mcap": "record",
     "rosbags": "record",
     "paho": "mqtt",
+    "asyncua": "opcua",
     "rerun": "view",
     "rainflow": "study",
     "matplotlib": "study",

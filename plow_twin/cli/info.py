@@ -53,7 +53,18 @@ def _environment() -> dict[str, Any]:
 
     facts: dict[str, Any] = dict(build_fingerprint())
     core = ("scipy", "click", "rich", "PyYAML", "jsonschema")
-    extras = ("mcap", "rosbags", "paho-mqtt", "rerun-sdk", "matplotlib", "pyarrow", "Jinja2", "distributed", "rclpy")
+    extras = (
+        "mcap",
+        "rosbags",
+        "paho-mqtt",
+        "asyncua",
+        "rerun-sdk",
+        "matplotlib",
+        "pyarrow",
+        "Jinja2",
+        "distributed",
+        "rclpy",
+    )
     for name in (*core, *extras):
         try:
             facts[name] = version(name)

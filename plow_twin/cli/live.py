@@ -28,6 +28,7 @@ from plow_twin.cli.console import (
 from plow_twin.cli.live_report import Report
 
 if TYPE_CHECKING:
+    from plow_twin.live.bridge.access import Access
     from plow_twin.live.bridge.source import Bridge
     from plow_twin.live.control import Control
     from plow_twin.live.front import BridgeFront
@@ -40,7 +41,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 
 
 @click.command(
-    short_help="Run the twin on CSV files, standard input or MQTT.",
+    short_help="Run the twin on CSV files, standard input, MQTT or OPC UA.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.argument("source")
@@ -52,13 +53,17 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option("--record", type=click.Path(path_type=Path, file_okay=False), help="Folder for the recording.")
 @click.option("--follow", is_flag=True, help="Go on with what is appended to the files.")
 @click.option("--seconds", type=POSITIVE, default=None, help="Stop after so long [s].")
-@click.option("--user", default="", help="User at the broker; password: PLOW_TWIN_MQTT_PASSWORD, or a file.")
+@click.option(
+    "--user",
+    default="",
+    help="User at the broker or server; password: PLOW_TWIN_MQTT_PASSWORD, PLOW_TWIN_OPCUA_PASSWORD, or a file.",
+)
 @click.option("--password-file", type=_FILE, help="File whose first line is the password.")
-@click.option("--tls-ca", type=_FILE, help="Authority that the broker's certificate is checked against.")
+@click.option("--tls-ca", type=_FILE, help="Authority that the broker's or server's certificate is checked against.")
 @click.option("--tls-cert", type=_FILE, help="Certificate of this client.")
 @click.option("--tls-key", type=_FILE, help="Key of that certificate.")
 @click.option("--client-id", default="plow_twin", show_default=True, help="Name under which the broker keeps messages.")
-@click.option("--plain", is_flag=True, help="Allow a broker on another machine without TLS.")
+@click.option("--plain", is_flag=True, help="Allow a broker or server on another machine without encryption.")
 @click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
 @click.option(
     "--control", type=click.Path(path_type=Path), help="Socket to open, for plow-twin call SOCKET acknowledge_alarms."
@@ -66,7 +71,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @json_option
 @quiet_option
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
-    """Run the twin on SOURCE: CSV files (a folder, or one file), - for standard input, or mqtt[s]://HOST:PORT."""
+    """Run the twin on SOURCE: CSV files (a folder, or one file), -, mqtt[s]://HOST:PORT, or opc.tcp://HOST:PORT."""
     from plow_twin.live.stop import StopSignals
 
     with StopSignals() as stop:
@@ -92,7 +97,7 @@ def _live(
 
     try:
         settings = _settings(options)
-        bridge = _bridge(source, options)
+        bridge = _bridge(source, options, settings.expected_rate)
         for refused in apply_realtime(settings):
             say_error(f"plow-twin: refused by the system: {refused}")
         with busy("preparing the solver", quiet or not error_console().is_terminal):
@@ -173,25 +178,29 @@ def _settings(options: dict[str, Any]) -> Settings:
     return replace(settings, scene=scene, record_path=str(record))
 
 
-def _bridge(source: str, options: dict[str, Any]) -> Bridge:
+def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
     from plow_twin.live.bridge.files import Files, StandardInput
     from plow_twin.live.bridge.source import BridgeError
 
     if "://" in source:
-        from plow_twin.live.bridge.mqtt import Access, Mqtt
+        from plow_twin.live.bridge.access import Access
 
-        return Mqtt(
-            Access(
-                source,
-                user=options["user"],
-                password=_password(options["password_file"]),
-                ca=options["tls_ca"],
-                certificate=options["tls_cert"],
-                key=options["tls_key"],
-                plain=options["plain"],
-                client_id=options["client_id"],
-            )
+        opcua = source.startswith("opc.tcp://")
+        access = Access(
+            source,
+            user=options["user"],
+            password=_password(options["password_file"], "OPCUA" if opcua else "MQTT"),
+            ca=options["tls_ca"],
+            certificate=options["tls_cert"],
+            key=options["tls_key"],
+            plain=options["plain"],
+            client_id=options["client_id"],
         )
+        if opcua:
+            return _opcua(access, options["mapping"], rate_hz)
+        from plow_twin.live.bridge.mqtt import Mqtt
+
+        return Mqtt(access)
     if source == "-":
         return StandardInput()
     path = Path(source)
@@ -201,7 +210,19 @@ def _bridge(source: str, options: dict[str, Any]) -> Bridge:
     return Files(paths, follow=options["follow"])
 
 
-def _password(path: Path | None) -> str:
+def _opcua(access: Access, mapping: Path | None, rate_hz: float) -> Bridge:
+    from plow_twin.live.bridge.opcua.bridge import OpcUa
+    from plow_twin.live.bridge.source import BridgeError
+    from plow_twin.record.mapping import read_map
+
+    if mapping is None:
+        raise BridgeError(
+            "mapping: got none, expected --map with the nodes: excitation: {fx: {node: 'ns=2;s=...'}, ...}"
+        )
+    return OpcUa(access, read_map(mapping, None), rate_hz)
+
+
+def _password(path: Path | None, source: str) -> str:
     if path is None:
-        return os.environ.get("PLOW_TWIN_MQTT_PASSWORD", "")
+        return os.environ.get(f"PLOW_TWIN_{source}_PASSWORD", "")
     return path.read_text(encoding="utf-8").partition("\n")[0]

@@ -11,13 +11,14 @@ from typing import Any, Final
 from plow_twin.errors import UnitError
 from plow_twin.live import diagnostics
 from plow_twin.live.bridge.feeder import Feeder
-from plow_twin.live.bridge.source import BATCH, Bridge, BridgeError
+from plow_twin.live.bridge.source import BATCH, Bridge, BridgeError, Reporting
 from plow_twin.live.load_model import read_load_model
 from plow_twin.live.parameters import Settings
 from plow_twin.live.part import Part
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
+from plow_twin.record.map_file import OPCUA
 from plow_twin.record.mapping import Role, read_map, stamps_by, with_units
 from plow_twin.record.messages import DiagnosticStatus, JointState, Message
 from plow_twin.record.sources import Arrived
@@ -157,7 +158,8 @@ class BridgeFront:
 
     def parts(self) -> dict[str, Part]:
         """Return the diagnostics by part."""
-        return self._health.parts("active", "", self.runtime, time.monotonic_ns())
+        parts = self._health.parts("active", "", self.runtime, time.monotonic_ns())
+        return parts | ({"source": self._bridge.part()} if isinstance(self._bridge, Reporting) else {})
 
     def _loop(self, stop_asked: Callable[[], bool], give_up: float) -> None:
         inputs, bridge, trouble = self.runtime.inputs, self._bridge, ""
@@ -216,6 +218,8 @@ def _roles(
     if topics is None and mapping is None:
         raise BridgeError("mapping: got none, expected one that names the topics")
     roles = {name: role for name, role in read_map(mapping, topics).items() if name in _TAKEN}
+    if topics is None and any(role.message_type == OPCUA for role in roles.values()):
+        raise BridgeError("mapping: got nodes, expected topics: nodes are those of opc.tcp://HOST:PORT")
     if ("drive" in roles) != modelled or {"drive", "excitation"} <= roles.keys():
         raise BridgeError("mapping: expected drive and load_model together, and no excitation beside them")
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():

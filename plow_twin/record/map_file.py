@@ -22,6 +22,13 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "forces": PAIR_NAMES,
     "drive": ("power", "chain_force", "speed", "depth", "position"),
 }
+#: Type of a topic whose fields are nodes of an OPC UA server.
+OPCUA: Final = "opcua"
+#: Which stamp of a node's values is that of the sample: the sensor's, or the server's.
+SOURCE_STAMP: Final = "source"
+SERVER_STAMP: Final = "server"
+#: Keys that a node may have, beside its identifier.
+_NODE_KEYS: Final = ("scale", "offset", "unit", "limits")
 #: Key of a mapping beside the roles: the model of the load from the drive's signals.
 LOAD_MODEL: Final = "load_model"
 #: Units in SI, by what they measure.
@@ -48,7 +55,10 @@ QUANTITIES: Final = {
     **{("forces", name): "force" for name in PAIR_NAMES},
 }
 
-_PLACE: Final[Schema] = {"type": ["string", "integer"], "description": "the name of a column or a path"}
+_PLACE: Final[Schema] = {
+    "type": ["string", "integer"],
+    "description": "the name of a column, a path, or {node: identifier}",
+}
 _NUMBER: Final[Schema] = {"type": "number", "description": "a finite number"}
 _LIMITS: Final[Schema] = {
     "anyOf": [
@@ -78,7 +88,7 @@ def read_map_file(path: Path) -> dict[str, Any]:
 
     given, problems = read_yaml(path, "mapping", ", ".join(ROLES))
     if isinstance(given, dict):
-        given = {role: _for_each(role, entry) for role, entry in given.items()}
+        given = {role: _nodes_as_fields(role, _for_each(role, entry)) for role, entry in given.items()}
     problems = problems or validate(given, map_schema(), "mapping")
     if problems:
         raise MapError(problems, str(path))
@@ -103,6 +113,31 @@ def _for_each(role: Any, entry: Any) -> Any:
         for key, value in entry.items()
         if value is not None
     }
+
+
+def _nodes_as_fields(role: Any, entry: Any) -> Any:
+    """Return a role whose fields name nodes (`fx: {node: ns=2;s=Load.Fx, unit: kN}`) in the form of the others."""
+    if role not in ROLES or not isinstance(entry, dict):
+        return entry
+    named = {**entry, **(entry["fields"] if isinstance(entry.get("fields"), dict) else {})}
+    nodes = {name: named[name] for name in ROLES[role] if _is_node(named.get(name))}
+    if not nodes:
+        return entry
+    rest = {key: value for key, value in entry.items() if key not in nodes}
+    others = {name: field for name, field in rest.get("fields", {}).items() if name not in nodes}
+    fields = {**others, **{name: node["node"] for name, node in nodes.items()}}
+    for key in _NODE_KEYS:
+        own = {name: node[key] for name, node in nodes.items() if key in node}
+        if own:
+            given = rest.get(key)
+            rest[key] = {**(given if isinstance(given, dict) else {}), **own}
+        elif isinstance(rest.get(key), dict):  # one for all names: those without a node have none
+            rest[key] = {name: value for name, value in rest[key].items() if name in fields or name not in ROLES[role]}
+    return {"stamp": SOURCE_STAMP, "stamp_unit": "ns", **rest, "topic": role, "type": OPCUA, "fields": fields}
+
+
+def _is_node(field: Any) -> bool:
+    return isinstance(field, dict) and isinstance(field.get("node"), str) and set(field) <= {"node", *_NODE_KEYS}
 
 
 def map_error(path: Path, key: str, got: object, expected: str) -> MapError:

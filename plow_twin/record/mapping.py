@@ -11,7 +11,17 @@ from typing import Any, Final
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
-from plow_twin.record.map_file import LOAD_MODEL, QUANTITIES, ROLES, UNITS, map_error, read_map_file
+from plow_twin.record.map_file import (
+    LOAD_MODEL,
+    OPCUA,
+    QUANTITIES,
+    ROLES,
+    SERVER_STAMP,
+    SOURCE_STAMP,
+    UNITS,
+    map_error,
+    read_map_file,
+)
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
@@ -279,9 +289,21 @@ def _role(path: Path, role: str, entry: Mapping[str, Any], topics: Mapping[str, 
     _check_columns(path, role, found)
     if "stamp_unit" in entry:
         _check_stamp_unit(path, role, found)
-    if not isinstance(kind, Columns) and kind != "json" and found.stamp not in ("header", "log"):
+    if kind == OPCUA:
+        _check_nodes(path, role, found)
+    elif not isinstance(kind, Columns) and kind != "json" and found.stamp not in ("header", "log"):
         raise map_error(path, f"{role}.stamp", found.stamp, f"header or log for {kind}")
     return found
+
+
+def _check_nodes(path: Path, role: str, found: Role) -> None:
+    """Raise a `MapError` for a key that samples of nodes do not have."""
+    if found.stamp not in (SOURCE_STAMP, SERVER_STAMP):
+        raise map_error(path, f"{role}.stamp", found.stamp, f"{SOURCE_STAMP} or {SERVER_STAMP} for nodes")
+    if found.stamp_unit != "ns":
+        raise map_error(path, f"{role}.stamp_unit", found.stamp_unit, "none: the stamps of nodes are dates")
+    if found.sequence:
+        raise map_error(path, f"{role}.sequence", found.sequence, "none: the server numbers its messages")
 
 
 def with_units(roles: Mapping[str, Role], units: Mapping[str, str]) -> dict[str, Role]:

@@ -6,12 +6,9 @@ import ssl
 import threading
 import time
 from collections import deque
-from dataclasses import dataclass
-from ipaddress import ip_address
-from pathlib import Path
 from typing import Any, Final
-from urllib.parse import urlsplit
 
+from plow_twin.live.bridge.access import Access, host_and_port, is_loopback
 from plow_twin.live.bridge.source import BridgeError, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
@@ -19,25 +16,6 @@ from plow_twin.record.sources import Arrived
 #: Most messages that wait to be read; further ones are counted as lost.
 _QUEUE: Final = 100_000
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
-
-
-@dataclass(frozen=True)
-class Access:
-    """Address and credentials of a broker.
-
-    `url` is `mqtt://HOST:PORT`, or `mqtts://` with TLS; without a host it is this machine. `user` and `password` may be
-    empty. `ca`, `certificate` and `key` are PEM files; without `ca` those of the system are trusted. `plain` allows a
-    connection to another machine without TLS.
-    """
-
-    url: str
-    user: str = ""
-    password: str = ""
-    ca: Path | None = None
-    certificate: Path | None = None
-    key: Path | None = None
-    plain: bool = False
-    client_id: str = "plow_twin"
 
 
 class Mqtt:
@@ -162,24 +140,8 @@ class Mqtt:
 
 def _address(access: Access) -> tuple[str, int, bool]:
     """Return host, port and whether TLS is used."""
-    expected = "mqtt://HOST:PORT or mqtts://HOST:PORT"
-    try:
-        parts = urlsplit(access.url)
-        host, port = parts.hostname or "localhost", parts.port or _PORTS[parts.scheme]
-    except (ValueError, KeyError) as error:
-        raise BridgeError(f"{access.url}: expected {expected}") from error
-    if parts.username or parts.password or parts.path.strip("/"):
-        raise BridgeError(f"{parts.scheme}://...{parts.path}: expected {expected}, user and topics stand elsewhere")
-    tls = parts.scheme == "mqtts"
-    if not tls and not access.plain and not _is_loopback(host):
+    scheme, host, port = host_and_port(access, _PORTS)
+    tls = scheme == "mqtts"
+    if not tls and not access.plain and not is_loopback(host):
         raise BridgeError(f"{access.url}: got another machine without TLS, expected mqtts:// or this machine")
     return host, port, tls
-
-
-def _is_loopback(host: str) -> bool:
-    if host == "localhost":
-        return True
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return False

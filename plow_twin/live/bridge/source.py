@@ -5,9 +5,10 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.live.part import Part
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, TopicType, columns_of
 from plow_twin.scene_file.csv_rows import delimiter_of
@@ -55,6 +56,14 @@ class Bridge(Protocol):
 
     def close(self) -> None:
         """Close the source."""
+
+
+@runtime_checkable
+class Reporting(Protocol):
+    """A source with figures of its own."""
+
+    def part(self) -> Part:
+        """Return level, message and values for the part `source` of the diagnostics."""
 
 
 def read_json(data: bytes) -> dict[str, Any] | None:

@@ -1,0 +1,341 @@
+"""Samples from an OPC UA server: subscribed to, and read from its history where a message or a time is missing."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Any, Final
+
+from asyncua import ua
+from asyncua.ua.uaerrors import UaError
+
+from plow_twin.live.bridge.access import Access, host_and_port, is_loopback
+from plow_twin.live.bridge.opcua.link import PUBLISHING_MS, Link, Revised
+from plow_twin.live.bridge.opcua.readings import Counts, overflowed, reading
+from plow_twin.live.bridge.opcua.samples import Samples
+from plow_twin.live.bridge.source import BATCH, BridgeError
+from plow_twin.live.part import Part
+from plow_twin.record.map_file import OPCUA, SERVER_STAMP, SOURCE_STAMP
+from plow_twin.record.mapping import Role
+from plow_twin.record.merging import StampOf
+from plow_twin.record.sources import Arrived, TopicType
+
+#: Most samples that wait to be read; further ones are counted as lost, those of the history wait.
+_QUEUE: Final = 100_000
+_PORTS: Final = {"opc.tcp": 4840}
+#: Values with one stamp come in one message or in two that follow each other; the rest is for a busy machine [s].
+_WAIT_S: Final = 5e-3 * PUBLISHING_MS
+#: The history is read in pieces of this length [ns].
+_PIECE_NS: Final = 10_000_000_000
+#: Values of one node may have been on their way when those of another had arrived [ns].
+_OVERLAP_NS: Final = 1_000_000_000
+#: What a server has sent may reach its history so much later [s].
+_HISTORY_LAG_S: Final = 5.0
+#: First wait before another attempt to connect, and the longest [s].
+_FIRST_WAIT_S: Final = 1.0
+_LONGEST_WAIT_S: Final = 30.0
+
+
+class OpcUa:
+    """A subscription to the nodes of a mapping that outlives a broken connection.
+
+    Parameters
+    ----------
+    access
+        The server.
+    roles
+        The mapping: each role is a topic, its fields are nodes.
+    rate_hz
+        Expected rate of the samples [Hz]; 0: not known, the server is asked for its fastest sampling.
+    connect_s
+        Longest wait for the first connection [s].
+
+    Raises
+    ------
+    BridgeError
+        The address, a node's identifier or the set of certificates is invalid, or the connection is not encrypted.
+    """
+
+    def __init__(
+        self, access: Access, roles: Mapping[str, Role], rate_hz: float = 0.0, connect_s: float = 20.0
+    ) -> None:
+        self.ends = False
+        self.finished = False
+        self.connected = False
+        self.lost = 0
+        self.trouble = ""
+        self._access, self._connect_s = access, connect_s
+        _, self.host, self.port = host_and_port(access, _PORTS, has_path=True)
+        _check_encryption(access, self.host)
+        self._sampling_ms = 1e3 / rate_hz if rate_hz else 0.0
+        self._roles = {role.topic: role for role in roles.values() if role.message_type == OPCUA}
+        if not self._roles:
+            raise BridgeError("mapping: got no role with nodes, expected fields like fx: {node: 'ns=2;s=Load.Fx'}")
+        self._nodes = sorted({node for role in self._roles.values() for node in role.fields.values()})
+        self._ids = [_node_id(node) for node in self._nodes]
+        self._samples = {
+            topic: Samples(sorted(set(role.fields.values())), _WAIT_S) for topic, role in self._roles.items()
+        }
+        #: topics of each node, by its number
+        self._topics_of = [
+            [topic for topic, role in self._roles.items() if node in role.fields.values()] for node in self._nodes
+        ]
+        self._counts = Counts()
+        self._revised: Revised | None = None
+        self._queue: deque[Arrived] = deque()
+        self._arrived = threading.Event()
+        self._answer = threading.Event()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="opcua", daemon=True)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._link: Link | None = None
+        #: values that come while the history is read
+        self._held_back: list[tuple[list[tuple[int, Any]], bool]] | None = None
+        #: why the history of this connection cannot be read; empty: it may be
+        self._no_history = ""
+        logging.getLogger("asyncua").addHandler(logging.NullHandler())
+
+    def topics(self) -> dict[str, TopicType]:
+        """Return the roles of nodes."""
+        return dict.fromkeys(self._roles, OPCUA)
+
+    def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
+        """Connect and subscribe."""
+        self._thread.start()
+        if not self._answer.wait(self._connect_s):
+            self.trouble = f"no answer within {self._connect_s:g} s"
+        if not self.connected:
+            trouble = self.trouble
+            self.close()
+            raise BridgeError(
+                trouble if trouble.startswith(("node:", self._access.url)) else f"{self._access.url}: {trouble}"
+            )
+
+    def poll(self, timeout_s: float) -> list[Arrived]:
+        """Return the samples that have arrived."""
+        if not self._queue:
+            self._arrived.wait(timeout_s)
+        self._arrived.clear()
+        return [self._queue.popleft() for _ in range(min(len(self._queue), BATCH))]
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._stop.set()
+        if self._loop is not None and self._task is not None:
+            with suppress(RuntimeError):  # it has ended by itself
+                self._loop.call_soon_threadsafe(self._task.cancel)
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def part(self) -> Part:
+        """Return level, message and values of this source for the diagnostics."""
+        revised, complaint = self._revised, ""
+        values = {"server": self._access.url, "connected": str(self.connected).lower()}
+        if revised is not None:
+            values |= {key: f"{value:g}" for key, value in asdict(revised).items()}
+            complaint = revised.complaint(self._sampling_ms)
+        values |= {key: f"{value:g}" for key, value in asdict(self._counts).items()}
+        values["no_history"] = self._no_history
+        said = self.trouble or complaint
+        return int(bool(said)), said, values
+
+    def _run(self) -> None:
+        with suppress(asyncio.CancelledError):
+            asyncio.run(self._serve())
+
+    async def _serve(self) -> None:
+        """Connect again and again until a stop is asked for."""
+        self._loop, self._task = asyncio.get_running_loop(), asyncio.current_task()
+        wait_s = _FIRST_WAIT_S
+        while not self._stop.is_set():
+            link = Link(self._access, self.host, self._ids, self._sampling_ms, self._take, self._counts)
+            try:
+                await self._follow(link)
+            except Exception as error:  # a malformed answer ends in any error of the library
+                self.trouble = self._words(error)
+            finally:
+                wait_s = _FIRST_WAIT_S if self.connected else wait_s
+                self.connected, self._held_back = False, None
+                await link.close()
+            if not self._answer.is_set():  # the first attempt decides whether the twin starts
+                self._answer.set()
+                return
+            await asyncio.sleep(wait_s * random.uniform(0.5, 1.0))
+            wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
+
+    async def _follow(self, link: Link) -> None:
+        """Take what comes over one connection until it breaks or a stop is asked for."""
+        again = self._answer.is_set()
+        self._held_back, self._no_history, self._link = [], "", link
+        self._revised = await link.open()
+        self.connected, self.trouble = True, ""
+        self._answer.set()
+        if again:
+            self._counts.breaks += 1
+            self._counts.breaks_filled += await self._fill(await self._first_values())
+        await self._release()
+        while not self._stop.is_set() and not link.trouble:
+            await asyncio.sleep(_WAIT_S)
+            self._pass_on(time.monotonic())
+        if link.trouble:
+            self.trouble = f"the connection broke: {link.trouble}; it is tried again"
+
+    async def _first_values(self) -> list[tuple[int, Any]]:
+        """Return the first values of the new subscription: the history is read up to them."""
+        give_up = time.monotonic() + 1.0
+        while not self._held_back and time.monotonic() < give_up:
+            await asyncio.sleep(0.01)
+        return self._held_back[0][0] if self._held_back else []
+
+    async def _release(self) -> None:
+        """Take the values that came while the history was read."""
+        while self._held_back:
+            waiting, self._held_back = self._held_back, []
+            for values, lost in waiting:
+                await self._take_now([item for item in values if self._is_new(*item)], lost)
+        self._held_back = None
+
+    async def _take(self, values: list[tuple[int, Any]], lost: bool) -> None:
+        """Take values of the subscription, after those that were lost before them."""
+        if self._held_back is not None:
+            self._held_back.append((values, lost))
+            return
+        self._held_back = []
+        try:
+            await self._take_now(values, lost)
+        finally:
+            await self._release()
+
+    async def _take_now(self, values: list[tuple[int, Any]], lost: bool) -> None:
+        overflows = sum(overflowed(value) for _, value in values)
+        self._counts.overflows += overflows
+        if (lost or overflows) and any(min(samples.newest_ns.values()) for samples in self._samples.values()):
+            await self._fill(values)
+            values = [item for item in values if self._is_new(*item)]
+        now_s = time.monotonic()
+        for number, value in values:
+            self._add(number, value, now_s)
+        self._pass_on(now_s)
+
+    def _is_new(self, number: int, value: Any) -> bool:
+        """Return whether a value is newer than all of its node."""
+        found = reading(value, self._by_server(number), Counts())
+        return found is not None and found[0] > self._newest_ns(number)
+
+    def _by_server(self, number: int) -> bool:
+        return self._roles[self._topics_of[number][0]].stamp == SERVER_STAMP
+
+    def _newest_ns(self, number: int) -> int:
+        return self._samples[self._topics_of[number][0]].newest_ns[self._nodes[number]]
+
+    def _add(self, number: int, value: Any, now_s: float) -> None:
+        found = reading(value, self._by_server(number), self._counts)
+        if found is not None:
+            for topic in self._topics_of[number]:
+                samples, node = self._samples[topic], self._nodes[number]
+                if samples.newest_ns[node] or topic == "travel":  # a speed holds until the next one
+                    samples.add(node, *found, now_s)
+                else:
+                    samples.begin(node, *found)
+
+    async def _fill(self, up_to: list[tuple[int, Any]]) -> bool:
+        """Take from the history what is between the newest values and these; return whether nothing is missing."""
+        ends_ns: dict[int, int] = {}
+        for number, value in up_to:
+            found = reading(value, self._by_server(number), Counts())
+            if found is not None:
+                ends_ns.setdefault(number, found[0])
+        if not self._no_history:
+            try:
+                await self._read_history(ends_ns)
+            except UaError as error:
+                self._no_history = self._words(error)
+        missing_ns = max((end_ns - self._newest_ns(number) for number, end_ns in ends_ns.items()), default=0)
+        if missing_ns <= 0:
+            return True
+        self._counts.unfilled_s += missing_ns * 1e-9
+        self.lost += 1
+        return False
+
+    async def _read_history(self, ends_ns: Mapping[int, int]) -> None:
+        """Read the history in pieces, until each node has a value at its end."""
+        end_ns = max(ends_ns.values(), default=time.time_ns())
+        reached_ns, found = 0, 0
+        give_up = time.monotonic() + _HISTORY_LAG_S
+        while any(self._newest_ns(number) < end for number, end in ends_ns.items()):
+            newest_ns = max(self._newest_ns(number) for number in range(len(self._nodes)))
+            reached_ns = max(reached_ns, newest_ns - _OVERLAP_NS)
+            piece_ns = min(reached_ns + _PIECE_NS, end_ns)
+            new = await self._take_piece(reached_ns, piece_ns)
+            found += new
+            if piece_ns < end_ns:
+                reached_ns = piece_ns
+            elif new:
+                give_up = time.monotonic() + _HISTORY_LAG_S
+            elif time.monotonic() > give_up:
+                break
+            else:
+                await asyncio.sleep(0.2)
+        if not found and any(self._newest_ns(number) < end for number, end in ends_ns.items()):
+            self._no_history = "the server's history is empty"
+
+    async def _take_piece(self, begin_ns: int, end_ns: int) -> int:
+        """Take the values of the history in a piece of time; return the number of new ones."""
+        assert self._link is not None
+        values = await self._link.history(begin_ns, end_ns)
+        new = [item for item in values if self._is_new(*item)]
+        self._counts.values_filled += len(new)
+        now_s = time.monotonic()
+        for number, value in new:
+            self._add(number, value, now_s)
+        self._pass_on(float("-inf"))
+        while len(self._queue) > _QUEUE // 2:
+            await asyncio.sleep(0.01)
+        return len(new)
+
+    def _pass_on(self, now_s: float) -> None:
+        """Hand over the samples that are complete."""
+        log_ns = time.time_ns()
+        for topic, samples in self._samples.items():
+            for stamp_ns, values in samples.take(now_s):
+                if len(self._queue) >= _QUEUE:
+                    self.lost += 1
+                    continue
+                content = {SOURCE_STAMP: stamp_ns, SERVER_STAMP: stamp_ns, **values}
+                self._queue.append(Arrived(topic, log_ns, content))
+            self.lost += samples.take_incomplete()
+        if self._queue:
+            self._arrived.set()
+
+    def _words(self, error: BaseException) -> str:
+        if isinstance(error, BridgeError):
+            return str(error)
+        if isinstance(error, TimeoutError):
+            return f"no server at {self.host}:{self.port}: no answer"
+        kind = "refused" if isinstance(error, UaError) else f"no server at {self.host}:{self.port}"
+        return f"{kind}: {error or type(error).__name__}"
+
+
+def _node_id(text: str) -> ua.NodeId:
+    try:
+        return ua.NodeId.from_string(text)
+    except (UaError, ValueError) as error:
+        raise BridgeError(f"node: got {text!r}, expected an identifier like 'ns=2;s=Load.Fx' or 'ns=2;i=7'") from error
+
+
+def _check_encryption(access: Access, host: str) -> None:
+    given = (access.certificate, access.key, access.ca)
+    if any(given) and not all(given):
+        raise BridgeError("certificates: expected --tls-cert, --tls-key and --tls-ca (of the server) together")
+    if not any(given) and not access.plain and not is_loopback(host):
+        raise BridgeError(
+            f"{access.url}: got another machine without certificates, expected --tls-cert or this machine"
+        )

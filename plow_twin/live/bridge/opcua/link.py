@@ -1,0 +1,244 @@
+"""A connection to an OPC UA server: one subscription, and the history of what it has missed."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from asyncua import ua
+from asyncua.client.client import Client
+from asyncua.ua.attribute_ids import AttributeIds
+from asyncua.ua.status_codes import StatusCodes
+from asyncua.ua.uaerrors import UaError
+
+from plow_twin.live.bridge.access import Access
+from plow_twin.live.bridge.opcua.readings import Counts, date_of
+from plow_twin.live.bridge.opcua.security import secure
+from plow_twin.live.bridge.source import BridgeError
+
+#: Interval at which the server is asked to send [ms]: two thirds of the age that a sample may have at the twin.
+PUBLISHING_MS: Final = 10.0
+#: Values of a node that the server is asked to keep between two messages: 1 s at 10 kHz.
+_QUEUE: Final = 10_000
+#: A server that has nothing to send says so at this interval [s]; three times that long it is believed to be there.
+_KEEPALIVE_S: Final = 2.0
+#: The server keeps a subscription for so long without its client [s].
+_LIFETIME_S: Final = 60.0
+#: Messages that are asked for again at once.
+_MOST_AGAIN: Final = 100
+#: Longest wait for an answer [s].
+_ANSWER_S: Final = 10.0
+#: Longest wait for the end of a session [s].
+_CLOSE_S: Final = 2.0
+#: Sequence numbers begin again at 1 behind this.
+_LAST_NUMBER: Final = 2**32 - 1
+
+#: Takes values by number of their node, and whether values before them are missing.
+Take = Callable[[list[tuple[int, Any]], bool], Awaitable[None]]
+
+
+@dataclass(frozen=True)
+class Revised:
+    """What the server grants: intervals [ms] and values kept between two messages."""
+
+    publishing_ms: float
+    sampling_ms: float
+    queue: int
+
+    def complaint(self, sampling_ms: float) -> str:
+        """Return in words what falls short of what was asked for; empty: nothing."""
+        slow = self.sampling_ms > max(1.01 * sampling_ms, self.publishing_ms if sampling_ms == 0.0 else 0.0)
+        found = [f"samples every {self.sampling_ms:g} ms, asked every {sampling_ms:g} ms"] * slow
+        needed = self.publishing_ms / sampling_ms if sampling_ms else 1.0
+        found += [f"keeps {self.queue} values, {needed:.0f} come between two messages"] * (self.queue < needed)
+        return f"the server {'; '.join(found)}" if found else ""
+
+
+class Link:
+    """A connection with its subscription.
+
+    Parameters
+    ----------
+    access, host
+        The server.
+    nodes
+        Identifiers of the nodes.
+    sampling_ms
+        Sampling interval that is asked for [ms]; 0: the fastest that the server has.
+    take
+        Receives the values.
+    counts
+        Receives losses.
+    """
+
+    def __init__(
+        self, access: Access, host: str, nodes: Sequence[ua.NodeId], sampling_ms: float, take: Take, counts: Counts
+    ) -> None:
+        self._access, self._host, self._nodes = access, host, list(nodes)
+        self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
+        self._client = Client(access.url, timeout=_ANSWER_S)
+        if access.user:
+            self._client.set_user(access.user)
+            self._client.set_password(access.password)
+        self._subscription = 0
+        self._next_number: int | None = None
+        self._keepalive_s = _KEEPALIVE_S
+        self._heard_s = 0.0
+        #: why the subscription has ended
+        self._ended = ""
+
+    async def open(self) -> Revised:
+        """Connect and subscribe; return what the server grants.
+
+        Raises
+        ------
+        BridgeError
+            The certificate is not trusted, or a node cannot be subscribed to.
+        OSError, UaError, TimeoutError
+            There is no server, or it refuses.
+        """
+        if self._access.certificate is not None:
+            await secure(self._client, self._access, self._host)
+        await self._client.connect()
+        return await self._subscribe()
+
+    async def close(self) -> None:
+        """Disconnect."""
+        try:
+            await asyncio.wait_for(self._client.disconnect(), _CLOSE_S)
+        except Exception:  # whatever the state of the connection was
+            self._client.disconnect_socket()
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing can come any more; empty: the server answers."""
+        if self._ended:
+            return self._ended
+        if not self._client.uaclient.has_transport:
+            return "the server has closed it"
+        silent_s = time.monotonic() - self._heard_s
+        return f"no sign of life for {silent_s:.0f} s" if silent_s > 3.0 * self._keepalive_s else ""
+
+    async def history(self, begin_ns: int, end_ns: int) -> list[tuple[int, Any]]:
+        """Return the values of all nodes between two stamps [ns], both included, by number of the node.
+
+        Raises
+        ------
+        UaError
+            The server keeps no history of some node.
+        """
+        details = ua.ReadRawModifiedDetails(
+            IsReadModified=False,
+            StartTime=date_of(begin_ns),
+            EndTime=date_of(end_ns + 1000),
+            NumValuesPerNode=0,
+            ReturnBounds=False,
+        )
+        found: list[tuple[int, Any]] = []
+        wanted = [(number, ua.HistoryReadValueId(NodeId=node)) for number, node in enumerate(self._nodes)]
+        while wanted:
+            asked = ua.HistoryReadParameters(details, ua.TimestampsToReturn.Both, False, [read for _, read in wanted])
+            results = await self._client.uaclient.history_read(asked)
+            more = []
+            for (number, read), result in zip(wanted, results, strict=True):
+                result.StatusCode.check()
+                found += [(number, value) for value in getattr(result.HistoryData, "DataValues", None) or ()]
+                if result.ContinuationPoint:
+                    more.append(
+                        (number, ua.HistoryReadValueId(read.NodeId, ContinuationPoint=result.ContinuationPoint))
+                    )
+            wanted = more
+        return found
+
+    async def _subscribe(self) -> Revised:
+        asked = ua.CreateSubscriptionParameters(
+            RequestedPublishingInterval=PUBLISHING_MS,
+            RequestedLifetimeCount=round(_LIFETIME_S * 1e3 / PUBLISHING_MS),
+            RequestedMaxKeepAliveCount=round(_KEEPALIVE_S * 1e3 / PUBLISHING_MS),
+            MaxNotificationsPerPublish=0,
+            PublishingEnabled=True,
+            Priority=0,
+        )
+        self._heard_s = time.monotonic()
+        granted = await self._client.uaclient.create_subscription(asked, self._on_publish)
+        self._subscription = granted.SubscriptionId
+        self._keepalive_s = granted.RevisedPublishingInterval * granted.RevisedMaxKeepAliveCount * 1e-3
+        # each stamp is a value, for samples are made of values with one stamp
+        by_stamp = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
+        results = await self._monitor(range(len(self._nodes)), by_stamp)
+        refused = [
+            number
+            for number, result in results.items()
+            if result.StatusCode.value
+            in (StatusCodes.BadMonitoredItemFilterUnsupported, StatusCodes.BadFilterNotAllowed)
+        ]
+        if refused:
+            results |= await self._monitor(refused, None)
+        for number, result in results.items():
+            if not result.StatusCode.is_good():
+                node = self._nodes[number].to_string()
+                raise BridgeError(f"node: got {node}, expected a node of the server: {result.StatusCode.name}")
+        return Revised(
+            granted.RevisedPublishingInterval,
+            max(result.RevisedSamplingInterval for result in results.values()),
+            min(result.RevisedQueueSize for result in results.values()),
+        )
+
+    async def _monitor(self, numbers: Sequence[int], trigger: Any) -> dict[int, ua.MonitoredItemCreateResult]:
+        items = [
+            ua.MonitoredItemCreateRequest(
+                ua.ReadValueId(self._nodes[number], AttributeIds.Value),
+                ua.MonitoringMode.Reporting,
+                ua.MonitoringParameters(
+                    ClientHandle=number,
+                    SamplingInterval=self._sampling_ms,
+                    Filter=trigger,
+                    QueueSize=_QUEUE,
+                    DiscardOldest=True,
+                ),
+            )
+            for number in numbers
+        ]
+        asked = ua.CreateMonitoredItemsParameters(self._subscription, ua.TimestampsToReturn.Both, items)
+        return dict(zip(numbers, await self._client.uaclient.create_monitored_items(asked), strict=True))
+
+    async def _on_publish(self, result: ua.PublishResult) -> None:
+        self._heard_s = time.monotonic()
+        message = result.NotificationMessage
+        if not message.NotificationData:
+            return
+        missing = self._missing(message.SequenceNumber)
+        lost = 0
+        for number in missing[:_MOST_AGAIN]:
+            again = await self._again(number)
+            lost += again is None
+            if again is not None:
+                await self._take_message(again, lost=False)
+        lost += len(missing[_MOST_AGAIN:])
+        self._counts.notifications_lost += lost
+        await self._take_message(message, lost=lost > 0)
+
+    def _missing(self, number: int) -> range:
+        """Return the sequence numbers that should have come before this one."""
+        expected, self._next_number = self._next_number, number % _LAST_NUMBER + 1
+        return range(0) if expected is None or number < expected else range(expected, number)
+
+    async def _again(self, number: int) -> ua.NotificationMessage | None:
+        """Return a message that the server may still have."""
+        try:
+            message = await self._client.uaclient.session.republish(self._subscription, number)
+        except UaError:
+            return None
+        return message if message.NotificationData else None
+
+    async def _take_message(self, message: ua.NotificationMessage, *, lost: bool) -> None:
+        values: list[tuple[int, Any]] = []
+        for part in message.NotificationData:
+            if isinstance(part, ua.DataChangeNotification):
+                values += [(item.ClientHandle, item.Value) for item in part.MonitoredItems]
+            elif isinstance(part, ua.StatusChangeNotification):
+                self._ended = f"the subscription has ended: {part.Status.name}"
+        await self._take(values, lost)

@@ -1,0 +1,80 @@
+"""Values of OPC UA as numbers with a stamp, and the counts of values that are not used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from typing import Any, Final
+
+from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Value
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_MICROSECOND: Final = timedelta(microseconds=1)
+_SEVERITY: Final = 0xC0000000
+_UNCERTAIN: Final = 0x40000000
+#: Bits of a status that say: values before this one were dropped from the server's queue.
+_OVERFLOW: Final = 0x00000480
+
+
+@dataclass
+class Counts:
+    """Counts of values of a server."""
+
+    values: int = 0
+    bad: int = 0
+    uncertain: int = 0
+    not_numbers: int = 0
+    unstamped: int = 0
+    #: messages that are missing in the server's numbering, and were not sent again
+    notifications_lost: int = 0
+    #: values before which the server's queue overflowed
+    overflows: int = 0
+    breaks: int = 0
+    breaks_filled: int = 0
+    values_filled: int = 0
+    #: time that neither a message nor the history covers
+    unfilled_s: float = 0.0
+
+
+def overflowed(value: Any) -> bool:
+    """Return whether the server dropped values before this one."""
+    return value.StatusCode is not None and value.StatusCode.value & _OVERFLOW == _OVERFLOW
+
+
+def reading(data: Any, by_server: bool, counts: Counts) -> tuple[int, Value] | None:
+    """Return stamp [ns] and value of a `DataValue`, or None for a value without a stamp.
+
+    A value whose status is Bad or Uncertain, and one that is no number, is not measured. A source without a stamp has
+    that of the server.
+    """
+    counts.values += 1
+    stamp_ns = None if by_server else _stamp_ns(data.SourceTimestamp, data.SourcePicoseconds)
+    if stamp_ns is None:
+        stamp_ns = _stamp_ns(data.ServerTimestamp, data.ServerPicoseconds)
+    if stamp_ns is None:
+        counts.unstamped += 1
+        return None
+    severity = 0 if data.StatusCode is None else data.StatusCode.value & _SEVERITY
+    value = data.Value.Value if data.Value is not None else None
+    if severity:
+        counts.uncertain += severity == _UNCERTAIN
+        counts.bad += severity != _UNCERTAIN
+        return stamp_ns, NOT_MEASURED
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        counts.not_numbers += 1
+        return stamp_ns, NOT_MEASURED
+    return stamp_ns, float(value)
+
+
+def _stamp_ns(time: datetime | None, picoseconds: int | None) -> int | None:
+    """Return a time [ns], which OPC UA resolves to 100 ns, and from there on in units of 10 ps."""
+    if time is None:
+        return None
+    time = time if time.tzinfo else time.replace(tzinfo=UTC)
+    stamp_ns = (time - _EPOCH) // _MICROSECOND * 1000 + (picoseconds or 0) // 100
+    return stamp_ns if stamp_ns > 0 else None  # 1601 stands for no time
+
+
+def date_of(stamp_ns: int) -> datetime:
+    """Return a stamp as a date, cut to microseconds."""
+    return _EPOCH + stamp_ns // 1000 * _MICROSECOND

@@ -1,0 +1,91 @@
+"""Values of OPC UA nodes put together to samples by their stamps."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Sequence
+from typing import Final
+
+#: A value that is not to be used; it reads as not measured.
+NOT_MEASURED: Final = ""
+Value = float | str
+#: Most stamps that wait for values.
+_MOST_WAITING: Final = 10_000
+
+
+class Samples:
+    """Samples of one role: the values of its nodes at one stamp.
+
+    A server does not send a value again that has not changed: a node without a value at a stamp keeps the one before.
+    A stamp is complete when each node has a value there or at a later one; else it waits for `wait_s`.
+
+    Parameters
+    ----------
+    nodes
+        The nodes of the role.
+    wait_s
+        How long the values of a stamp may be apart when they arrive [s].
+    """
+
+    def __init__(self, nodes: Sequence[str], wait_s: float) -> None:
+        self._wait_s = wait_s
+        self._stamps_ns: list[int] = []
+        #: time of arrival of the first value [s], and the values by node
+        self._waiting: dict[int, tuple[float, dict[str, Value]]] = {}
+        #: stamp of the newest value of each node [ns]
+        self.newest_ns = dict.fromkeys(nodes, 0)
+        self._held: dict[str, Value] = {}
+        #: nodes of which only the value before the first sample has come
+        self._begun: set[str] = set()
+        self._released_ns = 0
+        #: late stamps that were dropped, for the other values of that time had been used
+        self._incomplete = 0
+
+    def add(self, node: str, stamp_ns: int, value: Value, now_s: float) -> None:
+        """Take in a value; the same stamp of a node again is ignored."""
+        if stamp_ns == self.newest_ns[node]:
+            return
+        # the clock of a first value, perhaps the server's at its start, says nothing of those after it
+        self.newest_ns[node] = stamp_ns if node in self._begun else max(stamp_ns, self.newest_ns[node])
+        self._begun.discard(node)
+        if stamp_ns not in self._waiting:
+            insort(self._stamps_ns, stamp_ns)
+            self._waiting[stamp_ns] = (now_s, {})
+        self._waiting[stamp_ns][1].setdefault(node, value)
+
+    def begin(self, node: str, stamp_ns: int, value: Value) -> None:
+        """Take in the value that a node had before the first sample: it completes that sample, and is none itself."""
+        self.newest_ns[node] = stamp_ns
+        self._begun.add(node)
+        self._held[node] = value
+
+    def take(self, now_s: float) -> list[tuple[int, dict[str, Value]]]:
+        """Return the stamps [ns] in order, with the value of each node, that wait no longer at `now_s`."""
+        found = []
+        while self._stamps_ns and self._is_due(self._stamps_ns[0], now_s):
+            stamp_ns = self._stamps_ns.pop(0)
+            late = stamp_ns <= self._released_ns
+            values = self._waiting.pop(stamp_ns)[1] if late else self._with_held(stamp_ns)
+            if len(values) == len(self.newest_ns):
+                found.append((stamp_ns, values))
+            else:  # without all values at the start is not a loss
+                self._incomplete += late
+        return found
+
+    def take_incomplete(self) -> int:
+        """Return the number of late stamps since the last call that were dropped for want of values."""
+        found, self._incomplete = self._incomplete, 0
+        return found
+
+    def _is_due(self, stamp_ns: int, now_s: float) -> bool:
+        arrived_s, values = self._waiting[stamp_ns]
+        missing = self.newest_ns.keys() - values.keys()
+        if not missing or now_s - arrived_s > self._wait_s or len(self._stamps_ns) > _MOST_WAITING:
+            return True
+        return stamp_ns > self._released_ns and all(self.newest_ns[node] > stamp_ns for node in missing)
+
+    def _with_held(self, stamp_ns: int) -> dict[str, Value]:
+        """Return the values at a stamp, with those that have not changed since the one before."""
+        self._held |= self._waiting.pop(stamp_ns)[1]
+        self._released_ns = stamp_ns
+        return dict(self._held)

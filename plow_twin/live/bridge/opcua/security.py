@@ -1,0 +1,109 @@
+"""Certificates of a connection to an OPC UA server."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from asyncua import ua
+from asyncua.client.client import Client
+from asyncua.crypto import security_policies
+from asyncua.crypto.uacrypto import CertProperties
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+
+from plow_twin.live.bridge.access import Access
+from plow_twin.live.bridge.source import BridgeError
+
+#: Policies that are used, the strongest first.
+_POLICIES: Final = (
+    security_policies.SecurityPolicyAes256Sha256RsaPss,
+    security_policies.SecurityPolicyAes128Sha256RsaOaep,
+    security_policies.SecurityPolicyBasic256Sha256,
+)
+_MODE: Final = ua.MessageSecurityMode.SignAndEncrypt
+
+
+async def secure(client: Client, access: Access, host: str) -> None:
+    """Have a client sign and encrypt, with the strongest policy that the server offers.
+
+    Raises
+    ------
+    BridgeError
+        The server offers none, its certificate is not trusted, or a file cannot be read.
+    """
+    assert access.certificate and access.key and access.ca, "checked with the address"
+    endpoints = await client.connect_and_get_server_endpoints()
+    offered = {end.SecurityPolicyUri: end for end in endpoints if end.SecurityMode == _MODE}
+    policy = next((policy for policy in _POLICIES if policy.URI in offered), None)
+    if policy is None:
+        expected = ", ".join(policy.URI.rpartition("#")[2] for policy in _POLICIES)
+        raise BridgeError(f"{access.url}: got a server that offers no encryption, expected one of {expected}")
+    server = _first(offered[policy.URI].ServerCertificate)
+    _check_trust(x509.load_der_x509_certificate(server), _read(access.ca), host, access)
+    client.application_uri = _application_uri(_read(access.certificate), client.application_uri)
+    try:
+        await client.set_security(
+            policy,
+            CertProperties(str(access.certificate)),
+            CertProperties(str(access.key)),
+            server_certificate=CertProperties(server, "der"),
+            mode=_MODE,
+        )
+    except (OSError, ValueError, TypeError) as error:
+        raise BridgeError(f"{access.url}: the files of certificate and key cannot be used: {error}") from error
+
+
+def _first(chain: bytes) -> bytes:
+    """Return the server's certificate, without the authorities that may follow it (DER, long form of the length)."""
+    return chain[: int.from_bytes(chain[2:4], "big") + 4]
+
+
+def _read(path: Path) -> x509.Certificate:
+    try:
+        data = path.read_bytes()
+        return x509.load_pem_x509_certificate(data) if b"-----BEGIN" in data else x509.load_der_x509_certificate(data)
+    except (OSError, ValueError) as error:
+        raise BridgeError(f"{path}: got no certificate, expected PEM or DER: {error}") from error
+
+
+def _check_trust(server: x509.Certificate, trusted: x509.Certificate, host: str, access: Access) -> None:
+    """Raise a `BridgeError` unless the certificate is the trusted one, or of that authority and for this host."""
+    now = datetime.now(UTC)
+    if not server.not_valid_before_utc <= now <= server.not_valid_after_utc:
+        raise BridgeError(
+            f"{access.url}: the server's certificate is not valid now: until {server.not_valid_after_utc}"
+        )
+    if server == trusted:
+        return
+    try:
+        server.verify_directly_issued_by(trusted)
+    except (ValueError, TypeError, InvalidSignature) as error:
+        raise BridgeError(
+            f"{access.url}: certificate verify failed: it is neither {access.ca} nor issued by it"
+        ) from error
+    if host not in _hosts(server):
+        raise BridgeError(f"{access.url}: the server's certificate is for {', '.join(_hosts(server))}, not for {host}")
+
+
+def _names(certificate: x509.Certificate) -> x509.SubjectAlternativeName | None:
+    try:
+        return certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return None
+
+
+def _hosts(certificate: x509.Certificate) -> list[str]:
+    names = _names(certificate)
+    if names is None:
+        return []
+    addresses = [str(found) for found in names.get_values_for_type(x509.IPAddress)]
+    return [*names.get_values_for_type(x509.DNSName), *addresses]
+
+
+def _application_uri(certificate: x509.Certificate, otherwise: str) -> str:
+    """Return the name of this application in its certificate: servers compare the two."""
+    names = _names(certificate)
+    uris = names.get_values_for_type(x509.UniformResourceIdentifier) if names else []
+    return uris[0] if uris else otherwise

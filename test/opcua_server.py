@@ -1,0 +1,84 @@
+"""A real OPC UA server in a process of its own: `opcua_server.py PORT [CERTIFICATE KEY]`; commands on its input."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+from asyncua import Server, ua
+from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.server.user_managers import UserManager
+
+NODES = ("Load.Fx", "Load.Fy", "Load.M")
+EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class OneUser(UserManager):
+    """Only the user `plough` may come."""
+
+    def get_user(self, iserver: Any, username: Any = None, password: Any = None, certificate: Any = None) -> Any:
+        return User(UserRole.User) if (username, password) == ("plough", "s3cret") else None
+
+
+class Plant:
+    """A server with three nodes and their history."""
+
+    def __init__(self, server: Server, nodes: list[Any]) -> None:
+        self._server, self._nodes = server, nodes
+
+    async def write(self, stamp_ns: int, values: list[Any], status: str = "Good", keep: bool = True) -> None:
+        time = EPOCH + timedelta(microseconds=stamp_ns // 1000)
+        for node, value in zip(self._nodes, values, strict=True):
+            if value is None:
+                continue
+            code = ua.StatusCode(getattr(ua.StatusCodes, status if node is self._nodes[0] else "Good"))
+            data = ua.DataValue(ua.Variant(value), code, time, datetime.now(UTC))
+            if keep:
+                await self._server.iserver.history_manager.storage.save_node_value(node.nodeid, data)
+            await node.write_value(data)
+
+    async def rows(self, rows: list[list[Any]], pause_s: float = 0.0, **how: Any) -> None:
+        for stamp_ns, *values in rows:
+            await self.write(stamp_ns, values, **how)
+            await asyncio.sleep(pause_s)
+
+    async def lose(self) -> None:
+        """Let each subscription skip a number, as if a message had been lost."""
+        for found in self._server.iserver.subscription_service.subscriptions.values():
+            found._notification_seq += 1
+
+
+async def serve() -> None:
+    logging.disable()
+    port, *security = sys.argv[1:]
+    server = Server(user_manager=OneUser() if security else None)
+    await server.init()
+    server.set_endpoint(f"opc.tcp://127.0.0.1:{port}/plant")
+    if security:
+        certificate, key = map(Path, security)
+        server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
+        await server.load_certificate(certificate)
+        await server.load_private_key(key)
+    index = await server.register_namespace("urn:plow-twin:test")
+    nodes = [
+        await server.nodes.objects.add_variable(ua.NodeId(name, index), name, 0.0, ua.VariantType.Double)
+        for name in NODES
+    ]
+    for node in nodes:
+        await server.iserver.history_manager.storage.new_historized_node(node.nodeid, None)
+    plant = Plant(server, nodes)
+    async with server:
+        print("ready", flush=True)
+        while line := await asyncio.to_thread(sys.stdin.readline):
+            name, arguments, how = json.loads(line)
+            await getattr(plant, name)(*arguments, **how)
+            print("done", flush=True)
+
+
+if __name__ == "__main__":
+    asyncio.run(serve())

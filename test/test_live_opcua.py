@@ -1,0 +1,376 @@
+"""OPC UA in: a real server in a process of its own, its losses, breaks and history, and what is not trusted."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from record_support import PAPER_AMPLITUDE
+from test_live import ROOT, _live
+
+from plow_twin.live.bridge.access import Access
+from plow_twin.live.bridge.opcua.bridge import OpcUa
+from plow_twin.live.bridge.opcua.link import Revised
+from plow_twin.live.bridge.opcua.samples import NOT_MEASURED, Samples
+from plow_twin.live.bridge.source import BridgeError
+from plow_twin.record.entries import EntryRecord
+from plow_twin.record.mapping import read_map
+from plow_twin.record.reader import RunReader
+from plow_twin.record.replay import replay
+from plow_twin.record.sources import Arrived
+from plow_twin.run.twin import Twin
+from plow_twin.scene_file import load_scene
+from plow_twin.stream.journal import Hold, Sample
+from plow_twin.stream.session import Session
+
+MAP = "excitation: {fx: {node: 'ns=2;s=Load.Fx', unit: kN}, fy: {node: ns=2;s=Load.Fy}, m: {node: ns=2;s=Load.M}}\n"
+MS = 1_000_000
+
+
+class Plant:
+    """The server, and a line to it that can be cut."""
+
+    def __init__(self, *security: str) -> None:
+        self.port, server_port = _free_port(), _free_port()
+        self._process = subprocess.Popen(
+            [sys.executable, str(ROOT / "test" / "opcua_server.py"), str(server_port), *security],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self._process.stdout is not None and self._process.stdout.readline() == "ready\n"
+        self._server = ("127.0.0.1", server_port)
+        self._sockets: list[socket.socket] = []
+        self.mend()
+
+    def do(self, name: str, *arguments: Any, **how: Any) -> None:
+        """Give the server a command, and wait until it is carried out."""
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(json.dumps([name, arguments, how]) + "\n")
+        self._process.stdin.flush()
+        assert self._process.stdout.readline() == "done\n"
+
+    def mend(self) -> None:
+        """Let clients connect."""
+        self._door = socket.create_server(("127.0.0.1", self.port))
+        threading.Thread(target=self._let_in, args=(self._door,), daemon=True).start()
+
+    def cut(self) -> None:
+        """Break all connections; nobody can connect any more."""
+        for found in (self._door, *self._sockets):
+            with suppress(OSError):
+                found.shutdown(socket.SHUT_RDWR)
+            found.close()
+        self._sockets = []
+
+    def _let_in(self, door: socket.socket) -> None:
+        while True:
+            try:
+                client, _ = door.accept()
+                server = socket.create_connection(self._server)
+            except OSError:
+                return
+            self._sockets += [client, server]
+            for pair in ((client, server), (server, client)):
+                threading.Thread(target=_pass_on, args=pair, daemon=True).start()
+
+    def close(self) -> None:
+        self.cut()
+        self._process.kill()
+        self._process.communicate()
+
+
+def _pass_on(source: socket.socket, sink: socket.socket) -> None:
+    with suppress(OSError):
+        while data := source.recv(1 << 16):
+            sink.sendall(data)
+    for found in (source, sink):
+        with suppress(OSError):
+            found.shutdown(socket.SHUT_RDWR)
+
+
+def _free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Plant]:
+    plant = Plant()
+    yield plant
+    plant.close()
+
+
+@pytest.fixture
+def roles(tmp_path: Path) -> Any:
+    (tmp_path / "map.yaml").write_text(MAP)
+    return read_map(tmp_path / "map.yaml", None)
+
+
+def _rows(start_ns: int, first: int, last: int, step_ns: int = MS) -> list[list[float]]:
+    """Return stamps and values of samples, the forces along x in kN."""
+    found = []
+    for index in range(first, last):
+        phase = float(np.sin(2e-9 * step_ns * index))
+        fx, fy, m = (phase * amplitude for amplitude in PAPER_AMPLITUDE)
+        found.append([start_ns + index * step_ns, fx / 1e3, fy, m])
+    return found
+
+
+@contextmanager
+def _bridge(plant: Plant, roles: Any, **options: Any) -> Iterator[OpcUa]:
+    bridge = OpcUa(Access(f"opc.tcp://127.0.0.1:{plant.port}/plant"), roles, **options)
+    bridge.start(list(bridge.topics()))
+    try:
+        yield bridge
+    finally:
+        bridge.close()
+
+
+def _until(bridge: OpcUa, enough: Callable[[list[Arrived]], bool]) -> list[Arrived]:
+    found: list[Arrived] = []
+    give_up = time.monotonic() + 60.0
+    while not enough(found):
+        assert time.monotonic() < give_up, (found[-3:], bridge.part())
+        found += bridge.poll(0.1)
+    return found
+
+
+def _stamps(found: list[Arrived]) -> list[int]:
+    return [arrived.content["source"] for arrived in found]
+
+
+def test_values_of_a_stamp_are_a_sample_and_what_has_not_changed_stays() -> None:
+    samples = Samples(["a", "b"], wait_s=1.0)
+    samples.add("a", 10, 1.0, 0.0)
+    samples.add("b", 10, 2.0, 0.1)
+    samples.add("a", 20, 3.0, 0.2)
+    assert samples.take(0.3) == [(10, {"a": 1.0, "b": 2.0})]  # b may come yet
+    samples.add("b", 30, 4.0, 0.4)
+    samples.add("a", 30, 5.0, 0.4)
+    assert samples.take(0.5) == [(20, {"a": 3.0, "b": 2.0}), (30, {"a": 5.0, "b": 4.0})]
+    samples.add("b", 40, NOT_MEASURED, 0.6)
+    assert samples.take(0.7) == [] and samples.take(1.7) == [(40, {"a": 5.0, "b": NOT_MEASURED})]
+    samples.add("a", 35, 6.0, 2.0)  # late: the value of b at that time is not known any more
+    samples.add("b", 25, 7.0, 2.0)
+    samples.add("a", 25, 8.0, 2.0)
+    assert samples.take(2.1) == [(25, {"a": 8.0, "b": 7.0})]
+    assert samples.take(9.0) == []
+    assert samples.take_incomplete() == 1
+    samples.add("b", 40, 9.0, 9.0)  # sent again
+    assert samples.take(99.0) == []
+    samples = Samples(["a", "b"], wait_s=1.0)
+    samples.begin("a", 5, 1.0)
+    samples.add("b", 7, 2.0, 0.0)
+    assert samples.take(2.0) == [(7, {"a": 1.0, "b": 2.0})]
+
+
+def test_a_wrong_mapping_of_nodes_names_the_key(tmp_path: Path) -> None:
+    path = tmp_path / "map.yaml"
+    for text, said in (
+        ("excitation: {fx: {node: 5}, fy: {node: a}, m: {node: b}}", "excitation.fx"),
+        ("head_pose: {x: {node: a, unit: kN}}", "unit.x: got 'kN', expected one of m"),
+        ("head_pose: {x: {node: a}, stamp: t}", "stamp: got 't', expected source or server"),
+        ("head_pose: {x: {node: a}, stamp_unit: ms}", "stamp_unit: got 'ms', expected none"),
+        ("head_pose: {x: {node: a}, sequence: n}", "sequence: got 'n', expected none"),
+    ):
+        path.write_text(text)
+        with pytest.raises(Exception, match="got") as caught:
+            read_map(path, None)
+        assert said in str(caught.value)
+
+
+def test_samples_come_with_the_sources_stamps_and_bad_values_are_counted(server: Plant, roles: Any) -> None:
+    start_ns = time.time_ns() // MS * MS
+    with _bridge(server, roles) as bridge:
+        server.do("rows", _rows(start_ns, 0, 200), 1e-3)
+        found = _until(bridge, lambda found: len(found) >= 200)
+        assert _stamps(found) == [row[0] for row in _rows(start_ns, 0, 200)]
+        stamp_ns, values = roles["excitation"].read(found[77])
+        assert (stamp_ns, values["fx"]) == (start_ns + 77 * MS, pytest.approx(1e3 * _rows(start_ns, 77, 78)[0][1]))
+        for index, status in ((200, "BadSensorFailure"), (201, "UncertainLastUsableValue"), (202, "GoodClamped")):
+            server.do("rows", _rows(start_ns, index, index + 1), status=status)
+        server.do("write", start_ns + 203 * MS, [None, 7.0, None])  # the others have not changed
+        *bad, good, last = (
+            roles["excitation"].read(found)[1] for found in _until(bridge, lambda found: len(found) >= 4)
+        )
+        assert all(np.isnan(values["fx"]) for values in bad) and np.isfinite(good["fx"])
+        assert last == good | {"fy": 7.0}
+        level, said, facts = bridge.part()
+        assert (facts["bad"], facts["uncertain"], facts["breaks"]) == ("1", "1", "0") and bridge.lost == 0
+        assert facts["publishing_ms"] == "10" and (level, said) == (0, "")
+
+
+def test_a_lost_message_is_seen_by_its_number_and_filled_from_the_history(server: Plant, roles: Any) -> None:
+    start_ns = time.time_ns() // MS * MS
+    with _bridge(server, roles) as bridge:
+        server.do("rows", _rows(start_ns, 0, 5))
+        _until(bridge, lambda found: start_ns + 4 * MS in _stamps(found))
+        server.do("lose")
+        server.do("rows", _rows(start_ns, 6, 8))
+        found = _until(bridge, lambda found: start_ns + 7 * MS in _stamps(found))
+        assert bridge.part()[2]["notifications_lost"] == "1" and bridge.lost == 0
+        assert _stamps(found) == [start_ns + 6 * MS, start_ns + 7 * MS]
+
+
+def test_what_the_server_grants_is_compared_with_what_was_asked() -> None:
+    assert Revised(10.0, 1.0, 100).complaint(1.0) == ""
+    assert Revised(10.0, 10.0, 100).complaint(0.0) == ""
+    assert "samples every 100 ms, asked every 1 ms" in Revised(100.0, 100.0, 1000).complaint(1.0)
+    assert "keeps 1 values, 100 come" in Revised(100.0, 1.0, 1).complaint(1.0)
+
+
+def test_a_minute_without_a_connection_is_filled_and_ends_in_the_digest_of_the_uninterrupted_run(
+    server: Plant, tmp_path: Path
+) -> None:
+    """The model goes on by the hold policy meanwhile, and back to where the samples had ended."""
+    (tmp_path / "map.yaml").write_text(MAP)
+    run, step_ns = tmp_path / "run", 10 * MS
+    start_ns = time.time_ns() // MS * MS - 63_000 * MS
+    arguments = (
+        *(f"opc.tcp://127.0.0.1:{server.port}/plant", "--map", str(tmp_path / "map.yaml")),
+        *("--scene", "paper", "--record", str(run), "--set", "excitation_timeout=0.3"),
+    )
+    with _live(*arguments) as live:
+        live.until(lambda heard: "source" in heard, "connected")
+        server.do("rows", _rows(start_ns, 0, 200, step_ns))
+        live.until_count("samples_used", 200)
+        server.cut()
+        live.until(lambda heard: int(heard["input"]["values"]["holds"]) > 0, "holds")
+        server.do("rows", _rows(start_ns, 200, 6200, step_ns))  # 60 s
+        server.mend()
+        values = live.until_count("samples_used", 6200)
+        source = live.heard["source"]["values"]
+        assert int(values["rolled_back"]) > 0 and values["samples_used"] == values["samples_in"] == "6200"
+        live.until(lambda heard: heard["source"]["values"]["breaks_filled"] == "1", "filled")
+        assert source["unfilled_s"] == "0"
+        assert live.stop() == 0
+    entries = [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+    last = max(index for index, entry in enumerate(entries) if isinstance(entry, Sample))
+    interrupted, whole = (
+        Session(Twin(load_scene("paper"), excitation="sampled"), rollback_span_s=2.0) for _ in range(2)
+    )
+    for entry in entries[: last + 1]:
+        interrupted.apply(entry)
+    samples = sorted((entry for entry in entries if isinstance(entry, Sample)), key=lambda entry: entry.stamp_ns)
+    assert any(isinstance(entry, Hold) for entry in entries[:last]) and len(samples) == 6200
+    for _ in whole.samples(samples):
+        pass
+    assert interrupted.twin.digest() == whole.twin.digest()
+    assert replay(run).exit_code == 0
+
+
+def test_a_break_without_history_is_a_loss(server: Plant, roles: Any) -> None:
+    start_ns = time.time_ns() // MS * MS
+    with _bridge(server, roles) as bridge:
+        server.do("rows", _rows(start_ns, 0, 10))
+        _until(bridge, lambda found: start_ns + 9 * MS in _stamps(found))
+        server.cut()
+        server.do("rows", _rows(start_ns, 10, 20), keep=False)
+        server.mend()
+        _until(bridge, lambda found: start_ns + 19 * MS in _stamps(found))
+        facts = bridge.part()[2]
+        assert (facts["breaks"], facts["breaks_filled"], facts["unfilled_s"], bridge.lost) == ("1", "0", "0.01", 1)
+        assert facts["no_history"] == "the server's history is empty"
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("certificates")
+    for name, uri in (
+        ("server", "urn:freeopcua:python:server"),
+        ("client", "urn:plow-twin:client"),
+        ("other", "urn:x"),
+    ):
+        subprocess.run(
+            ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
+             "-addext", f"subjectAltName=DNS:localhost,URI:{uri}",
+             "-addext", "keyUsage=digitalSignature,nonRepudiation,keyEncipherment,dataEncipherment,keyCertSign",
+             "-addext", "extendedKeyUsage=serverAuth,clientAuth",
+             "-keyout", str(folder / f"{name}.key.pem"), "-out", str(folder / f"{name}.pem")],
+            check=True, capture_output=True,
+        )  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="module")
+def secured(certificates: Path) -> Iterator[tuple[Plant, Access]]:
+    plant = Plant(str(certificates / "server.pem"), str(certificates / "server.key.pem"))
+    yield (
+        plant,
+        Access(
+            f"opc.tcp://localhost:{plant.port}/plant",
+            user="plough",
+            password="s3cret",
+            ca=certificates / "server.pem",
+            certificate=certificates / "client.pem",
+            key=certificates / "client.key.pem",
+        ),
+    )
+    plant.close()
+
+
+def test_an_encrypted_session_of_a_user_leaves_no_secret_in_the_recording(
+    secured: tuple[Plant, Access], tmp_path: Path
+) -> None:
+    plant, access = secured
+    (tmp_path / "map.yaml").write_text(MAP)
+    arguments = (
+        *(access.url, "--map", str(tmp_path / "map.yaml"), "--user", access.user, "--record", str(tmp_path / "run")),
+        *("--tls-ca", str(access.ca), "--tls-cert", str(access.certificate), "--tls-key", str(access.key)),
+    )
+
+    with _live(*arguments, environment={"PLOW_TWIN_OPCUA_PASSWORD": access.password}) as live:
+        live.until(lambda heard: "source" in heard, "connected")
+        plant.do("rows", _rows(time.time_ns() // MS * MS, 0, 10))
+        live.until_count("samples_used", 10)
+        shown = Path(f"/proc/{live.process.pid}/cmdline").read_bytes()
+        assert live.stop() == 0
+    recorded = b"".join(path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file())
+    key = Path(str(access.key)).read_bytes().splitlines()[5]
+    assert access.password.encode() not in shown + recorded and key not in recorded
+
+
+def test_what_is_not_trusted_or_not_encrypted_is_refused(
+    secured: tuple[Plant, Access], certificates: Path, roles: Any, server: Plant
+) -> None:
+    _, access = secured
+    for wrong, said in (
+        ({"password": "guess"}, "refused"),
+        ({"ca": certificates / "other.pem"}, "certificate verify failed"),
+        ({"certificate": None, "key": None, "ca": None}, "refused|No matching"),
+        ({"url": f"opc.tcp://127.0.0.1:{server.port}/plant"}, "offers no encryption"),
+        ({"url": "opc.tcp://localhost:1"}, "no server at localhost:1"),
+    ):
+        with pytest.raises(BridgeError, match=said):
+            OpcUa(replace(access, **wrong), roles).start([])  # type: ignore[arg-type]
+    for wrong, said in (
+        ({"url": "opc.tcp://plough.example", "certificate": None, "key": None, "ca": None}, "without certificates"),
+        ({"url": "opc.tcp://user:secret@localhost"}, "user and topics stand elsewhere"),
+        ({"key": None}, "together"),
+    ):
+        with pytest.raises(BridgeError, match=said) as caught:
+            OpcUa(replace(access, **wrong), roles)  # type: ignore[arg-type]
+        assert "secret" not in str(caught.value)
+
+
+def test_a_node_that_is_not_there_is_named(server: Plant, tmp_path: Path) -> None:
+    (tmp_path / "map.yaml").write_text(MAP.replace("Load.Fy", "Load.Fz"))
+    bridge = OpcUa(Access(f"opc.tcp://127.0.0.1:{server.port}"), read_map(tmp_path / "map.yaml", None))
+    with pytest.raises(BridgeError, match=r"Load\.Fz, expected a node of the server: BadNodeIdUnknown"):
+        bridge.start([])
+    (tmp_path / "map.yaml").write_text(MAP.replace("ns=2;s=Load.Fy", "Load.Fy"))
+    with pytest.raises(BridgeError, match=r"node: got 'Load\.Fy', expected an identifier"):
+        OpcUa(Access("opc.tcp://127.0.0.1:1"), read_map(tmp_path / "map.yaml", None))
