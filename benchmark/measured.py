@@ -19,15 +19,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rigid_square import rigid_toss, two_at_once
 from scipy.optimize import minimize
 
 from plow_twin.estimate.estimate import estimate
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.model.contact_laws import LAWS
 from plow_twin.scene_file import load_scene
+from plow_twin.solve.rounded_block import toss_blocks
 from plow_twin.study.measured.drops import Drops
 from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, EllipseContact, contact_arms, impact
-from plow_twin.study.measured.square import MARKER, RATE_HZ, SCATTER, SQUARE, Marker, ensemble, fit_flight, toss
+from plow_twin.study.measured.square import (
+    MARKER,
+    RATE_HZ,
+    SCATTER,
+    SQUARE,
+    Marker,
+    damping_numbers,
+    ensemble,
+    fit_flight,
+    toss,
+)
 
 FOLDER = Path(__file__).resolve().parent
 DATA = FOLDER / "data" / "measured"
@@ -128,14 +140,13 @@ def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndar
     return found
 
 
-def routh(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
+def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3):  # type: ignore[no-untyped-def]
     """Return impulses after Routh with Poisson's restitution: Coulomb's friction at each bit of the normal impulse.
 
     Routh, Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635.
     """
     along, away, end = np.zeros_like(slip), np.zeros_like(slip), np.full_like(slip, np.inf)
-    bit = 2e-3
-    for _ in range(4000):
+    for _ in range(round(8.0 / bit)):
         now = slip + tt * along + tn * away
         drag = np.clip(-(now + tn * bit) / tt, -mu * bit, mu * bit)
         going = away < end
@@ -218,26 +229,69 @@ FITTED = (
 )  # fmt: skip
 
 
+#: Two corners hit at once within this time in s.
+TWO_AT_ONCE_S = 1e-3
+
+
 class Square:
     """The measured drops and what a block with a marker makes of them."""
 
     def __init__(self, drops: Drops) -> None:
         self.drops, self.usable = drops, np.array(drops.usable())
         self.first = drops.flight_rows[self.usable] - 1
+        bounces = [drops.bounces[i] for i in self.usable]
+        #: rows from the last one of the first flight to each bounce, 0 where there is none, shape (n, 3)
+        self.rows = np.array(
+            [
+                [its[k] - first if k < len(its) else 0 for k in (1, 2, 3)]
+                for its, first in zip(bounces, self.first, strict=True)
+            ]
+        )
         self.flights = np.array([fit_flight(drops.pose[i, : drops.flight_rows[i]]).state for i in self.usable])
 
     def errors(self, block: np.ndarray, marker: Marker, chosen: np.ndarray, bounces: int) -> np.ndarray:
         """Return mean distance in m and angle in rad over so many bounces, shape (k, 2), of drops that have them."""
-        enough = [n for n in chosen if len(self.drops.bounces[self.usable[n]]) > bounces]
-        last = [self.drops.bounces[self.usable[n]][bounces] for n in enough]
-        rows = max(np.array(last) - self.first[enough]) + 1
+        enough = chosen[self.rows[chosen, bounces - 1] > 0]
         states = marker.state_of_block(self.flights[enough])
-        tossed = marker.measured(toss(states, rows, np.full(len(enough), block, block.dtype))[:, :, :3])
+        tossed = toss(states, self.rows[enough, bounces - 1].max() + 1, np.full(len(enough), block, block.dtype))
+        return self.off(marker.measured(tossed[:, :, :3]), enough, bounces)
+
+    def off(self, poses: np.ndarray, chosen: np.ndarray, bounces: int) -> np.ndarray:
+        """Return mean distance in m and angle in rad of poses (k, rows, 3) of the chosen drops, shape (k, 2)."""
         found = []
-        for n, end, motion in zip(enough, last, tossed, strict=True):
-            off = motion[: end - self.first[n]] - self.drops.pose[self.usable[n], self.first[n] : end]
+        for n, motion in zip(chosen, poses, strict=True):
+            rows, first = self.rows[n, bounces - 1], self.first[n]
+            off = motion[:rows] - self.drops.pose[self.usable[n], first : first + rows]
             found.append((np.hypot(off[:, 0], off[:, 1]).mean(), np.abs(off[:, 2]).mean()))
         return np.array(found)
+
+    def against_rigid(self) -> dict[str, Any]:
+        """Return errors over one bounce of rigid and compliant impacts, of all drops and where two corners hit at once.
+
+        Both have the marker, the rounded corners and the drag; e and mu of the rigid one are fitted to all drops.
+        """
+        every = np.flatnonzero(self.rows[:, 0] > 0)
+        states, rows = MARKER.state_of_block(self.flights[every]), int(self.rows[every, 0].max()) + 1
+
+        def rigid(x: np.ndarray) -> np.ndarray:
+            return self.off(MARKER.measured(rigid_toss(states, rows, SQUARE, routh, *x)[:, :, :3]), every, 1)[:, 0]
+
+        def cost(x: np.ndarray) -> float:
+            distance = rigid(np.clip(x, 0.0, 1.0))
+            return float((distance / (1.0 + distance / 0.02)).mean())
+
+        simplex = np.array([[0.5, 0.12], [0.4, 0.12], [0.5, 0.18]])
+        fitted = minimize(cost, simplex[0], method="Nelder-Mead", options=dict(initial_simplex=simplex, maxfev=30)).x
+        fine = np.zeros((len(every), 16 * rows, 6))
+        fine[:, 0] = states
+        blocks = np.full(len(every), SQUARE, SQUARE.dtype)
+        toss_blocks(blocks, damping_numbers(), np.zeros((len(every), 1, 3)), 1.0 / (16.0 * RATE_HZ), fine)
+        twice = two_at_once(fine, 16 * self.rows[every, 0], SQUARE, TWO_AT_ONCE_S)
+        found: dict[str, Any] = {"e, mu": np.round(fitted, 3).tolist(), "two_at_once": int(twice.sum())}
+        for name, distance in (("rigid", rigid(fitted)), ("compliant", self.errors(SQUARE, MARKER, every, 1)[:, 0])):
+            medians = (float(np.median(distance[which])) for which in (slice(None), twice, ~twice))
+            found[name] = [round(1e3 * median, 1) for median in medians]
+        return found
 
     def fit(self, chosen: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, Marker]:
         """Fit block and marker to the chosen drops: bounded distances over one bounce, and less those over two."""
@@ -412,6 +466,8 @@ def main() -> None:
         return
     if chosen.only in (None, "square"):
         results["square"] = of_drops(drops)
+        results["square_rigid"] = Square(drops).against_rigid()
+        print(results["square_rigid"], flush=True)
     if chosen.only in (None, "fit"):
         results["square_held_out"] = Square(drops).held_out()
         print(results["square_held_out"], flush=True)

@@ -53,6 +53,18 @@ def measured_drops() -> str:
     return _lines([*head, "inside after bounce 1", "after bounce 2", "median CRPS of x, z, theta"], rows)
 
 
+def measured_rigid() -> str:
+    """Return the errors of rigid and compliant impacts, by whether two corners hit at once."""
+    found = _part("square_rigid")
+    e, mu = found["e, mu"]
+    names = {
+        "rigid": f"rigid, one corner at a time (Routh, Poisson; e {e:.2f}, mu {mu:.2f} fitted)",
+        "compliant": "compliant",
+    }
+    rows = [[text, *(f"{mm:.1f} mm" for mm in found[name])] for name, text in names.items()]
+    return _lines(["over one bounce", "all", f"two corners at once ({found['two_at_once']} drops)", "the others"], rows)
+
+
 def measured_table() -> str:
     """Return how the height of the table is estimated."""
     found = _part("table")
@@ -69,5 +81,6 @@ def measured_table() -> str:
 FIGURES: dict[str, Callable[[], str]] = {
     "measured_laws": measured_laws,
     "measured_drops": measured_drops,
+    "measured_rigid": measured_rigid,
     "measured_table": measured_table,
 }

@@ -13,7 +13,7 @@ from plow_twin.errors import ArgumentError
 from plow_twin.study.measured import bands, impact
 from plow_twin.study.measured.drops import Drops
 from plow_twin.study.measured.ellipse import ELLIPSE, GYRATION, SEMI_AXES, contact_arms
-from plow_twin.study.measured.square import SQUARE, ensemble, fit_flight, toss
+from plow_twin.study.measured.square import MARKER, SQUARE, ensemble, fit_flight, toss
 
 DATA = Path(__file__).resolve().parent.parent / "benchmark" / "data" / "measured"
 
@@ -135,3 +135,23 @@ def test_what_is_no_impact_is_named() -> None:
         impact(np.zeros((2, 5)))
     with pytest.raises(ArgumentError, match="n_rows"):
         bands(np.zeros((8, 3)), 0)
+
+
+def test_marker_is_turned_as_the_angles_at_rest_show(drops) -> None:
+    end = drops.pose[:, -10:]
+    rests = (np.ptp(end[:, :, 1], axis=1) < 1e-3) & (np.ptp(end[:, :, 2], axis=1) < 5e-3)
+    angle = end[rests, :, 2].mean(axis=1)
+    right = np.pi / 2.0
+    assert rests.sum() > 200
+    assert np.median((angle + 0.5 * right) % right - 0.5 * right) == pytest.approx(MARKER.turn, abs=5e-3)
+
+
+def test_marker_s_state_is_the_block_s_and_back() -> None:
+    state = np.random.default_rng(0).standard_normal((20, 6))
+    np.testing.assert_allclose(MARKER.state_of_block(MARKER.measured(state)), state, atol=1e-12)
+    # its velocity is that of a point of the block
+    h = 1e-6
+    moved = state.copy()
+    moved[:, :3] += h * state[:, 3:]
+    rate = (MARKER.measured(moved) - MARKER.measured(state))[:, :3] / h
+    np.testing.assert_allclose(rate, MARKER.measured(state)[:, 3:], atol=1e-5)

@@ -15,7 +15,7 @@ import numpy as np
 from plow_twin import Initial, load_scene, simulate
 from plow_twin.study.measured import bands
 from plow_twin.study.measured.drops import Drops
-from plow_twin.study.measured.square import RATE_HZ, fit_flight
+from plow_twin.study.measured.square import MARKER, RATE_HZ, fit_flight
 
 FOLDER = Path(__file__).resolve().parent
 DATA = FOLDER.parent.parent / "benchmark" / "data" / "measured" / "square_drops.npz"
@@ -30,11 +30,11 @@ def main() -> None:
     until = drops.until(DROP, 1) + 1
     found = bands(pose[:given], until)
     # the preset's cavity has its centre 1 m above the table
-    x, z, theta, *rates = fit_flight(pose[:given]).state
+    x, z, theta, *rates = MARKER.state_of_block(fit_flight(pose[:given]).state)
     start = Initial(q=(x, z - 1.0, theta), v=(rates[0], rates[1], rates[2]))
     scene = replace(load_scene("measured_square"), initial=start)
     result = simulate(scene, t_end=(until - given) / RATE_HZ, output_dt=1.0 / RATE_HZ)
-    simulated = result.q + np.array([0.0, 1.0, 0.0])
+    simulated = MARKER.measured(result.q + np.array([0.0, 1.0, 0.0]))
     off = np.hypot(*(simulated[:, :2] - pose[given - 1 : until, :2]).T)
     inside = ((pose[:until] >= found[:, 0]) & (pose[:until] <= found[:, 2])).mean()
     print(f"first flight: {given} rows; up to the second bounce: {until} rows")
