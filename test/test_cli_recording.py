@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import socket
 import struct
 import subprocess
@@ -49,6 +50,16 @@ def test_options_that_would_be_left_out_are_refused(
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return record_run(tmp_path_factory.mktemp("recording") / "run", map(paper_sample, range(SAMPLES)))
+
+
+def test_an_analysis_of_runs_without_measurements_shows_what_the_model_computed_and_no_empty_table(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = shutil.copytree(run.folder, tmp_path / "other")
+    assert cli(["analyse", str(run.folder), str(other), "--workers", "1", "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert said.count("Contacts computed") == 1 and "plow-twin compare" in said
+    assert "bias" not in said and said.count("nothing measured") == 2
 
 
 def test_replay_of_an_untouched_recording_ends_with_0(run: Run) -> None:

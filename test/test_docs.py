@@ -80,6 +80,13 @@ def test_every_public_name_is_on_the_reference_page_and_there_is_no_other() -> N
     assert all(hasattr(plow_twin, name) for name in listed)
 
 
+def test_no_heading_begins_with_a_digit() -> None:
+    """The site's contents follow the reader by selectors of the headings' names, which may not begin with one."""
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "examples").glob("**/README.md")]
+    found = [line for page in pages for line in re.findall(r"^#+ \d.*", page.read_text(), re.MULTILINE)]
+    assert found == []
+
+
 def test_every_page_is_in_the_site_s_contents() -> None:
     contents = (ROOT / "mkdocs.yml").read_text().partition("nav:")[2]
     made = {"index.md", "examples.md"}

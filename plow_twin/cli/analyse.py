@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.console import Console
 from rich.markup import escape
 
 from plow_twin.cli.console import (
@@ -186,8 +187,24 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
     return {**found.facts(), "lossy": found.lossy}
 
 
-def _unit(signal: str) -> str:
-    return "N" if signal.startswith("force_") else "rad" if signal == "theta" else "m"
+def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
+    """Print what the model computed of each run, runs side by side."""
+    shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
+    for facts in results:
+        loads = facts["loads"]
+        largest = loads["largest_force_n"]
+        place = max(largest, key=lambda pair: largest[pair])
+        minutes = loads["duration_s"] / 60.0
+        numbers = (
+            f"{loads['duration_s']:.1f}",
+            f"{sum(loads['impacts'].values()) / minutes:.1f}" if minutes else "",
+            f"{largest[place] / 1e3:.2f}",
+            place if largest[place] else "",
+        )
+        shown.add_row(escape(facts["run"]), *numbers)
+    console.print(shown)
+    if len(results) > 1:
+        console.print("Whether they differ by more than chance, pad by pad: plow-twin compare RUN...", highlight=False)
 
 
 def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool, left_out: Sequence[str] = ()) -> None:
@@ -202,17 +219,23 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         return
     if quiet:
         return
+    from plow_twin.study.analysis.signals import signal_unit
+
     console = output_console()
-    for facts in results:
-        if "error" in facts:
+    good = [facts for facts in results if "error" not in facts]
+    if good:
+        _show_contacts(console, good)
+    for facts in good:
+        if not facts["signals"]:
+            console.print(f"{facts['run']}: nothing measured that the model could be held against", highlight=False)
             continue
         shown = table(
-            f"{facts['run']}: predicted minus measured", "signal", "n", "bias", "rms", "correlation", "lag [s]"
+            f"{facts['run']}: predicted minus measured", "signal", "n", "bias", "RMS", "correlation [1]", "lag [s]"
         )
         for name, signal in facts["signals"].items():
             numbers = (signal[key] for key in ("bias", "rms", "correlation", "lag_s"))
             shown.add_row(
-                escape(f"{name} [{_unit(name)}]"),
+                escape(f"{name} [{signal_unit(name)}]"),
                 str(signal["n"]),
                 *("" if value is None else f"{value:.4g}" for value in numbers),
             )

@@ -13,6 +13,7 @@ import numpy as np
 
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.durable import naming, whole_file, write_whole
+from plow_twin.study.analysis.signals import signal_unit
 
 if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
@@ -34,9 +35,9 @@ th:first-child,td:first-child,.long{text-align:left}img{max-width:100%}</style><
 {% for part in parts %}
 <h2>Scene {{ part.scene }}</h2>
 {% if part.signals %}<h3>Predicted minus measured</h3>
-<table><tr><th>signal</th><th>n</th><th>bias</th><th>RMS</th><th>correlation</th><th>lag [s]</th><th>RMS aligned</th>
-<th>coherence</th></tr>{% for name, s in part.signals.items() %}
-<tr><td>{{ name }}</td><td>{{ s.n }}</td><td>{{ number(s.bias) }}</td><td>{{ number(s.rms) }}</td>
+<table><tr><th>signal</th><th>n</th><th>bias</th><th>RMS</th><th>correlation [1]</th><th>lag [s]</th>
+<th>RMS aligned</th><th>coherence [1]</th></tr>{% for name, s in part.signals.items() %}
+<tr><td>{{ name }} [{{ unit(name) }}]</td><td>{{ s.n }}</td><td>{{ number(s.bias) }}</td><td>{{ number(s.rms) }}</td>
 <td>{{ number(s.correlation) }}</td><td>{{ number(s.lag_s) }}</td><td>{{ number(s.rms_aligned) }}</td>
 <td>{{ number(s.coherence) }}</td></tr>{% endfor %}</table>
 {% else %}<p>Nothing was measured.</p>{% endif %}
@@ -85,6 +86,7 @@ def _write_report(found: Analysis, out: Path) -> None:
         facts=facts,
         parts=[facts, *facts["with"]],
         pairs=PAIR_NAMES,
+        unit=signal_unit,
         number=lambda value: "" if value is None else f"{value:.4g}",
         picture=_picture(found),
     )

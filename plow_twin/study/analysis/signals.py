@@ -51,6 +51,11 @@ class Comparison:
         return dict(vars(self))
 
 
+def signal_unit(name: str) -> str:
+    """Return the unit of a signal by its name."""
+    return "N" if name.startswith("force_") else "rad" if name == "theta" else "m"
+
+
 def compare(t: Array, predicted: Array, t_measured: Array, measured: Array) -> Comparison | None:
     """Compare a prediction (n,) at times t (rising) with measured values (m,) at their own times; None for too few."""
     inside = (t_measured >= t[0]) & (t_measured <= t[-1]) & np.isfinite(measured) if len(t) else np.zeros(0, bool)
