@@ -19,7 +19,7 @@ from rerun.chunk import RrdReader
 
 from plow_twin.cli.app import run as cli
 from plow_twin.errors import RecordingError
-from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_NAMES
 from plow_twin.model.scene import Wear
 from plow_twin.record.entries import EntryRecord
 from plow_twin.record.messages import JointState, Odometry
@@ -294,10 +294,26 @@ def test_an_arrow_pushes_the_wall_off_its_corner() -> None:
     section = Section.of(load_scene(scene_path("paper")))
     force = np.zeros(8)
     force[2] = 1e5  # top right corner, top wall: the head is pushed up, which is towards -y on the screen
-    origins, vectors, pairs = section.arrows(0.0, force)
+    origins, vectors, pairs = section.arrows((0.0, 0.0, 0.0), force)
     np.testing.assert_allclose(origins, [[165.0, -135.0]])
     np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)
     assert list(pairs) == [2]
+
+
+def test_a_block_moves_in_its_guide_and_a_wall_pushes_its_corner_inwards() -> None:
+    scene = load_scene("paper")
+    section = Section.of(replace(scene, head=replace(scene.head, carries="corners")))
+    np.testing.assert_allclose(np.abs(section.frame_strip()).max(axis=0), 0.5 * section.cavity)
+    # turned by more than 45 degrees: the corner that was bottom right is the top right one
+    pose = (0.01, 0.02, 0.5 * np.pi + 0.1)
+    (outline,) = section.head_strips(pose)
+    corners = section.corners(pose)
+    assert corners[CORNER_NAMES.index("top_right")] == pytest.approx(outline[CORNER_NAMES.index("bottom_right")])
+    force = np.zeros(8)
+    force[PAIR_NAMES.index("bottom_left_bottom")] = 1e5
+    origins, vectors, _ = section.arrows(pose, force)
+    np.testing.assert_allclose(origins, corners[[CORNER_NAMES.index("bottom_left")]])
+    np.testing.assert_allclose(vectors, [[0.0, -ARROW_MM_PER_N * 1e5]], atol=1e-9)  # up, which is -y on the screen
 
 
 def test_events_tell_touches_and_how_the_file_ended(

@@ -142,8 +142,10 @@ class Drawing:
         depths = rr.Points2D.from_fields(colors=list(PAIR_COLORS), radii=[0.1], show_labels=True)
         self.stream.log("exaggerated/pads/wear", depths, static=True)
         places = np.concatenate((0.85 * self.section.corners(), [[0.0, -0.37 * self.section.frame[1]]]))
-        places[:, 1] -= LABEL_MM
         names = (*self.section.labels, self.section.frame_name)
+        if self.section.is_block:
+            places, names = np.array([[0.0, -0.5 * self.section.cavity[1]]]), (self.section.frame_name,)
+        places[:, 1] -= LABEL_MM
         labels = rr.Points2D(places, labels=names, radii=[0.1], colors=[_GREY], show_labels=True)
         self.stream.log("section/frame/names", labels, static=True)
         self.stream.log("section/head", rr.LineStrips2D.from_fields(radii=[0.9]), static=True)
@@ -370,10 +372,11 @@ class Drawing:
         force = contact[2 * PAIR_COUNT :]
         pose = (float(head[0]), float(head[1]), 2.0 * math.atan2(head[2], head[3]))
         color = set_color(int(masks_of(force[None])[0]))
-        self.head.add(stamp_ns, step, strips=list(self.section.head_strips(pose)), colors=[color, color])
+        strips = self.section.head_strips(pose)
+        self.head.add(stamp_ns, step, strips=list(strips), colors=[color] * len(strips))
         self._load(stamp_ns, step, pose, load)
-        self.corners.add(stamp_ns, step, positions=self.section.corners(), radii=self.section.corner_radii(force))
-        origins, vectors, pairs = self.section.arrows(pose[2], force)
+        self.corners.add(stamp_ns, step, positions=self.section.corners(pose), radii=self.section.corner_radii(force))
+        origins, vectors, pairs = self.section.arrows(pose, force)
         colors = [PAIR_COLORS[pair] for pair in pairs]
         labels = [f"{force[pair] / 1e3:.0f} kN" for pair in pairs]
         self.arrows.add(stamp_ns, step, origins=origins, vectors=vectors, colors=colors, labels=labels)

@@ -112,7 +112,7 @@ def _draw_section(axis: Any, section: Section, instant: Instant) -> None:
     for number, strip in enumerate(section.head_strips(pose)):
         axis.plot(*strip.T, color="k", lw=1.0, label="" if number else "head")
     if largest > 0.0:
-        origins, vectors, pairs = section.arrows(pose[2], force)
+        origins, vectors, pairs = section.arrows(pose, force)
         for origin, vector, pair in zip(origins, vectors, pairs, strict=True):
             color = tuple(part / 255 for part in PAIR_COLORS[pair])
             axis.annotate("", origin + vector, origin, arrowprops={"arrowstyle": "->", "color": color, "lw": 2})

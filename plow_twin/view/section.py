@@ -43,13 +43,18 @@ _OUTWARDS: Final[Array] = np.stack((NORMAL_X, NORMAL_Y), axis=1)
 
 @dataclass(frozen=True)
 class Section:
-    """Sizes [mm] that are constant in a run."""
+    """Sizes [mm] that are constant in a run.
+
+    A head that carries walls is drawn as the cavity that moves about the frame, one that carries corners as the block
+    that moves in the cavity.
+    """
 
     frame: Array
     cavity: Array
     labels: tuple[str, ...]
-    #: name of the frame; with a support the section is drawn in its axes
+    #: name of the body that stands; with a support the section is drawn in its axes
     frame_name: str = "frame (fixed)"
+    is_block: bool = False
 
     @classmethod
     def of(cls, scene: Scene) -> Section:
@@ -58,7 +63,9 @@ class Section:
         gaps = _MM * np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
         letters = {corner: letter for letter, corner in scene.frame.labels.items()}
         name = "frame (fixed)" if scene.support is None else "frame (on springs)"
-        return cls(frame, frame + gaps, tuple(letters.get(corner, "") for corner in CORNER_NAMES), name)
+        labels = tuple(letters.get(corner, "") for corner in CORNER_NAMES)
+        is_block = scene.head.carries == "corners"
+        return cls(frame, frame + gaps, labels, "guide (fixed)" if is_block else name, is_block)
 
     @property
     def half_view(self) -> Array:
@@ -66,15 +73,24 @@ class Section:
         return 0.5 * self.cavity + BODY_MARGIN_MM + 70.0
 
     def frame_strip(self) -> Array:
-        """Outline of the frame, shape (5, 2)."""
-        return 0.5 * self.frame * _SQUARE * _FLIP
+        """Outline of the frame, or of the cavity about a block, shape (5, 2)."""
+        return 0.5 * (self.cavity if self.is_block else self.frame) * _SQUARE * _FLIP
 
-    def corners(self) -> Array:
-        """Corners of the frame in the order of `CORNER_NAMES`, shape (4, 2)."""
-        return (0.5 * self.frame * _SIGNS * _FLIP)[::2]
+    def corners(self, pose: Iterable[float] = (0.0, 0.0, 0.0)) -> Array:
+        """Corners of the frame, or of a block at a pose, in the order of `CORNER_NAMES`, shape (4, 2).
+
+        A block's corners are named by their place: beyond 45 degrees the names have turned.
+        """
+        corners = (0.5 * self.frame * _SIGNS)[::2]
+        if not self.is_block:
+            return corners * _FLIP
+        x, y, theta = pose
+        return np.roll(_placed(corners, (x, y, theta)), -round(theta / (0.5 * math.pi)), axis=0)
 
     def head_strips(self, pose: Iterable[float]) -> Array:
-        """Outlines of the cavity and of the body at a pose x, y [m], theta [rad], shape (2, 5, 2)."""
+        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2), or block, (1, 5, 2)."""
+        if self.is_block:
+            return _placed(0.5 * self.frame * _SQUARE[None], pose)
         sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
         return _placed(0.5 * sides[:, None, :] * _SQUARE, pose)
 
@@ -108,19 +124,22 @@ class Section:
         return middles, 0.5 * (depth * np.abs(_OUTWARDS) + _PAD_MM * np.abs(along)), labels
 
     def head_points(self, pose: Iterable[float]) -> Array:
-        """Centre of the cavity and the place of the head's name, shape (2, 2)."""
-        places = _placed(np.array([[0.0, 0.0], [0.0, 0.5 * self.cavity[1] + 0.5 * BODY_MARGIN_MM]]), pose)
+        """Centre of the head and the place of its name, shape (2, 2)."""
+        above = 0.5 * (self.frame if self.is_block else self.cavity)[1] + 0.5 * BODY_MARGIN_MM
+        places = _placed(np.array([[0.0, 0.0], [0.0, above]]), pose)
         places[1, 1] -= LABEL_MM
         return places
 
-    def arrows(self, theta: float, force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
+    def arrows(self, pose: tuple[float, float, float], force: Array) -> tuple[Array, Array, NDArray[np.intp]]:
         """Origins and vectors of the forces on the head, shape (k, 2), and the pairs that they belong to, (k,)."""
         drawn = np.flatnonzero(force >= FAINT_N)
+        # a frame corner pushes the wall of the head outwards, a wall pushes the corner of a block inwards
+        theta = math.pi if self.is_block else pose[2]
         normal_x = math.cos(theta) * NORMAL_X[drawn] - math.sin(theta) * NORMAL_Y[drawn]
         normal_y = math.sin(theta) * NORMAL_X[drawn] + math.cos(theta) * NORMAL_Y[drawn]
         length = ARROW_MM_PER_N * force[drawn]
         vectors = np.stack((length * normal_x, length * normal_y), axis=1) * _FLIP
-        return self.corners()[drawn // 2], vectors, drawn
+        return self.corners(pose)[drawn // 2], vectors, drawn
 
     def corner_radii(self, force: Array) -> Array:
         """Radius of each corner's mark [mm]: larger where the corner carries force, shape (4,)."""
