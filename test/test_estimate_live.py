@@ -152,7 +152,7 @@ def test_the_live_estimate_is_published_and_given_again_by_the_journal(tmp_path:
         probe = running.probe
         heard: list[JointState] = probe.listen(JointState, "estimate")
         clearances: list[JointState] = probe.listen(JointState, "clearance")
-        forces: list[JointState] = probe.listen(JointState, "force_intervals")
+        forces: list[JointState] = probe.listen(JointState, "window_forces")
         forecasts: list[JointState] = probe.listen(JointState, "forecast")
         assert value(probe.status[-1], "horizontal") == "prior"
         _play(running, truth, late=True)

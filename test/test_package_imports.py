@@ -29,7 +29,7 @@ SUBPACKAGES = {
     "solve": {"errors", "kernel", "model"},
     "run": SOLVER,
     "stream": CORE,
-    "estimate": CORE,
+    "estimate": CORE | {"stream"},
     "record": CORE | {"build", "scene_file", "stream", "estimate"},
     "view": CORE | {"scene_file", "stream", "estimate", "record"},
     "study": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},

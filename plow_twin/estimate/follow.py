@@ -1,22 +1,28 @@
 """The twin that follows its machine: full twins drawn from what is known, steered by the measured poses.
 
 The members differ in clearances, contact and load gains. They are drawn from the prior at first and from each estimate
-that stands from then on; a new ensemble goes once more through the last seconds of load and poses, so it stands where
-the machine is. Each pose moves all members by an ensemble Kalman filter with perturbed observations (Burgers et al.,
-Mon. Weather Rev. 126 (1998) 1719), late poses through their covariance with the present. A member whose walls the
-correction would press on with more than half of the head's weight goes on as it is: behind a hard contact a tenth of a
-millimetre would be an impact that never was.
+that stands from then on; new members begin where those before them stand. Each pose moves all members by an ensemble
+Kalman filter with perturbed observations (Burgers et al., Mon. Weather Rev. 126 (1998) 1719), late poses through their
+covariance with the present. A member whose walls the correction would press on with more than half of the head's weight
+goes on as it is: behind a hard contact a tenth of a millimetre would be an impact that never was.
 
 The first member has the middle of all that is known and no drawn noise. It is the median twin: a real motion.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import math
+import struct
+import time as _time
+from bisect import bisect_left, insort
+from collections import deque
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import ArgumentError
 from plow_twin.estimate.estimate import prior_of
@@ -28,17 +34,21 @@ from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import DAMPING, GAIN, Unknowns
 from plow_twin.model.geometry import penetration_rows
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Scene
+from plow_twin.model.scene import Clearance, Scene, fastest_travel
+from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
+from plow_twin.run.twin import Advanced
+from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS, Status
+from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.void]
 
 #: Members by default.
 MEMBERS: Final = 128
-#: Seconds of load and poses that a new ensemble goes through: two load periods of the paper.
-LOOK_BACK_S: Final = 6.3
-#: Seconds of motion that are kept for poses that are late, by their delay among it.
+#: Seconds of motion that are kept for poses that are late, by their delay among it, and least distance of what is kept.
 LATEST_S: Final = 0.25
+_PATH_S: Final = 2e-3
 #: Least distance in s of poses that are used: nearer ones tell little more and cost as much.
 APART_S: Final = 4e-3
 #: Poses from whose quick changes the noise is told: fewest, and most.
@@ -46,35 +56,19 @@ _NOISE_ROWS: Final = (20, 400)
 #: Share of the head's weight on earth that a correction may press a pair with, beyond its force.
 _PRESSED: Final = 0.5
 _STANDARD_GRAVITY: Final = 9.81
-#: Share of the clearances, as a standard deviation, by which the members of a new ensemble are apart at first, and rows
-#: over whose distance the rates of the measured poses are told.
-_APART, _RATE_ROWS = 0.12, 5
 #: Members that carry the clearance of the prior at least, as a share: of more the poses would be trusted too far.
 _FEWEST_CARRY: Final = 0.1
+#: Samples that are advanced through at once: the rows of all members stay in the processor's cache.
+_CALL: Final = 20
+#: What is known of the clearances is told anew so often [1/s]: as often as it is published.
+_KNOWN_HZ: Final = 10.0
+#: Poses that wait for the model to reach their stamps: those of a stopped load do not pile up.
+_MOST_DUE: Final = 1000
+_NO_MARKS: Final = np.zeros(0, np.int64)
 #: Nothing is stated of either.
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
-
-
-@dataclass(frozen=True, eq=False)
-class Followed:
-    """What is known at some times, from what was measured before each.
-
-    Attributes
-    ----------
-    t : ndarray, shape (n,)
-        Times in s.
-    force, low, high : ndarray, shape (n, 8)
-        Forces of the median twin and the ends of their 90 % intervals in N.
-    clearance : ndarray, shape (n, 2, 3)
-        Horizontal and vertical clearance: value, 5 % and 95 % points in m.
-    """
-
-    t: Array
-    force: Array
-    low: Array
-    high: Array
-    clearance: Array
+_LENGTH: Final = struct.Struct("<q")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,14 +90,18 @@ class Span:
 
 
 class Follower:
-    """Follows one machine: takes in load, poses and estimates in order of time, tells forces and clearances.
+    """A twin under sampled loads that follows one machine: it takes in poses and estimates too.
+
+    It is driven like a `Twin`. Its motion is that of its first member, which has the middle of what is known.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     members : int
-        Twins, at least 20.
+        Twins, at least 20; with 1 the parameters alone follow: no pose moves it, and its forces have no intervals.
+    tol : float
+        As for `Twin`.
     start : float
         Time in s at which the scene's initial state holds.
     seed : int
@@ -115,103 +113,319 @@ class Follower:
         For too few members.
     """
 
-    def __init__(self, scene: Scene, members: int = MEMBERS, *, start: float = 0.0, seed: int = 0) -> None:
-        if members < FEWEST:
-            raise ArgumentError(f"members: got {members}, expected at least {FEWEST}")
-        self._scene, self._members, self._seed = scene, members, seed
-        self._prior = prior(scene)
-        self._start = start
-        self._load = Rows()
-        self._poses = Rows()
-        #: the estimate that is followed; None: the prior
-        self.estimate: Estimate | None = None
-        self._known = self._prior
-        self._ensemble = Ensemble(scene, self._known, members, self._rng(0), start)
-        self._taken_over = 0
-        self._span_start = start
+    excitation: Literal["scene", "sampled"] = "sampled"
+    max_evaluations: int | None = None
+    #: advances cut short: none
+    bounded = 0
 
-    def _rng(self, count: int) -> np.random.Generator:
-        return np.random.default_rng([self._seed, count])
+    def __init__(
+        self, scene: Scene, members: int = MEMBERS, *, tol: float = TOLERANCE, start: float = 0.0, seed: int = 0
+    ) -> None:
+        if members != 1 and members < FEWEST:
+            raise ArgumentError(f"members: got {members}, expected 1 or at least {FEWEST}")
+        self.scene, self.tol = scene, tol
+        self._members, self._seed = members, seed
+        self._prior = prior(scene)
+        self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
+        #: poses and estimates so far, whether they were used or not
+        self.taken = 0
+        #: whether the intervals of the forces are wanted at each row, beside those published
+        self.every_row = False
+        self._ends = _NO_MARKS
+        self._span_start = start
+        self._wrench = np.zeros(3)
+        #: poses that have moved the members
+        self.poses_used = 0
+        #: times that members were drawn anew
+        self.drawn = 0
+        self._draw("", start, self._unworn())
+        self._forget()
+
+    def _forget(self) -> None:
+        """Forget all poses."""
+        #: what waits for its time, in order: time in s, number, pose or text of an estimate
+        self._due: list[tuple[float, int, list[float] | str]] = []
+        #: times of the poses used lately
+        self._used: deque[float] = deque()
+        self._noise_rows: deque[Array] = deque(maxlen=_NOISE_ROWS[1])
+
+    def _unworn(self) -> Array:
+        wear = self.scene.wear
+        return np.zeros(PAIR_COUNT) if wear is None else np.array(wear.initial_depth_m, dtype=np.float64)
+
+    def _draw(self, text: str, time: float, worn: Array) -> None:
+        """Draw members from an estimate, JSON; from the prior without one. They are in the scene's initial state."""
+        self._text = text
+        #: the estimate that is followed; None: the prior
+        self.estimate = Estimate.from_dict(json.loads(text)) if text else None
+        self._known = self._prior if self.estimate is None else _whole(self.estimate, self._prior)
+        rng = np.random.default_rng([self._seed, self.drawn])
+        self._ensemble = Ensemble(self.scene, self._known, self._members, rng, time, self.tol, worn)
+        self._ensemble.set_travel_speed(self._speed)
+        self._tell_clearance()
+
+    # -- as a `Twin` -------------------------------------------------------------------------------------------------
+
+    @property
+    def signature(self) -> tuple[bool, ...]:
+        """Which terms the equations have, as of `Twin`."""
+        return self._ensemble.twins.signature
 
     @property
     def time(self) -> float:
         """Model time in s."""
-        return self._ensemble.time
+        return self._ensemble.twins.time
 
-    def clearance(self) -> Array:
-        """Return horizontal and vertical clearance, each with its 5 % and 95 % points, shape (2, 3), in m."""
-        if self.estimate is None and self._ensemble.steered:
-            return self._ensemble.clearance()
+    @property
+    def wrench(self) -> Array:
+        """The last sample: Fx, Fy [N] and M [N m], shape (3,); zero before the first."""
+        return self._wrench.copy()
+
+    @property
+    def wear_depth(self) -> Array:
+        """Wear depth of each pad of the median twin [m], shape (8,)."""
+        worn: Array = self._ensemble.worn[0].copy()
+        return worn
+
+    @property
+    def steered(self) -> bool:
+        """Whether poses move the members."""
+        return self._members > 1
+
+    @property
+    def members(self) -> int:
+        """Twins that are advanced."""
+        return self._members
+
+    @property
+    def lost(self) -> int:
+        """Members that have left the model's range."""
+        return int((~self._ensemble.good).sum())
+
+    def failure(self, status: int) -> str:
+        """Say why the newest advance that failed did so."""
+        return Status(status).text
+
+    def like(self, scene: Scene) -> Follower:
+        """Return a follower of another machine."""
+        return Follower(scene, self._members, tol=self.tol, seed=self._seed)
+
+    def warm_up(self) -> float:
+        """Compile what is needed, or load it from the cache on disk; return the seconds it took."""
+        begin, before = _time.perf_counter(), self.snapshot()
+        self.advance(self.time + 1e-6)
+        self._ensemble.stand_like(self._ensemble, self._wrench)
+        self.restore(before)
+        return _time.perf_counter() - begin
+
+    def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance:
+        """Advance to model time `t`, as `Twin.advance`."""
+        sample = self._wrench if wrench is None else np.asarray(wrench, dtype=np.float64)
+        rows = np.zeros(1, ROW)
+        self.advance_rows(np.array([t], dtype=np.float64), sample[None], rows)
+        return Advance(rows[0])
+
+    def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
+        """Say what the next `advance_rows` is for.
+
+        Parameters
+        ----------
+        ends : ndarray of int64, shape (m,)
+            Rising numbers of the rows that are published: a span of peaks and impulses ends there.
+        begins : bool
+            Whether a span begins with the first row.
+        """
+        self._ends = ends
+        if begins:
+            self._ensemble.begin_span()
+
+    def advance_rows(
+        self, t: Array, wrench: Array, rows: Rows | None, marks: NDArray[np.int64] = _NO_MARKS
+    ) -> Advanced:
+        """Advance to some times, as `Twin.advance_rows`; a row knows what was measured before it."""
+        if wrench.shape != (len(t), 3) or not np.isfinite(wrench).all():
+            raise ArgumentError(f"wrench: got {wrench!r}, expected finite numbers of shape ({len(t)}, 3)")
+        ends = np.zeros(len(t), bool)
+        ends[self._ends] = True
+        self._ends = _NO_MARKS
+        wanted = ends.copy()
+        wanted[-1] = True
+        if self.every_row or not self.steered:
+            wanted[:] = self.every_row
+        stops = set(marks.tolist())
+        failed, digests, begin = 0, list[str](), 0
+        while begin < len(t):
+            end = self._stop(t, begin, stops)
+            here = slice(begin, end)
+            told = rows[here] if rows is not None else np.zeros(end - begin, ROW)
+            self._ensemble.advance(t[here], wrench[here], told, wanted[here], ends[here])
+            failed += int((told["status"] != 0).sum())
+            self._say_clearance(told, float(t[end - 1]))
+            self._wrench = wrench[end - 1].copy()
+            while self._due and self._due[0][0] <= t[end - 1]:
+                when, _, what = self._due.pop(0)
+                self._take_in(when, what)
+            if end in stops:
+                digests.append(self.digest())
+            begin = end
+        return Advanced(failed, digests)
+
+    def _stop(self, t: Array, begin: int, marks: set[int]) -> int:
+        """Return up to where to go at once: nothing happens on the way."""
+        end = min(begin + _CALL, len(t))
+        due = self._due[0][0] if self._due else math.inf
+        for place in range(begin, end):
+            if place + 1 in marks or t[place] >= due or math.floor(t[place] * _KNOWN_HZ) != self._cell:
+                return place + 1
+        return end
+
+    def _say_clearance(self, rows: Rows, now: float) -> None:
+        """Write what is known of the clearances, with the wear of the median twin."""
+        rows["known_clearance"] = self._clearance.ravel() + self._moved(rows["wear_depth"])
+        if math.floor(now * _KNOWN_HZ) != self._cell:
+            self._tell_clearance()
+            rows["known_clearance"][-1] = self._clearance.ravel() + self._moved(rows["wear_depth"][-1])
+
+    def _moved(self, worn: Array) -> Array:
+        """Return by how much pads that are worn by `worn` (..., 8) widen the clearances and their points, (..., 6)."""
+        return np.repeat(_moved(self.scene, worn), 3, axis=-1)
+
+    def _tell_clearance(self) -> None:
+        """Tell the clearances that unworn pads would have from what is known now."""
+        self._cell = math.floor(self.time * _KNOWN_HZ)
         known = self._known
-        return np.array([[value.mean, value.p05, value.p95] for value in (known.horizontal, known.vertical)])
-
-    def advance(self, t: Array, wrench: Array) -> Followed:
-        """Advance through samples of the load believed, `t` (n,) in s and `wrench` (n, 3) in N, N, N m."""
-        self._load.add(t, wrench, float(t[-1]) - LOOK_BACK_S)
-        force, low, high = self._ensemble.advance(t, wrench)
-        return Followed(t, force, low, high, np.repeat(self.clearance()[None], len(t), axis=0))
-
-    def held(self, t: float) -> Followed:
-        """Return what is known at a time after the newest sample, which is held; nothing changes."""
-        force, low, high = self._ensemble.held(t)
-        return Followed(np.array([t]), force, low, high, self.clearance()[None])
-
-    def span(self) -> Span:
-        """Return peaks and impulses since the call before; what a new ensemble has not gone through is left out."""
-        start, self._span_start = self._span_start, self.time
-        return Span(start, self.time, *self._ensemble.span())
-
-    def take_pose(self, t: float, q: Array) -> None:
-        """Take in a pose that was measured at `t` in s, not later than the present, NaN where it was not."""
-        if len(self._poses.t) and t - self._poses.t[-1] < APART_S:
+        if self.estimate is None and self._ensemble.moved:
+            self._clearance = self._ensemble.clearance()
             return
-        self._poses.add(np.array([t]), q[None], self.time - LOOK_BACK_S)
+        self._clearance = np.array([[value.mean, value.p05, value.p95] for value in (known.horizontal, known.vertical)])
+        if self.estimate is not None:
+            self._clearance -= self._ensemble.moved_before
+
+    def reset(
+        self,
+        t: float,
+        *,
+        wear_depth: ArrayLike | None = None,
+        pose: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> None:
+        """Begin anew at model time `t`, as `Twin.reset`: what was measured of the motion before holds no longer."""
+        self.drawn += 1
+        worn = self._unworn() if wear_depth is None else np.array(wear_depth, dtype=np.float64)
+        self._draw("", t, worn)
+        self._forget()
+        self._wrench = np.zeros(3)
+        self._span_start = t
+        if pose is not None:
+            q, v = (np.asarray(part, dtype=np.float64) for part in pose)
+            self._ensemble.stand_about(q, v)
+
+    def set_travel_speed(self, speed_m_s: float) -> None:
+        """Set the speed along the face from here on, as `Twin.set_travel_speed`."""
+        self._speed = abs(float(speed_m_s))
+        self._ensemble.set_travel_speed(self._speed)
+
+    def digest(self) -> str:
+        """Return 16 hexadecimal digits that stand for the exact state."""
+        state = self._ensemble.twins.snapshot() + self._wrench.tobytes() + self._ensemble.square.tobytes()
+        return hashlib.blake2b(state, digest_size=8).hexdigest()
+
+    def snapshot(self) -> bytes:
+        """Return the exact state as bytes, to be restored by a follower of the same scene, members and seed."""
+        blobs, random = self._ensemble.state()
+        noise = np.array(self._noise_rows).reshape(-1, 3)
+        blobs += [noise.tobytes(), self._clearance.tobytes(), self._wrench.tobytes()]
+        facts = {
+            "members": self._members, "taken": self.taken, "drawn": self.drawn, "estimate": self._text,
+            "due": self._due, "used": list(self._used), "speed": self._speed, "cell": self._cell,
+            "span": self._span_start, "worn": self._ensemble.worn_before.tolist(), "random": random,
+            "sizes": [len(blob) for blob in blobs],
+        }  # fmt: skip
+        head = json.dumps(facts).encode()
+        return b"".join([_LENGTH.pack(len(head)), head, *blobs])
+
+    def snapshot_size(self, data: bytes) -> int:
+        """Return the length of the snapshot at the beginning of some bytes."""
+        facts, begin = _facts(data)
+        return begin + int(sum(facts["sizes"]))
+
+    def restore(self, data: bytes) -> None:
+        """Take over a state saved by `snapshot`."""
+        facts, begin = _facts(data)
+        blobs = []
+        for size in facts["sizes"]:
+            blobs.append(data[begin : begin + size])
+            begin += size
+        worn, self._speed = np.array(facts["worn"]), float(facts["speed"])
+        drawn = facts["drawn"], facts["members"], facts["estimate"], facts["worn"]
+        if drawn != (self.drawn, self._members, self._text, self._ensemble.worn_before.tolist()):
+            self.drawn, self._members = int(facts["drawn"]), int(facts["members"])
+            self._draw(facts["estimate"], 0.0, worn)
+        self.taken, self._cell, self._span_start = int(facts["taken"]), int(facts["cell"]), float(facts["span"])
+        self._due = [(float(when), int(number), what) for when, number, what in facts["due"]]
+        self._used = deque(facts["used"])
+        *own, noise, clearance, wrench = blobs
+        self._ensemble.set_state(own, facts["random"])
+        self._noise_rows = deque(np.frombuffer(noise).reshape(-1, 3).copy(), maxlen=_NOISE_ROWS[1])
+        self._clearance, self._wrench = np.frombuffer(clearance).reshape(2, 3).copy(), np.frombuffer(wrench).copy()
+
+    # -- what is measured --------------------------------------------------------------------------------------------
+
+    def take_pose(self, t: float, q: ArrayLike) -> None:
+        """Take in a pose measured at `t` in s, shape (3,), NaN where it was not; it acts once the model has come there.
+
+        One of the last `LATEST_S` acts at once.
+        """
+        self._take(t, np.asarray(q, dtype=np.float64).tolist())
+
+    def take_estimate(self, text: str, t: float) -> None:
+        """Take in an estimate, JSON as of `Estimate.as_dict`, that is known from `t` in s on.
+
+        It is followed if it says more than what is followed; one that is withdrawn lets the prior hold again.
+        """
+        self._take(t, text)
+
+    def _take(self, t: float, what: list[float] | str) -> None:
+        self.taken += 1
+        if t <= self.time:
+            self._take_in(t, what)
+        elif len(self._due) < _MOST_DUE:
+            insort(self._due, (t, self.taken, what), key=lambda due: due[:2])
+
+    def _take_in(self, t: float, what: list[float] | str) -> None:
+        if not isinstance(what, str):
+            self._use_pose(t, np.array(what))
+            return
+        found = Estimate.from_dict(json.loads(what))
+        states = (found.horizontal_state, found.vertical_state)
+        if State.WITHDRAWN in states:
+            if self.estimate is not None:
+                self._begin_anew("")
+        elif all(state.known for state in states) or (self.estimate is None and any(state.known for state in states)):
+            self._begin_anew(what)
+
+    def _begin_anew(self, text: str) -> None:
+        """Draw from what is known now; the members begin where those before them stand."""
+        before = self._ensemble
+        self.drawn += 1
+        self._draw(text, self.time, before.worn[0])
+        self._ensemble.stand_like(before, self._wrench)
+
+    def follow_parameters(self) -> None:
+        """Go on with one twin that no pose moves, from where the median twin stands."""
+        self._members = 1
+        self._begin_anew(self._text)
+
+    def _use_pose(self, t: float, q: Array) -> None:
+        if not self.steered or any(abs(t - used) < APART_S for used in self._used):
+            return
+        if np.isfinite(q).all() and (not self._used or t > max(self._used)):
+            self._noise_rows.append(q)
+        self._used.append(t)
+        while self._used and self._used[0] < self.time - 2.0 * LATEST_S:
+            self._used.popleft()
         noise, bias, delay = self._sensor()
         if noise is not None:
-            self._ensemble.take_pose(t - delay, q - bias, noise)
-
-    def take_estimate(self, found: Estimate) -> bool:
-        """Take over an estimate if it says more than what is followed; return whether the ensemble is another one.
-
-        One that is withdrawn lets the prior hold again.
-        """
-        told = [found.horizontal_state.known, found.vertical_state.known]
-        if State.WITHDRAWN in (found.horizontal_state, found.vertical_state):
-            if self.estimate is None:
-                return False
-            self.estimate, self._known = None, self._prior
-        elif all(told) or (self.estimate is None and any(told)):
-            self.estimate = found
-            self._known = _whole(found, self._prior)
-        else:
-            return False
-        self._begin_anew()
-        return True
-
-    def restart(self, scene: Scene) -> None:
-        """Go on with another machine: what was estimated of the one before holds no longer."""
-        self._scene, self._prior = scene, prior(scene)
-        self.estimate, self._known = None, self._prior
-        self._begin_anew()
-
-    def _begin_anew(self) -> None:
-        """Let an ensemble drawn from what is known now go through the newest load and poses."""
-        self._taken_over += 1
-        load, poses = self._load, self._poses
-        begin = float(load.t[0]) if len(load.t) else self._start
-        rng = self._rng(self._taken_over)
-        ensemble = Ensemble(self._scene, self._known, self._members, rng, begin)
-        noise, bias, delay = self._sensor()
-        if noise is not None and begin > self._start:
-            ensemble.scatter(poses.rates(_RATE_ROWS))
-        for rows, used in in_turn(load.t, poses.t):
-            if load.t[rows][-1] <= self._span_start:
-                ensemble.span()
-            ensemble.advance(load.t[rows], load.values[rows], told=False)
-            for index in range(used.start, used.stop):
-                if noise is not None:
-                    ensemble.take_pose(float(poses.t[index]) - delay, poses.values[index] - bias, noise)
-        self._ensemble = ensemble
+            self.poses_used += self._ensemble.take_pose(t - delay, q - bias, noise)
 
     def _sensor(self) -> tuple[Array | None, Array, float]:
         """Return noise, None where too little was measured to tell, bias and delay of the sensor."""
@@ -219,10 +433,8 @@ class Follower:
         noise: Array | None = None
         if found is not None and found.noise is not None:
             noise = np.array(found.noise)
-        else:
-            whole = self._poses.values[np.isfinite(self._poses.values).all(axis=1)][-_NOISE_ROWS[1] :]
-            if len(whole) >= _NOISE_ROWS[0]:
-                noise = noise_level(whole)
+        elif len(self._noise_rows) >= _NOISE_ROWS[0]:
+            noise = noise_level(np.array(self._noise_rows))
         if noise is None or not noise.all():
             return None, np.zeros(3), 0.0
         if found is None:
@@ -230,120 +442,176 @@ class Follower:
         bias = [0.0 if value is None else value.mean for value in (found.bias_x, found.bias_y, found.bias_theta)]
         return noise, np.array(bias), 0.0 if found.delay is None else max(found.delay.mean, 0.0)
 
+    # -- what is known -----------------------------------------------------------------------------------------------
 
-class Rows:
-    """The newest rows of a stream: `t` (n,) in s, `values` (n, 3)."""
-
-    def __init__(self) -> None:
-        self.t, self.values = np.zeros(0), np.zeros((0, 3))
-
-    def add(self, t: Array, values: Array, oldest: float) -> None:
-        """Add rows, and drop those before `oldest`."""
-        first = int(np.searchsorted(self.t, oldest, side="left"))
-        self.t = np.append(self.t[first:], t)
-        self.values = np.concatenate([self.values[first:], values])
-
-    def rates(self, apart: int) -> Array:
-        """Return the root mean square of the rates over so many rows, shape (3,), 0 where too few were measured."""
-        if len(self.t) <= apart:
-            return np.zeros(3)
-        rate = (self.values[apart:] - self.values[:-apart]) / (self.t[apart:] - self.t[:-apart])[:, None]
-        rate = np.where(np.isfinite(rate), rate, 0.0)
-        found: Array = np.sqrt((rate**2).mean(axis=0))
+    def clearance(self) -> Array:
+        """Return horizontal and vertical clearance, each with its 5 % and 95 % points, shape (2, 3), in m."""
+        self._tell_clearance()
+        found: Array = self._clearance + self._moved(self.wear_depth).reshape(2, 3)
         return found
 
+    def span(self) -> Span:
+        """Return peaks and impulses since the call before, where no publication has ended a span."""
+        start, self._span_start = self._span_start, self.time
+        found = Span(start, self.time, *self._ensemble.span())
+        self._ensemble.begin_span()
+        return found
 
-def in_turn(load: Array, poses: Array) -> list[tuple[slice, slice]]:
-    """Return samples of a load and the poses that follow upon them, in turn, by their stamps in s.
+    def held(self, t: float) -> Rows:
+        """Return the row, shape (1,), of a time after the newest sample, which is held; nothing changes."""
+        rows = np.zeros(1, ROW)
+        self._ensemble.held(t, rows)
+        rows["known_clearance"] = self._clearance.ravel() + self._moved(rows["wear_depth"])
+        return rows
 
-    A pose follows upon the first sample that is not earlier: a twin goes no further than its load is known.
-    """
-    places = np.searchsorted(load, poses, side="left")
-    ends = np.append(np.unique(places[places < len(load)]) + 1, len(load))
-    out, first = [], 0
-    for end in ends.tolist():
-        if end > first:
-            used = slice(*np.searchsorted(places, [first, end], side="left").tolist())
-            out.append((slice(first, end), used))
-            first = end
-    return out
+
+def follower(scene: Scene, follow: str, members: int, tol: float) -> Follower:
+    """Return the twin of a scene that follows `full`, with so many members, or `parameters` alone."""
+    return Follower(scene, members) if follow == "full" else Follower(scene, 1, tol=tol)
+
+
+def _facts(data: bytes) -> tuple[dict[str, Any], int]:
+    """Return the facts at the beginning of a snapshot, and where what follows them begins."""
+    (length,) = _LENGTH.unpack_from(data)
+    begin = _LENGTH.size + length
+    return json.loads(data[_LENGTH.size : begin]), begin
+
+
+def _moved(scene: Scene, worn: Array) -> Array:
+    """Return by how much pads that are worn by `worn` (..., 8) widen the clearances in m, shape (..., 2)."""
+    own = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
+    found: Array = clearances(scene, worn)[..., :2] - own
+    return found
 
 
 class Ensemble:
-    """Twins drawn from what is known; the first has its middle."""
+    """Twins drawn from what is known; the first has its middle.
 
-    def __init__(self, scene: Scene, known: Estimate, members: int, rng: np.random.Generator, start: float) -> None:
-        scenes, gain = draw_scenes(scene, known, members, rng)
+    Parameters
+    ----------
+    scene, known
+        The nominal scene, and what is known: clearances of unworn pads in the prior, those at present in an estimate.
+    members, rng, start, tol
+        How many; for all that is drawn; time of the scene's initial state; tolerance.
+    worn : ndarray, shape (8,)
+        Wear depth of the pads in m.
+    """
+
+    def __init__(
+        self, scene: Scene, known: Estimate, members: int, rng: np.random.Generator, start: float, tol: float,
+        worn: Array,
+    ) -> None:  # fmt: skip
+        scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
-        self._twins = TwinBatch(scenes, tol=TOLERANCE, start=start)
+        #: wear of the pads at the beginning, and by how much it had widened the clearances that are known, (2, 1)
+        self.worn_before, self.moved_before = worn, np.zeros((2, 1))
+        if scene.wear is not None:
+            states = (known.horizontal_state, known.vertical_state)
+            self.moved_before = np.where([[state.known] for state in states], _moved(scene, worn)[:, None], 0.0)
+            scenes = [_worn(one, scene, worn, self.moved_before[:, 0]) for one in scenes]
+        self.twins = TwinBatch(scenes, tol=tol, start=start)
         self._gain, self._rng = gain, rng
         self._walls = np.stack([penetration_rows(one) for one in scenes])
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
-        weight = _PRESSED * scene.head.mass_kg * _STANDARD_GRAVITY
-        stiffness, exponent = np.array([one.contact.stiffness for one in scenes])[:, None], scene.contact.exponent
-        self._pressed = stiffness, exponent, weight
-        self._good = np.ones(members, dtype=bool)
+        self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
+        self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
+        self._pressed = _PRESSED * scene.head.mass_kg * _STANDARD_GRAVITY
+        self.good = np.ones(members, dtype=bool)
         self._peak, self._impulse = np.zeros((members, PAIR_COUNT)), np.zeros((members, PAIR_COUNT))
         #: squares of each member's normalised innovations
-        self._square = np.zeros(members)
-        #: times and poses (h, m, 3) of the newest seconds, oldest first, and the present rates (m, 3)
-        self._t, self._q = np.array([start]), np.zeros((1, members, 3)) + np.array(scene.initial.q)
-        self._v = np.zeros((members, 3)) + np.array(scene.initial.v)
-        self._depth = self._penetration(self._q[-1])
+        self.square = np.zeros(members)
+        #: times and poses (m, 3) of the newest seconds, oldest first; present rates (m, 3), wear and penetration (m, 8)
+        self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
+        self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
+        self._depth = self._penetration(self._path[-1][1])
 
     @property
-    def time(self) -> float:
-        """Model time in s."""
-        return self._twins.time
-
-    @property
-    def steered(self) -> bool:
+    def moved(self) -> bool:
         """Whether any pose has moved the members."""
-        return bool(self._square.any())
+        return bool(self.square.any())
 
-    def advance(self, t: Array, wrench: Array, told: bool = True) -> tuple[Array, Array, Array]:
-        """Advance all members; return forces of the first and the ends of their intervals, (n, 8) each, if `told`."""
-        batch = self._twins.advance_samples(t, wrench * self._gain[:, None, :])
-        self._good &= (batch.status == 0).all(axis=1)
-        np.maximum(self._peak, batch.peak.max(axis=1), out=self._peak)
-        self._impulse += batch.impulse.sum(axis=1)
-        kept = self._t > t[-1] - LATEST_S
-        self._t = np.append(self._t[kept], t)
-        self._q = np.concatenate([self._q[kept], batch.q.transpose(1, 0, 2)])
-        self._v, self._depth = batch.v[:, -1].copy(), batch.penetration[:, -1].copy()
-        return self._points(batch.force) if told else (self._v,) * 3
+    def set_travel_speed(self, speed_m_s: float) -> None:
+        """Set the speed along the face, of each member as far as its damping allows."""
+        self.twins.set_travel_speed(np.minimum(speed_m_s, self._fastest))
 
-    def held(self, t: float) -> tuple[Array, Array, Array]:
-        """Return the same at a later time with the newest sample held; nothing changes."""
-        before = self._twins.snapshot()
-        batch = self._twins.advance(t)
-        self._twins.restore(before)
-        return self._points(batch.force)
+    def advance(self, t: Array, wrench: Array, rows: Rows, wanted: NDArray[np.bool_], ends: NDArray[np.bool_]) -> None:
+        """Advance all members; write the rows of the first, shape (n,).
+
+        Intervals stand in those `wanted`; a span of peaks and impulses ends with each of `ends`.
+        """
+        batch = self.twins.advance_samples(t, wrench * self._gain[:, None, :])
+        rows[:] = batch.rows[0]
+        rows["followed"] = FOLLOWED
+        failed = np.any(batch.status != 0, axis=0).tolist()
+        for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), wanted.tolist(), ends.tolist(), strict=True)):
+            if failed[place]:
+                self.good &= batch.status[:, place] == 0
+            np.maximum(self._peak, batch.peak[:, place], out=self._peak)
+            self._impulse += batch.impulse[:, place]
+            if is_wanted:
+                self._tell(batch.force[:, place], rows[place : place + 1])
+            if is_end:
+                self.begin_span()
+            self._remember(now, batch.q[:, place].copy())
+        self._v, self.worn = batch.v[:, -1].copy(), batch.wear_depth[:, -1].copy()
+        self._depth = batch.penetration[:, -1].copy()
+
+    def _remember(self, now: float, q: Array) -> None:
+        path = self._path
+        if len(path) > 1 and path[-1][0] - path[-2][0] < _PATH_S:
+            path.pop()
+        path.append((now, q))
+        while path[1][0] <= now - LATEST_S:
+            path.popleft()
+
+    def _tell(self, force: Array, row: Rows) -> None:
+        """Write the intervals of forces, peaks and impulses."""
+        names = ("force", "peak", "impulse")
+        _, low, high = self._points(np.stack([force, self._peak, self._impulse], axis=1))
+        for index, name in enumerate(names):
+            row[f"{name}_low"], row[f"{name}_high"] = low[index], high[index]
+        row["followed"] = WITH_INTERVALS
+
+    def held(self, t: float, row: Rows) -> None:
+        """Write the row of a later time with the newest sample held; nothing changes."""
+        before = self.twins.snapshot()
+        batch = self.twins.advance(t)
+        self.twins.restore(before)
+        row[:] = batch.rows[0]
+        self._tell(batch.force[:, 0], row)
+
+    def begin_span(self) -> None:
+        """Let peaks and impulses begin here."""
+        self._peak[:], self._impulse[:] = 0.0, 0.0
 
     def span(self) -> tuple[Array, Array]:
-        """Return peaks and impulses since the call before: of the first member and the points, (3, 8) each."""
-        told = np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
-        self._peak[:], self._impulse[:] = 0.0, 0.0
-        return told
+        """Return peaks and impulses since the span's begin: of the first member and the points, (3, 8) each."""
+        return np.stack(self._points(self._peak)), np.stack(self._points(self._impulse))
 
-    def _points(self, force: Array) -> tuple[Array, Array, Array]:
-        low, _, high = quantiles(force[self._good] if self._good.sum() >= FEWEST else force)
-        return force[0].copy(), np.minimum(low, force[0]), np.maximum(high, force[0])
+    def _points(self, values: Array) -> tuple[Array, Array, Array]:
+        """Return the first member's values, and the 5 % and 95 % points over the members that are in range."""
+        low, _, high = quantiles(values if self.good.all() else values[self._used()])
+        return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
+
+    def _used(self) -> NDArray[np.bool_]:
+        """Tell which members determine intervals: those in the model's range, or all where these are too few."""
+        return self.good if self.good.sum() >= FEWEST else np.ones(len(self.good), dtype=bool)
 
     def clearance(self) -> Array:
         """Return the clearances with their 5 % and 95 % points, (2, 3), of the members that foretell the poses best.
 
-        The likelihoods are tempered until enough members carry the interval.
+        The likelihoods are tempered until enough members carry the interval. Of unworn pads.
         """
-        excess = self._square - self._square[self._good].min(initial=np.inf)
+        use = self._used()
+        excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
         low, high = 0.0, 1.0
         fewest = _FEWEST_CARRY * len(excess)
         for _ in range(40):
             share = 0.5 * (low + high)
-            weight = np.where(self._good, np.exp(-0.5 * share * np.minimum(excess, 1e9)), 0.0)
+            weight = np.where(use, np.exp(-0.5 * share * excess), 0.0)
             enough = weight.sum() ** 2 > fewest * (weight**2).sum()
             low, high = (share, high) if enough else (low, share)
-        weight = np.where(self._good, np.exp(-0.5 * low * np.minimum(excess, 1e9)), 0.0)
+        weight = np.where(use, np.exp(-0.5 * low * excess), 0.0)
         out = np.zeros((2, 3))
         for axis, values in enumerate(self._clearance.T):
             order = np.argsort(values)
@@ -351,58 +619,111 @@ class Ensemble:
             out[axis] = values[order[np.searchsorted(share, [0.5, 0.05, 0.95]).clip(0, len(order) - 1)]]
         return out
 
-    def scatter(self, rate: Array) -> None:
-        """Set the members apart about the middle of the cavity, with rates that scatter by `rate`, shape (3,)."""
-        white = self._rng.standard_normal((len(self._twins), 6))
-        turn = self._clearance.min(axis=1) / np.abs(self._walls[:, :2]).max(axis=(1, 2))
-        room = _APART * np.column_stack([self._clearance, turn])
-        q, v = room * np.clip(white[:, :3], -2.0, 2.0), rate * white[:, 3:]
-        clear = (self._penetration(q) < 0.0).all(axis=1)
-        q[~clear] = 0.0
-        q[0], v[0] = 0.0, 0.0
-        self._put(np.arange(len(q)), q, v)
+    def stand_like(self, before: Ensemble, wrench: Array) -> None:
+        """Begin where others stand under a load, each by its own clearances, with what they have gone through."""
+        from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
+        there = before._room()[from_]
+        share = np.divide(self._room(), there, out=np.ones_like(there), where=there > 0.0)
+        self.twins.set_wrench(wrench * self._gain)
+        self._path = deque((t, q[from_] * share) for t, q in before._path)
+        self._peak, self._impulse = before._peak[from_], before._impulse[from_]
+        self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
 
-    def take_pose(self, t: float, q: Array, noise: Array) -> None:
-        """Move the members toward a pose measured at `t`, by their covariance with it; too late ones tell nothing."""
+    def stand_about(self, q: Array, v: Array) -> None:
+        """Begin at a pose of the first member, the others by their own clearances."""
+        room = self._room()
+        places = q * np.divide(room, room[0], out=np.ones_like(room), where=room[0] > 0.0)
+        force = self._force(self._penetration(places))[:1]
+        self._stand(places, np.tile(v, (len(room), 1)), force)
+
+    def _room(self) -> Array:
+        """Return what the head can move by, horizontally, vertically, and at its corners, shape (m, 3)."""
+        return np.column_stack([self._clearance, self._clearance.min(axis=1)])
+
+    def _stand(self, q: Array, v: Array, force: Array) -> None:
+        """Stand at poses; where a pair would be pressed by more than a force, (m, 8), nearer to the middle."""
+        low, high = np.zeros(len(q)), np.ones(len(q))
+        free = self._allowed(q, force)
+        low[free] = 1.0
+        for _ in range(40) if not free.all() else ():
+            share = 0.5 * (low + high)
+            allowed = self._allowed(share[:, None] * q, force)
+            low, high = np.where(allowed, share, low), np.where(allowed, high, share)
+        self._put(np.arange(len(q)), low[:, None] * q, v)
+
+    def take_pose(self, t: float, q: Array, noise: Array) -> bool:
+        """Move the members toward a pose measured at `t`, by their covariance with it; False for one too late."""
         there = np.flatnonzero(np.isfinite(q))
-        if t <= self._t[0] or not len(there):
-            return
-        after = min(int(np.searchsorted(self._t, t)), len(self._t) - 1)
-        share = min((t - self._t[after - 1]) / (self._t[after] - self._t[after - 1]), 1.0)
-        then = ((1.0 - share) * self._q[after - 1] + share * self._q[after])[:, there]
+        times = [time for time, _ in self._path]
+        if t <= times[0] or not len(there):
+            return False
+        after = min(bisect_left(times, t), len(times) - 1)
+        path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
+        share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
+        then = ((1.0 - share) * path[0] + share * path[1])[:, there]
         white = self._rng.standard_normal((len(then), len(there)))
         white[0] = 0.0
         off = q[there] - then
-        self._square += ((off / noise[there]) ** 2).sum(axis=1)
-        state = np.concatenate([self._v, *self._q[max(after - 1, 0) :]], axis=1)
-        use = self._good if self._good.sum() >= FEWEST else np.ones(len(state), dtype=bool)
+        self.square += ((off / noise[there]) ** 2).sum(axis=1)
+        state = np.concatenate([self._v, *path], axis=1)
+        use = self._used()
         about, seen = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
         scatter = seen[use].T @ seen[use] / (use.sum() - 1) + np.diag(noise[there] ** 2)
         weight = np.linalg.solve(scatter, seen[use].T @ about[use] / (use.sum() - 1))
         moved = state + (off + noise[there] * white) @ weight
         v, places = moved[:, :3], moved[:, 3:].reshape(len(moved), -1, 3).transpose(1, 0, 2)
-        allowed = np.flatnonzero(self._allowed(places[-1]))
-        self._q[len(self._q) - len(places) :, allowed] = places[:, allowed]
+        allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
+        for place, index in enumerate(range(after - 1, len(times))):
+            self._path[index][1][allowed] = places[place, allowed]
         self._put(allowed, places[-1, allowed], v[allowed])
+        return True
 
-    def _allowed(self, q: Array) -> NDArray[np.bool_]:
-        """Tell which members may be put to poses (m, 3): no pair is pressed much more than it is."""
-        stiffness, exponent, weight = self._pressed
-        now, then = (np.maximum(depth, 0.0) ** exponent for depth in (self._depth, self._penetration(q)))
-        return np.asarray((stiffness * (then - now) < weight).all(axis=1))
+    def _force(self, depth: Array) -> Array:
+        """Return the elastic force of each pair, (m, 8)."""
+        found: Array = self._stiffness[:, None] * np.maximum(depth, 0.0) ** self._exponent
+        return found
+
+    def _allowed(self, q: Array, force: Array) -> NDArray[np.bool_]:
+        """Tell which members may be put to poses (m, 3): no pair is pressed by much more than a force, (m, 8)."""
+        return np.asarray((self._force(self._penetration(q)) < force + self._pressed).all(axis=1))
 
     def _put(self, which: NDArray[np.int64], q: Array, v: Array) -> None:
-        self._twins.move(which, q, v)
-        self._q[-1, which], self._v[which] = q, v
-        self._depth = self._penetration(self._q[-1])
+        self.twins.move(which, q, v)
+        self._path[-1][1][which], self._v[which] = q, v
+        self._depth = self._penetration(self._path[-1][1])
 
     def _penetration(self, q: Array) -> Array:
         """Return the penetration of each pair in m, (m, 8), with each member's clearances at poses of shape (m, 3)."""
         x, y, theta = q.T
         c, s = np.cos(theta), np.sin(theta)
         body = np.stack([c, s, c * x + s * y, -s * x + c * y, np.ones(len(q))], axis=1)
-        found: Array = np.einsum("mi,mij->mj", body, self._walls)
+        found: Array = np.einsum("mi,mij->mj", body, self._walls) - self.worn
         return found
+
+    def state(self) -> tuple[list[bytes], Any]:
+        """Return all that changes, as bytes and as JSON."""
+        times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
+        arrays = (self.good, self.square, self._peak, self._impulse, self._v, self.worn, self._depth, times, path)
+        return [self.twins.snapshot(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
+
+    def set_state(self, blobs: list[bytes], random: Any) -> None:
+        """Go on from what `state` returned."""
+        self.twins.restore(blobs[0])
+        self.good = np.frombuffer(blobs[1], np.bool_).copy()
+        count = len(self.good)
+        self.square, *wide, times, path = (np.frombuffer(blob).copy() for blob in blobs[2:])
+        self._peak, self._impulse, self._v, self.worn, self._depth = (one.reshape(count, -1) for one in wide)
+        self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
+        self._rng.bit_generator.state = random
+
+
+def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:
+    """Return a member's scene with worn pads; its clearances are what is known, by `moved` (2,) due to the wear."""
+    assert scene.wear is not None
+    depths = tuple(worn.tolist())
+    horizontal, vertical = one.clearance.horizontal_m - moved[0], one.clearance.vertical_m - moved[1]
+    clearance = Clearance(max(float(horizontal), 0.0), max(float(vertical), 0.0))
+    return replace(one, clearance=clearance, wear=replace(scene.wear, initial_depth_m=depths))
 
 
 def prior(scene: Scene) -> Estimate:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -10,13 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.estimate import Guess, estimate_window
-from plow_twin.estimate.follow import MEMBERS, Followed, Follower, Span, in_turn
+from plow_twin.estimate.follow import MEMBERS, Follower, Span
 from plow_twin.estimate.gaps import Gaps
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.result import Estimate
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
+from plow_twin.solve.state import ROW
+from plow_twin.stream.journal import Estimated, Pose
+from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
@@ -25,6 +29,33 @@ WINDOW_S, INTERVAL_S = 32.0, 10.0
 _NS: Final = 1e9
 #: Seconds of load that are advanced through at once: the rows of all members stay in the processor's cache.
 _PART_S: Final = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What is known at some times, from what was measured before each.
+
+    Attributes
+    ----------
+    t : ndarray, shape (n,)
+        Times in s.
+    force, low, high : ndarray, shape (n, 8)
+        Forces of the median twin and the ends of their 90 % intervals in N.
+    clearance : ndarray, shape (n, 2, 3)
+        Horizontal and vertical clearance: value, 5 % and 95 % points in m.
+    """
+
+    t: Array
+    force: Array
+    low: Array
+    high: Array
+    clearance: Array
+
+    @classmethod
+    def of(cls, t: Array, rows: NDArray[np.void]) -> Followed:
+        """Take the rows of a twin that follows."""
+        clearance = rows["known_clearance"].reshape(-1, 2, 3)
+        return cls(t, rows["force"], rows["force_low"], rows["force_high"], clearance)
 
 
 @dataclass(frozen=True)
@@ -80,77 +111,89 @@ def follow(
 
 
 class _Steps:
-    """The loop over the load: advance, take in what was measured meanwhile, estimate where a window is due."""
+    """The loop over the load: the session that a live twin has gets what was measured in the order of its stamps."""
 
     def __init__(
         self, scene: Scene, load: Load, poses: Poses, gaps: Gaps | None, members: int, seed: int, span: float | None
     ) -> None:
         self._scene, self._load, self._poses, self._gaps = scene, load, poses, gaps
-        self._start = float(load.t[0])
-        self._follower = Follower(scene, members, start=self._start, seed=seed)
+        self._stamps, self._pose_stamps = (_stamps(part.t, load.t[0]) for part in (load, poses))
+        self._follower = Follower(scene, members, seed=seed)
+        self._follower.every_row = True
+        self._session = Session(self._follower)
         deviation = 0.0 if gaps is None else gaps.deviation
         self._windows = Windows(WINDOW_S, INTERVAL_S, 0.0, poses.deviation, load.deviation, deviation, early=True)
         self._guess: Guess = ()
-        #: rows on a grid so far, and gaps that were taken in
-        self._count = self._gaps_taken = 0
+        #: rows on a grid so far, poses and gaps that were taken in
+        self._count = self._poses_taken = self._gaps_taken = 0
         self._span = span
         self.taken_over: list[TakenOver] = []
         self.spans: list[Span] = []
 
     def rows(self, dt: float | None) -> Iterator[Followed]:
         """Yield what is known, part by part."""
-        load, poses = self._load, self._poses
-        for rows, used in in_turn(load.t, poses.t):
-            for part in self._until_due(rows):
-                yield from self._advance(load.t[part], load.wrench[part], dt)
-                if self._span is not None and load.t[part][-1] >= self._start + (len(self.spans) + 1) * self._span:
-                    self.spans.append(self._follower.span())
-                self._take_gaps(float(load.t[part][-1]))
-                for index in range(used.start, used.stop) if part.stop == rows.stop else ():
-                    self._windows.take_pose(self._stamp(poses.t[index]), tuple(poses.q[index].tolist()))
-                    self._follower.take_pose(float(poses.t[index]), poses.q[index])
-                for time, sample in zip(load.t[part].tolist(), load.wrench[part].tolist(), strict=True):
-                    window = self._windows.take_load(self._stamp(time), tuple(sample))
-                    if window is not None:
-                        self._estimate(window)
+        step = max(1, int(np.searchsorted(self._load.t, self._load.t[0] + _PART_S)))
+        # the first sample alone: a pose before it is of no motion
+        for first in (0, *range(1, len(self._stamps), step)):
+            part = slice(first, min(first + step, len(self._stamps)) if first else 1)
+            if first:
+                self._take_poses(self._stamps[part][-1])
+            yield from self._advance(part, dt)
+            if self._span is not None and self._follower.time >= (len(self.spans) + 1) * self._span:
+                self.spans.append(self._follower.span())
+            self._take_gaps(float(self._load.t[part][-1]))
+            stamps, samples = self._stamps[part].tolist(), self._load.wrench[part].tolist()
+            for stamp, sample in zip(stamps, samples, strict=True):
+                window = self._windows.take_load(stamp, tuple(sample))
+                if window is not None:
+                    self._estimate(window)
 
-    def _until_due(self, rows: slice) -> Iterator[slice]:
-        """Yield rows one by one where poses are rare: windows and rows of a grid are then between them."""
-        step = max(1, int(np.searchsorted(self._load.t[rows], self._load.t[rows.start] + _PART_S)))
-        for first in range(rows.start, rows.stop, step):
-            yield slice(first, min(first + step, rows.stop))
+    def _take_poses(self, until_ns: int) -> None:
+        """Take in the poses up to a stamp: the model uses each once it comes there."""
+        last = int(np.searchsorted(self._pose_stamps, until_ns, side="right"))
+        for index in range(self._poses_taken, last):
+            stamp, q = int(self._pose_stamps[index]), tuple(self._poses.q[index].tolist())
+            self._session.apply(Pose(stamp, q))
+            self._windows.take_pose(stamp, q)
+        self._poses_taken = max(last, self._poses_taken)
 
-    def _advance(self, t: Array, wrench: Array, dt: float | None) -> Iterator[Followed]:
+    def _advance(self, part: slice, dt: float | None) -> Iterator[Followed]:
+        t, stamps, wrench = self._load.t[part], self._stamps[part], self._load.wrench[part]
         if dt is None:
-            yield self._follower.advance(t, wrench)
+            yield Followed.of(t, self._session.advance(stamps, wrench, np.zeros(len(t), ROW)).rows)
             return
         for index in range(len(t)):
-            while (due := self._start + self._count * dt) < t[index]:
+            while (due := float(self._load.t[0]) + self._count * dt) < t[index]:
                 self._count += 1
-                yield self._follower.held(due)
-            now = self._follower.advance(t[index : index + 1], wrench[index : index + 1])
+                yield Followed.of(np.array([due]), self._follower.held(due - float(self._load.t[0])))
+            here = slice(index, index + 1)
+            now = self._session.advance(stamps[here], wrench[here], np.zeros(1, ROW)).rows
             if due == t[index]:
                 self._count += 1
-                yield now
+                yield Followed.of(t[here], now)
 
     def _take_gaps(self, now: float) -> None:
         if self._gaps is None:
             return
         last = int(np.searchsorted(self._gaps.t, now, side="right"))
+        stamps = _stamps(self._gaps.t, self._load.t[0]).tolist()
         for index in range(self._gaps_taken, last):
             there = np.flatnonzero(np.isfinite(self._gaps.gap[index]))
             values = tuple(self._gaps.gap[index, there].tolist())
-            self._windows.take_gaps(self._stamp(self._gaps.t[index]), tuple(there.tolist()), values)
+            self._windows.take_gaps(stamps[index], tuple(there.tolist()), values)
         self._gaps_taken = last
-
-    def _stamp(self, t: float) -> int:
-        return round((float(t) - self._start) * _NS)
 
     def _estimate(self, window: Window) -> None:
         found, following = estimate_window(self._scene, window.load, window.pose, window.lost, self._guess, window.gaps)
-        taken = self._follower.take_estimate(found)
-        self.taken_over.append(TakenOver(self._follower.time, found, taken))
+        bounds, before = (window.start_ns, window.end_ns, window.samples, window.poses), self._follower.drawn
+        self._session.apply(Estimated(*bounds, self._guess, (0.0,) * 6, json.dumps(found.as_dict())))
+        self.taken_over.append(TakenOver(self._follower.time, found, self._follower.drawn != before))
         self._guess = following
+
+
+def _stamps(t: Array, start: float) -> NDArray[np.int64]:
+    """Return times as stamps in ns from a start."""
+    return np.round((t - start) * _NS).astype(np.int64)
 
 
 def table(followed: Followed) -> tuple[list[str], Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 from statistics import NormalDist
@@ -197,6 +198,28 @@ class Estimate:
     groups: dict[str, tuple[Interval, State]] = field(default_factory=dict)
     forces_measured: ForcesUsed | None = None
     differs: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+
+    @classmethod
+    def from_dict(cls, told: Mapping[str, Any]) -> Estimate:
+        """Return what `as_dict` told of the machine and the sensor that it moves; groups and figures are left out."""
+
+        def clearance(name: str) -> tuple[Interval, State]:
+            one = told[name]
+            return Interval(one["mean_m"], one["p05_m"], one["p95_m"]), State(one["state"])
+
+        (horizontal, horizontal_state), (vertical, vertical_state) = clearance("horizontal"), clearance("vertical")
+        others: dict[str, Any] = {
+            quantity.name: Interval(**told[quantity.name])
+            for quantity in QUANTITIES
+            if quantity.name in told and quantity.name not in ("horizontal", "vertical")
+        }
+        correlation = told["correlation"]
+        return cls(
+            told["t_start"], told["t_end"], horizontal, vertical, horizontal_state, vertical_state,
+            noise=None if told["noise"] is None else tuple(told["noise"]), model=told["model"], sensor=told["sensor"],
+            reasons=tuple(told["reasons"]), lost=told["lost"],
+            correlation=None if correlation is None else tuple(tuple(row) for row in correlation["matrix"]), **others,
+        )  # fmt: skip
 
     def values(self) -> dict[str, Interval]:
         """Return all that is told, by the names of `QUANTITIES`."""

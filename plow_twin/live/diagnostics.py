@@ -102,6 +102,15 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "reasons": "reasons why model or sensor is suspect; empty: neither is",
         "error": "reason why the estimation has ended; empty: it continues",
     },
+    "follow": {
+        "follow": "off, parameters or full",
+        "source": "numbers of the model: prior or estimate",
+        "members": "twins that are advanced",
+        "members_lost": "twins among them that have left the model's range",
+        "poses_used": "measured poses that have moved the twins",
+        "taken_over": "times that the twins were drawn anew: by an estimate, its withdrawal or a change of the machine",
+        "reduced": "1 where the parameters alone follow because all twins did not keep up",
+    },
     "recorder": {
         "recording": "file being written; empty: no recording",
         "written": "items in the file",
@@ -126,6 +135,7 @@ STATUS_KEYS: Final[dict[str, str]] = {
     "vertical": "the same for the vertical clearance",
     "model": "agreement of the model with the measurements: ok or suspect; empty: no estimate yet",
     "sensor": "the same for the sensor of head_pose",
+    "follow": "off; else the numbers that the twin has, prior or estimate",
     "pads": "state of the interval of the pads' wear, as for the clearances",
     **{f"publishers_{topic}": f"publishers of `{topic}` that this node is connected to" for topic in TOPICS},
 }
@@ -170,6 +180,8 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
     estimation = runtime.estimation
     if estimation is not None:
         values |= {name: state.value for name, state in estimation.states.items()} | estimation.trust
+    follower = runtime.follower
+    values["follow"] = "off" if follower is None else "prior" if follower.estimate is None else "estimate"
     values |= {f"publishers_{topic}": str(count) for topic, count in runtime.inputs.publishers.items()}
     if lifecycle != "active":
         return OK, lifecycle, values
@@ -187,6 +199,7 @@ def summary(lifecycle: str, reason: str, runtime: Runtime | None, preparing: boo
             estimation is not None and bool(estimation.reasons),
             "; ".join(estimation.reasons if estimation else ()),
         ),
+        (WARN, runtime.reduced, "the twins that follow did not keep up: the parameters alone follow"),
         (OK, runtime.clock == "paused", "/clock is paused"),
         (WARN, runtime.without_clock, "use_sim_time is set and nothing has come on /clock"),
         (WARN, bool(others), f"another publisher of {', '.join(others)} sends too and is not followed"),
@@ -228,6 +241,7 @@ class Health:
             parts["input"] = self.input(runtime)
             parts["output"] = self.output(runtime)
             parts["estimate"] = self.estimate(runtime)
+            parts["follow"] = self.follow(runtime)
             parts["recorder"] = self.recorder(runtime)
         return parts
 
@@ -352,6 +366,23 @@ class Health:
         }
         trouble = found.error or values["reasons"]
         return (ERROR if found.error else WARN if trouble else OK), trouble or "estimating", values
+
+    def follow(self, runtime: Runtime) -> Part:
+        """Return how the twin follows the machine."""
+        follower, reduced = runtime.follower, runtime.reduced
+        values = dict.fromkeys(KEYS["follow"], "")
+        values["follow"] = "off" if follower is None else "full" if follower.steered else "parameters"
+        if follower is None:
+            return OK, "not following", values
+        values |= {
+            "source": "prior" if follower.estimate is None else "estimate",
+            "members": str(follower.members),
+            "members_lost": str(follower.lost),
+            "poses_used": str(follower.poses_used),
+            "taken_over": str(follower.drawn),
+            "reduced": str(int(reduced)),
+        }
+        return (WARN, "the twins did not keep up", values) if reduced else (OK, "following", values)
 
     def recorder(self, runtime: Runtime) -> Part:
         """Return how the recording is doing; loss is an error."""

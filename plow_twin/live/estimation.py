@@ -33,7 +33,7 @@ from plow_twin.stream.journal import (
 from plow_twin.stream.session import Session
 
 #: Topics of what is published, by base name.
-ESTIMATE, FORCE_INTERVALS, FORECAST = ESTIMATES
+ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
 #: What a number of a forecast is called in SI.
 _SI: Final = {"hours": "seconds", "km": "metres"}
 #: How often one looks whether an estimate has come [Hz].
@@ -44,12 +44,12 @@ class Estimation:
     """The estimate of one live twin: what goes into it, and what becomes of what comes out."""
 
     def __init__(self, settings: Settings, scene: Scene) -> None:
-        self._frame_id = settings.frame_id
+        self._frame_id, self._follows = settings.frame_id, settings.follows != "off"
         span = (settings.estimate_window, settings.estimate_interval, settings.rollback_span)
         windows = Windows(*span, settings.head_pose_deviation, settings.excitation_deviation, settings.gaps_deviation)
         asked = asked_of(settings)
         self._worker = Worker(scene, windows, asked)
-        told = {ESTIMATE: True, FORCE_INTERVALS: bool(asked.members), FORECAST: asked.plan is not None}
+        told = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in told.items() if wanted]
         #: when other pads were set, until that has been told [ns]
         self._set_ns: int | None = None
@@ -96,6 +96,8 @@ class Estimation:
                 self._forget()
             case Reset():
                 self._worker.restart()
+                if self._follows:
+                    self._forget()
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
         """Hand an estimate that has come to the session; return its messages by topic, none if none has come.
@@ -119,7 +121,7 @@ class Estimation:
         self.forecast, self.forecast_error = found.also.get("forecast"), found.also.get("forecast_error", "")
         messages = {ESTIMATE: message_of(found, self._frame_id)}
         if "forces" in found.also:
-            messages[FORCE_INTERVALS] = forces_message(found, self._frame_id)
+            messages[WINDOW_FORCES] = forces_message(found, self._frame_id)
         if "forecast" in found.also:
             messages[FORECAST] = forecast_message(found, self._frame_id)
         return messages
@@ -224,6 +226,9 @@ def problems(settings: Settings, scene: Scene) -> list[Problem]:
         found.append(Problem("estimate", True, "false where excitation_source is scene: no load comes"))
     if scene.support is not None:
         found.append(Problem("estimate", True, "false where the scene has a support: the fit does not know its place"))
+    if settings.follows != "off" and settings.max_evaluations:
+        expected = "0 where follow is not off: the work of the twins that follow has no bound"
+        found.append(Problem("max_evaluations", settings.max_evaluations, expected))
     limits = settings.forecast_limits
     if any(limits) and not all(limits):
         found.append(Problem("forecast_limits", limits, "both limits, or 0 for both"))

@@ -68,6 +68,8 @@ class Inputs:
         #: senders of the optional inputs
         self.optional = {topic: OneSender() for topic in OPTIONAL}
         self._queue_peak = (0, 0.0)
+        #: longest wait of a sample in the queue [s]; whoever looks at it sets it back
+        self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
         #: messages that were sent and could not be read, as far as the transport tells
@@ -101,6 +103,7 @@ class Inputs:
 
     def waited(self, messages: int, longest_s: float) -> None:
         """Take note of how many messages waited in the queue, and how long the first of them [s]."""
+        self.wait_s = max(self.wait_s, longest_s)
         most, before_s = self._queue_peak
         if messages > most or longest_s > before_s:
             self._queue_peak = (max(most, messages), max(before_s, longest_s))

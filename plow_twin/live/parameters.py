@@ -135,7 +135,17 @@ class Settings:
         0,
         4096,
         Effect.CONFIGURE,
-        "number of twins drawn from each estimate for force_intervals, at least 20; 256 is plenty; 0: no intervals",
+        "number of twins drawn from each estimate for window_forces, at least 20; 256 is plenty; 0: no intervals",
+    )
+    follow: str = _choice(
+        "full",
+        ("off", "parameters", "full"),
+        Effect.CONFIGURE,
+        "with `estimate`, what follows the machine: nothing, the numbers of the model by each estimate, or the motion "
+        "too, by each measured pose, with intervals of the forces",
+    )
+    follow_members: int = _number(
+        128, "twins", 20, 4096, Effect.CONFIGURE, "number of twins with follow: full; each costs the same"
     )
     forecast_limits: tuple[float, ...] = _list(
         (0.0, 0.0),
@@ -367,6 +377,11 @@ class Settings:
     failure_limit: int = _number(
         10, "advances", 0, 1000000, Effect.NOW, "failed advances in a row after which the model is reset; 0: never"
     )
+
+    @property
+    def follows(self) -> str:
+        """What follows the machine: `follow`, and `off` without an estimate."""
+        return self.follow if self.estimate else "off"
 
 
 #: Parameters that change the running model, with their keys in the scene file.

@@ -100,7 +100,8 @@ class Publishing:
         if front.sends_motion:
             from plow_twin.record.sending import Messages
 
-            self._messages = Messages(settings.frame_id, settings.child_frame_id)
+            frames = settings.frame_id, settings.child_frame_id
+            self._messages = Messages(*frames, intervals=settings.follows == "full")
         self.latency = DurationHistogram()
         self.age = DurationHistogram()
         #: publications, and those that were not published because a number was not finite

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from plow_twin.errors import ArgumentError
 from plow_twin.live.inputs import Inputs
@@ -33,6 +33,7 @@ from plow_twin.stream.model_changes import changed_scene, changed_twin
 from plow_twin.stream.session import Session
 
 if TYPE_CHECKING:
+    from plow_twin.estimate.follow import Follower
     from plow_twin.live.estimation import Estimation
     from plow_twin.live.recording import Recording
 
@@ -40,6 +41,8 @@ _CATCH_UP_S: Final = 0.002
 _LOOK_FOR_CLOCK_HZ: Final = 20.0
 #: What is not used goes into the journal so often [Hz].
 _UNUSED_HZ: Final = 5.0
+#: The twins that follow do not keep up where samples waited so long [s] in so many seconds in a row.
+_LONGEST_WAIT_S, _WAITING_SECONDS = 0.5, 5
 
 
 class Runtime:
@@ -82,6 +85,9 @@ class Runtime:
         self.clock = "running"
         #: whether somebody else publishes under the names of this twin's outputs
         self.others_publish = False
+        #: whether the parameters alone follow because all twins did not keep up
+        self.reduced = False
+        self._waiting_seconds = 0
         self._clock_before_ns = 0
         self._start_due = True
         self._early: list[Arrival] = []
@@ -169,6 +175,12 @@ class Runtime:
         """Return the wear for the next runtime of this process; after the close."""
         depth = self.driver.session.wear_depth
         return self.wear_keeper.kept(depth) if self.wear_keeper else KeptWear(tuple(depth.tolist()))
+
+    @property
+    def follower(self) -> Follower | None:
+        """The twin, where it follows measurements."""
+        found: Follower | None = cast(Any, self.driver.session.following)
+        return found
 
     @property
     def recorder_state(self) -> str:
@@ -291,6 +303,8 @@ class Runtime:
             periodic.append((1.0 / settings.wear_save_period, self.save_wear))
         if self.recording:
             periodic.append((_UNUSED_HZ, self._journal_unused))
+        if settings.follows == "full" and not self._front.follows_samples:
+            periodic.append((1.0, self._look_for_lag))
         if self.without_clock:
             periodic.append((_LOOK_FOR_CLOCK_HZ, self._look_for_clock))
         if self.estimation:
@@ -442,6 +456,15 @@ class Runtime:
         if messages:
             self._front.changed()
 
+    def _look_for_lag(self) -> None:
+        """Let the parameters alone follow where all twins do not keep up."""
+        waited_s, self.inputs.wait_s = self.inputs.wait_s, 0.0
+        self._waiting_seconds = self._waiting_seconds + 1 if waited_s > _LONGEST_WAIT_S else 0
+        if self._waiting_seconds == _WAITING_SECONDS and not self.reduced and not self._start_due:
+            self.reduced = True
+            self.driver.parameter("follow", "parameters")
+            self._front.changed()
+
     def _look_for_clock(self) -> None:
         if self._start_due and not self.without_clock:
             self._send(self.step([]))
@@ -482,8 +505,8 @@ class Runtime:
     def _renew_recording(self) -> None:
         assert self.recording is not None
         renewed = self.recording.renew(self.driver.session)
-        if renewed and self.estimation and self.estimation.entry:
-            # no part of a snapshot
+        if renewed and self.estimation and self.estimation.entry and self.driver.session.following is None:
+            # no part of a snapshot, but of one of a twin that follows
             self.recording.journal(self.estimation.entry)
 
 

@@ -16,6 +16,7 @@ from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
 from plow_twin.stream import outputs
+from plow_twin.stream.driven import Driven
 
 #: Longest time for which a request to stop is not seen [s].
 _LOOK_S: Final = 0.05
@@ -31,7 +32,7 @@ class Prepared:
     """A scene, its twin with every kernel compiled or loaded, and the seconds that took."""
 
     scene: Scene
-    twin: Twin
+    twin: Driven
     compile_s: float
 
 
@@ -75,20 +76,26 @@ def key(settings: Settings) -> tuple[object, ...]:
     try:
         found = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):
-        return settings.scene, settings.tolerance, settings.excitation_source, settings.max_evaluations
-    bound = settings.max_evaluations
-    return settings.scene, settings.tolerance, settings.excitation_source, bound, found.st_mtime_ns, found.st_size
+        return settings.scene, *_numbers(settings)
+    return settings.scene, *_numbers(settings), found.st_mtime_ns, found.st_size
+
+
+def _numbers(settings: Settings) -> tuple[object, ...]:
+    follow = settings.follows, settings.follow_members
+    return settings.tolerance, settings.excitation_source, settings.max_evaluations, *follow
 
 
 def _prepare(settings: Settings, warm_up: Callable[[], None]) -> Prepared:
     scene = load_scene(scene_path(settings.scene))
     own = settings.excitation_source == "scene"
-    twin = Twin(
-        scene,
-        tol=settings.tolerance,
-        excitation="scene" if own else "sampled",
-        max_evaluations=settings.max_evaluations or None,
-    )
+    twin: Driven
+    if settings.follows != "off" and not own:
+        from plow_twin.estimate.follow import follower
+
+        twin = follower(scene, settings.follows, settings.follow_members, settings.tolerance)
+    else:
+        bound = settings.max_evaluations or None
+        twin = Twin(scene, tol=settings.tolerance, excitation="scene" if own else "sampled", max_evaluations=bound)
     compile_s = twin.warm_up()
     outputs.warm_up()
     warm_up()

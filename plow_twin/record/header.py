@@ -50,6 +50,11 @@ class RunHeader:
     run_id: str = ""
 
     @property
+    def follow(self) -> str:
+        """How the twin followed measurements: `off`, `parameters` or `full`."""
+        return str(self.parameters.get("follow", "off")) if self.parameters.get("estimate") else "off"
+
+    @property
     def samples_topic(self) -> str:
         """Topic of the journal's samples."""
         return f"{self.node}/journal/samples"

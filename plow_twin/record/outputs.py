@@ -14,10 +14,12 @@ from plow_twin.stream.topics import JOINT_STATE, Cadence, Topic, names_of, topic
 
 Array = NDArray[np.float64]
 
-#: The topics whose messages each publication has, or those with a slow part: they follow from the journal alone.
-REPLAYED: Final = topics_of(Cadence.EACH, Cadence.SLOW)
+#: The topics whose messages each publication has, or those with intervals or a slow part: they follow from the journal.
+REPLAYED: Final = topics_of(Cadence.EACH, Cadence.FOLLOWED, Cadence.SLOW)
 #: Their base names.
-PUBLICATION_TOPICS: Final = names_of(Cadence.EACH, Cadence.SLOW)
+PUBLICATION_TOPICS: Final = tuple(topic.name for topic in REPLAYED)
+#: Those of them that only a twin with `follow: full` has.
+FOLLOWED_TOPICS: Final = names_of(Cadence.FOLLOWED)
 
 
 def publication_messages(published: Published, frame_id: str, child_frame_id: str) -> dict[str, Message]:
@@ -36,7 +38,7 @@ def _messages(
     messages: dict[str, Message] = {}
     for topic in topics:
         records = topic.record_of(published)
-        if len(records):
+        if len(records) and (topic.cadence is not Cadence.FOLLOWED or published.with_intervals):
             numbers = np.concatenate(topic.numbers(records), axis=1)[0]
             messages[topic.name] = message(topic, int(records["stamp_ns"][0]), numbers, frame_id, child_frame_id)
     return messages

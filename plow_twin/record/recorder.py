@@ -149,6 +149,8 @@ class Recorder:
         each, slow, marked = (
             tuple(map(header.topic, names_of(cadence))) for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED)
         )
+        if header.follow == "full":
+            each += tuple(map(header.topic, names_of(Cadence.FOLLOWED)))
         #: topics of a publication, by whether it has a slow part and whether it is marked
         self._topics_of = {
             (False, False): each, (True, False): each + slow, (False, True): each + marked,

@@ -29,6 +29,7 @@ from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
 from plow_twin.record.outputs import (
+    FOLLOWED_TOPICS,
     PUBLICATION_TOPICS,
     publication_messages,
     publication_templates,
@@ -40,6 +41,7 @@ from plow_twin.record.template import Indexes, Templates, read_numbers
 from plow_twin.record.unused import InputCounts
 from plow_twin.run.twin import Twin
 from plow_twin.solve.state import ROW
+from plow_twin.stream.driven import Driven
 from plow_twin.stream.journal import (
     Digest,
     Gaps,
@@ -132,7 +134,13 @@ class _Replay:
         scene = header.scene(report.path)
         excitation: Any = "scene" if header.excitation_source == "scene" else "sampled"
         bound = header.parameters.get("max_evaluations") or None
-        twin = Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=None if bound is None else int(bound))
+        bound = None if bound is None else int(bound)
+        twin: Driven = Twin(scene, tol=header.tol, excitation=excitation, max_evaluations=bound)
+        self.follows = header.follow != "off"
+        if self.follows:
+            from plow_twin.estimate.follow import MEMBERS, follower
+
+            twin = follower(scene, header.follow, int(header.parameters.get("follow_members", MEMBERS)), header.tol)
         twin.warm_up()
         templates = publication_templates(header.frame_id, header.child_frame_id)
         self.templates = Templates.of(templates[name] for name in PUBLICATION_TOPICS)
@@ -144,7 +152,8 @@ class _Replay:
         self.session = Session(
             twin, header.origin_ns, rollback_span_s=float(header.parameters.get("rollback_span", 0.0))
         )
-        self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS}
+        absent = FOLLOWED_TOPICS if header.follow != "full" else ()
+        self.topics = {header.topic(name): name for name in PUBLICATION_TOPICS if name not in absent}
         self.next_sequence = 0
         self.in_a_row = 0  # entries before that without a gap
         self.synced = False  # the session is where the live one was
@@ -172,9 +181,10 @@ class _Replay:
         digests = entries.digest_at
         behind = digests > 0
         behind[behind] = ~entries.sample[digests[behind] - 1]
+        kinds = Gaps | Unused if self.follows else Pose | PartOfPose | Gaps | Unused
         for index in sorted({*entries.rest, *digests[behind | breaks[digests]].tolist()}):
             goes_on = not breaks[index] and (index == 0 or entries.sample[index - 1] or not breaks[index - 1])
-            still = index not in entries.rest or isinstance(entries.rest[index], Pose | PartOfPose | Gaps | Unused)
+            still = index not in entries.rest or isinstance(entries.rest[index], kinds)
             if not (goes_on and still):
                 breaks[index : index + 2] = True
         samples = np.flatnonzero(entries.sample)
@@ -327,7 +337,8 @@ class _Replay:
         self.alarms.published(found.first_sequence & _SEQUENCE_MASK, first_step + found.taken, published, poses)
         compared = self.outputs_synced | ~_IS_CUMULATIVE
         for name, count, known in zip(PUBLICATION_TOPICS, found.counts.tolist(), compared.tolist(), strict=True):
-            (self.report.compared if known else self.report.not_compared)[name] += count
+            if count or name not in FOLLOWED_TOPICS:
+                (self.report.compared if known else self.report.not_compared)[name] += count
         found.expect(published, self.templates, compared)
         differences, begin = [], span[0]
         for messages, from_, to in sent.pieces(*span):

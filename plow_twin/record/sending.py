@@ -25,15 +25,18 @@ class Messages:
     ----------
     frame_id, child_frame_id
         Frames named in the messages.
+    intervals
+        Whether there are messages with the intervals of forces.
     """
 
-    def __init__(self, frame_id: str, child_frame_id: str) -> None:
-        self._each, self._slow, self._marked = (
+    def __init__(self, frame_id: str, child_frame_id: str, *, intervals: bool = False) -> None:
+        self._each, self._slow, self._marked, followed = groups = [
             _Group.of(topics_of(cadence), frame_id, child_frame_id)
-            for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED)
-        )
+            for cadence in (Cadence.EACH, Cadence.SLOW, Cadence.MARKED, Cadence.FOLLOWED)
+        ]
+        self._followed = followed if intervals else None
         #: memory of each message by base name of its topic
-        self.memory = dict((*self._each.parts, *self._slow.parts, *self._marked.parts))
+        self.memory = dict(part for group in groups[: 3 + intervals] for part in group.parts)
 
     def write(self, published: Published) -> tuple[tuple[str, memoryview], ...]:
         """Return topic and bytes of the messages of a publication of one row, in the order in which they are sent.
@@ -44,6 +47,10 @@ class Messages:
         if not self._each.fill(rows) or (len(slow) and not self._slow.fill(slow)):
             return ()
         found = self._each.parts
+        if self._followed is not None and published.with_intervals:
+            if not self._followed.fill(rows):
+                return ()
+            found += self._followed.parts
         if len(slow):
             found += self._slow.parts
         if rows["marked"][0]:

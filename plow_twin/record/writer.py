@@ -24,6 +24,7 @@ from plow_twin.record.metadata_yaml import PartFacts, TopicCount, bag_metadata, 
 from plow_twin.record.outputs import REPLAYED, publication_templates
 from plow_twin.record.reader import sample_template
 from plow_twin.record.template import Indexes
+from plow_twin.solve.state import WITH_INTERVALS
 from plow_twin.stream.journal import Digest, Entry, Sample
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS, Cadence, topics_of
@@ -143,7 +144,12 @@ class RunWriter:
         """Write the messages of many publications, each sent after journal entry number `sequence`."""
         log_time_ns = np.maximum(log_time_ns, 0)
         everywhere = np.arange(len(published.rows))
-        rows = {topic: published.slow["row"] if topic.cadence is Cadence.SLOW else everywhere for topic in REPLAYED}
+        rows = dict.fromkeys(REPLAYED, everywhere)
+        for topic in REPLAYED:
+            if topic.cadence is Cadence.SLOW:
+                rows[topic] = published.slow["row"]
+            elif topic.cadence is Cadence.FOLLOWED:
+                rows[topic] = np.flatnonzero(published.rows["followed"] == WITH_INTERVALS)
         sizes = np.zeros(len(everywhere), np.int64)
         places = {}
         for topic, row in rows.items():
@@ -155,6 +161,8 @@ class RunWriter:
             if not len(row):
                 continue
             records = topic.record_of(published)
+            if topic.cadence is Cadence.FOLLOWED:
+                records = records[row]
             template = self._templates[topic.name]
             channel = self._channel(self.header.topic(topic.name), template.message_type)
             starts = begin + (ends - sizes)[row] + places[topic]
@@ -170,7 +178,8 @@ class RunWriter:
         """Write publications that were sent: entry before them, log time, stamp [ns], bytes by base name."""
         channels = self._part.sent
         if not channels:
-            for topic in topics_of(Cadence.EACH, Cadence.SLOW, Cadence.MARKED):
+            followed = (Cadence.FOLLOWED,) if self.header.follow == "full" else ()
+            for topic in topics_of(Cadence.EACH, Cadence.SLOW, Cadence.MARKED, *followed):
                 channels[topic.name] = self._channel(self.header.topic(topic.name), topic.type)
         each = np.fromiter(map(len, sent), np.int64, len(sent))
         data = [message for messages in sent for message in messages.values()]

@@ -15,6 +15,7 @@ from plow_twin.live.services import Services
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.wear_keeper import KeptWear
 from plow_twin.record.messages import Message
+from plow_twin.record.outputs import FOLLOWED_TOPICS
 from plow_twin.record.times import time_text
 from plow_twin.ros.input_loop import InputLoop, Turns
 from plow_twin.ros.publishers import OutputPublishers
@@ -72,6 +73,8 @@ class RosFront:
         wanted = (settings.estimate, settings.estimate_forces, any(settings.forecast_limits))
         without = [topic for topic, one in zip(ESTIMATES, wanted, strict=True) if not (settings.estimate and one)]
         # the node publishes its status whether it is configured or not
+        if settings.follows != "full":
+            without += FOLLOWED_TOPICS
         self._publishers = OutputPublishers(node, ["status", *without], runtime.publishing.memory)
         made.callback(self._publishers.close)
         self._loop = loop = InputLoop(self.turns, self._inputs_failed)

@@ -102,6 +102,22 @@ class TwinBatch:
         """Model time in s."""
         return float(self._states["time"][0])
 
+    @property
+    def signature(self) -> tuple[bool, ...]:
+        """Which terms the equations have, as of `Twin`: batches of one signature share their compiled code."""
+        parts = self._workers[0].parts
+        return tuple(part is not None for part in (*parts.terms, parts.implicit))
+
+    def set_wrench(self, wrench: ArrayLike) -> None:
+        """Let the load begin at other samples: it goes from there to the next ones on straight lines.
+
+        Parameters
+        ----------
+        wrench : array_like, shape (m, 3)
+            Fx, Fy [N] and M [N m] about the cavity's centre, of each twin.
+        """
+        self._wrench = np.array(wrench, dtype=np.float64).reshape(len(self), 3)
+
     def advance(self, t: float, wrench: ArrayLike | None = None) -> AdvanceBatch:
         """Advance all twins to model time `t`; see `advance_samples`. Without `wrench` the last samples are held.
 

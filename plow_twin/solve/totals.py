@@ -95,6 +95,15 @@ def _copy_motion(row_of, target) -> None:
     for pair in range(PAIR_COUNT):
         target.penetration[pair], target.rate[pair] = row_of.penetration[pair], row_of.rate[pair]
         target.force[pair], target.wear_depth[pair] = row_of.force[pair], row_of.wear_depth[pair]
+    target.followed = row_of.followed
+    if row_of.followed == 0:
+        return
+    for pair in range(PAIR_COUNT):
+        target.force_low[pair], target.force_high[pair] = row_of.force_low[pair], row_of.force_high[pair]
+        target.peak_low[pair], target.peak_high[pair] = row_of.peak_low[pair], row_of.peak_high[pair]
+        target.impulse_low[pair], target.impulse_high[pair] = row_of.impulse_low[pair], row_of.impulse_high[pair]
+    for j in range(6):
+        target.known_clearance[j] = row_of.known_clearance[j]
 
 
 @kernel(entry=True)

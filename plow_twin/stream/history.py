@@ -55,6 +55,11 @@ class History:
         return self._kept_ns[0] if self._kept_ns else None
 
     @property
+    def earliest_ns(self) -> int | None:
+        """Stamp of the earliest state that is kept [ns]: going back ends there or later."""
+        return self._snapshots[0][0] if self._snapshots else None
+
+    @property
     def newest_sample_ns(self) -> int | None:
         """Stamp of the newest sample [ns]."""
         if self._later:

@@ -10,7 +10,7 @@ from typing import Final
 
 from plow_twin.errors import ArgumentError
 from plow_twin.model.scene import Scene
-from plow_twin.run.twin import Twin
+from plow_twin.stream.driven import Driven
 
 #: Keys of the scene file, each with the smallest value that is taken.
 CHANGEABLE: Final[Mapping[str, float]] = {
@@ -47,7 +47,7 @@ def changed_scene(scene: Scene, changes: Mapping[str, float]) -> Scene:
     return scene
 
 
-def changed_twin(twin: Twin, scene: Scene, changes: Mapping[str, float]) -> Twin:
+def changed_twin(twin: Driven, scene: Scene, changes: Mapping[str, float]) -> Driven:
     """Return a twin of `scene` with other numbers, like `twin` else, at its scene's initial state.
 
     Raises

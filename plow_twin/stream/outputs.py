@@ -16,7 +16,7 @@ from plow_twin.kernel.compiler import for_arguments
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.running_in import with_running_in, without_running_in
 from plow_twin.model.scene import Scene
-from plow_twin.solve.state import ROW
+from plow_twin.solve.state import ROW, WITH_INTERVALS
 from plow_twin.solve.totals import publish, publish_window, summary
 
 Array = NDArray[np.float64]
@@ -49,8 +49,14 @@ THE_ONE: Final = np.zeros(1, np.int64)
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
 _NO_SLOW: Final = np.zeros(0, SLOW)
+#: Fields of a row whose motion follows measurements.
+FOLLOWED_FIELDS: Final = (
+    "followed", "known_clearance", "force_low", "force_high", "peak_low", "peak_high", "impulse_low", "impulse_high",
+)  # fmt: skip
 #: Fields of the motion at a row's time.
-_MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth")
+_MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
+#: Where `known_clearance` stands in `clearance`.
+_KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
 #: Rows made at once: numpy takes as long for one as for some.
 _STOCK: Final = 256
 
@@ -70,6 +76,11 @@ class Published(NamedTuple):
         return not len(self.slow) or all(
             bool(np.isfinite(self.slow[name]).all()) for name in ("clearance", "wear_rate")
         )
+
+    @property
+    def with_intervals(self) -> bool:
+        """Whether the first row has intervals of its forces."""
+        return len(self.rows) > 0 and int(self.rows["followed"][0]) == WITH_INTERVALS
 
     def at(self, index: int) -> Published:
         """Return what is published with one row."""
@@ -174,9 +185,7 @@ class Outputs:
         estimate stays when late samples are worked in.
         """
         values = np.zeros(len(CLEARANCE_NAMES))
-        for axis in range(2):
-            points = len(_CLEARANCES) + 2 * axis
-            values[[axis, points, points + 1]] = shift[3 * axis : 3 * axis + 3]
+        values[_KNOWN] = shift
         self._shift = values if values.any() else None
 
     def set_scene(self, scene: Scene) -> None:
@@ -246,6 +255,11 @@ class Outputs:
             self._waits = 1
 
     @property
+    def waits(self) -> bool:
+        """Whether some advance has not been published."""
+        return bool(self._waits)
+
+    @property
     def makes(self) -> NDArray[np.int64]:
         """Touches of each pair so far, shape (8,)."""
         makes: NDArray[np.int64] = self._window["makes"][0].copy()
@@ -296,6 +310,9 @@ class Outputs:
         slow = np.zeros(len(index), SLOW)
         slow["stamp_ns"], slow["row"] = stamps, index
         slow["clearance"], slow["wear_rate"] = self._clearance(wear_depth), grown / elapsed_s[:, None]
+        known = np.flatnonzero(rows["followed"][index])
+        if known.size:
+            slow["clearance"][known[:, None], _KNOWN] = rows["known_clearance"][index[known]]
         return slow
 
     def _clearance(self, wear_depth: Array) -> Array:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import struct
 from bisect import insort
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
+from plow_twin.stream.driven import Driven, Following
 from plow_twin.stream.history import History
 from plow_twin.stream.journal import (
     Digest,
@@ -38,12 +40,10 @@ from plow_twin.stream.journal import (
     Travel,
     Unload,
     Unused,
+    whole_pose,
 )
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
-
-if TYPE_CHECKING:
-    from plow_twin.run.twin import Twin
 
 #: A digest follows each so many advances.
 DIGEST_INTERVAL: Final = 100
@@ -57,6 +57,15 @@ _NO_ROWS: Final = NOTHING.rows
 
 def _ignore(entry: Entry) -> None:
     """Drop an entry."""
+
+
+class _Measured(NamedTuple):
+    """A pose or an estimate that the twin has taken in: its number, the time reached then and its stamp [ns]."""
+
+    number: int
+    reached_ns: int
+    stamp_ns: int
+    entry: Pose | PartOfPose | Estimated
 
 
 class Applied(NamedTuple):
@@ -88,7 +97,7 @@ class Session:
     Parameters
     ----------
     twin
-        The twin to drive; nobody else may advance it.
+        The twin to drive; nobody else may advance it. One that follows gets the measured poses and the estimates.
     origin_ns
         Stamp of model time 0, or None: the first stamp.
     on_entry
@@ -103,14 +112,16 @@ class Session:
 
     def __init__(
         self,
-        twin: Twin,
+        twin: Driven,
         origin_ns: int | None = None,
         on_entry: Callable[[Entry], object] = _ignore,
         *,
         rollback_span_s: float = 0.0,
         wear_depth: Sequence[float] | None = None,
     ) -> None:
-        self.twin = twin
+        self._use(twin)
+        #: what it has taken in since the earliest state that is kept
+        self._measured: deque[_Measured] = deque()
         self._scene = twin.scene
         #: numbers of the scene that have been changed, by their keys
         self.changes: dict[str, float] = {}
@@ -138,6 +149,12 @@ class Session:
         self._travels: list[Travel] = []
         self._on_entry = on_entry
         self._advances = 0
+
+    def _use(self, twin: Driven) -> None:
+        """Drive a twin from here on."""
+        self.twin: Driven = twin
+        #: the twin, where it follows measurements
+        self.following = twin if isinstance(twin, Following) else None
 
     def start(self) -> None:
         """Emit the snapshot that opens a journal."""
@@ -180,13 +197,22 @@ class Session:
             case Estimated(shift=shift):
                 self._on_entry(entry)
                 self.outputs.set_shift(shift)
+                if self.stamp_ns is not None:
+                    self._follow(self.stamp_ns, entry)
             case SetModel(_, changes):
                 self._on_entry(entry)
                 self._change_model(read_changes(changes))
             case Restore(_, data):
                 self._on_entry(entry)
                 self._restore_motion(data)
-            case Parameter() | Pose() | PartOfPose() | Gaps() | Mark() | Failed() | Spread() | Unused():
+            case Pose(stamp_ns) | PartOfPose(stamp_ns):
+                self._on_entry(entry)
+                self._follow(stamp_ns, entry)
+            case Parameter("follow", "parameters") if self.following is not None:
+                self._on_entry(entry)
+                self.following.follow_parameters()
+                self._forget()
+            case Parameter() | Gaps() | Mark() | Failed() | Spread() | Unused():
                 # acts through the entries that follow it, or on nothing here
                 self._on_entry(entry)
             case Snapshot(_, data):
@@ -399,6 +425,8 @@ class Session:
         if self.history.is_due and not resumed:
             before_ns = int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns
             self.history.add_snapshot(before_ns, self.snapshot().data, kept=False)
+        if self.following is not None:
+            self.following.end_spans(taken, begins=not self.outputs.waits)
         times = np.empty(len(stamps))
         model_times(stamps, origin_ns, times)
         failed, digests = self.twin.advance_rows(times, wrench, rows, marks)
@@ -411,6 +439,20 @@ class Session:
         if self.twin.max_evaluations is not None:
             self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"].max()))
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
+
+    def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated) -> None:
+        """Let the twin that follows, if it is one, take in what was measured; before the first sample nothing moves."""
+        if self.following is None or self.origin_ns is None:
+            return
+        time = (stamp_ns - self.origin_ns) * 1e-9
+        if isinstance(entry, Estimated):
+            self.following.take_estimate(entry.result, time)
+        else:
+            self.following.take_pose(time, entry.pose if isinstance(entry, Pose) else whole_pose(entry))
+        measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0
+        measured.append(_Measured(self.following.taken, reached_ns, stamp_ns, entry))
+        while measured and (earliest_ns is None or measured[0].reached_ns < earliest_ns):
+            measured.popleft()
 
     def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
         """Advance to the stamp of a speed that comes before the next sample, and take it over."""
@@ -458,6 +500,14 @@ class Session:
         advances, pending, slow = self._advances, self._travels, self.outputs.slow_before
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
+        if self.following is not None:
+            # in the order of their stamps, as if nothing had been late
+            measured, self._measured = self._measured, deque()
+            for one in measured:
+                if one.number > self.following.taken:
+                    self._follow(one.stamp_ns, one.entry)
+                else:
+                    self._measured.append(one)
         # one that was to come at the snapshot may have been applied, or be to come still
         known = {travel.stamp_ns: travel for travel in (*self._travels, *travels, *pending, *more)}
         self._travels = sorted(known.values(), key=lambda travel: travel.stamp_ns)
@@ -486,6 +536,8 @@ class Session:
         """Advance to a stamp, shape (1,), that is no sample's."""
         assert self.origin_ns is not None
         rows = self._stock.take(1)
+        if self.following is not None:
+            self.following.end_spans(NONE, begins=not self.outputs.waits)
         self.twin.advance_rows(np.multiply(stamps - self.origin_ns, 1e-9), wrench, rows)
         self.stamp_ns, self._row = int(stamps[0]), rows
         if self.twin.max_evaluations is not None:
@@ -545,9 +597,14 @@ class Session:
 
     def _forget(self) -> None:
         """Forget all before the present state."""
-        self.history.clear()
+        self._forget_past()
         if not self.held:
             self._remember()
+
+    def _forget_past(self) -> None:
+        """Let nobody go back to what was."""
+        self.history.clear()
+        self._measured.clear()
 
     def _restart(self, wear_depth: NDArray[np.float64]) -> None:
         """Put the motion back to its initial state."""
@@ -557,7 +614,7 @@ class Session:
         self.wear_depth = wear_depth.copy()
         self.twin.reset(0.0, wear_depth=wear_depth)
         self.outputs.restart()
-        self.history.clear()
+        self._forget_past()
         self._travels = []
         self.origin_ns = self.stamp_ns = None
 
@@ -568,7 +625,7 @@ class Session:
     def _change_model(self, changes: dict[str, float]) -> None:
         """Go on with other numbers of the scene; the contacts begin anew, what is remembered is forgotten."""
         before, speed = self.twin, 0.0 if self.held else self._speed
-        self.twin = self._changed_twin(changes)
+        self._use(self._changed_twin(changes))
         self._carry(before)
         self.changes = changes
         if self._wears:
@@ -577,14 +634,14 @@ class Session:
         self.outputs.clear_shift()
         self._forget()
 
-    def _changed_twin(self, changes: Mapping[str, float]) -> Twin:
+    def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
         """Return a twin of other numbers that can go on at the speeds that are set and to come."""
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
         return found
 
-    def _carry(self, before: Twin) -> None:
+    def _carry(self, before: Driven) -> None:
         """Begin with pose, rates, load and time of another twin; the wear is the present one."""
         now = before.advance(before.time)
         self.twin.reset(before.time, wear_depth=self.wear_depth, pose=(now.q, now.v))
@@ -609,13 +666,13 @@ class Session:
         if self._wears:
             self.twin.set_travel_speed(self._speed)
         self.outputs.restart()
-        self.history.clear()
+        self._forget_past()
         self._travels = []
         self.origin_ns = self.stamp_ns = None
 
     def _split_twin(self, data: bytes) -> tuple[bytes, dict[str, float]]:
         """Return the snapshot of the twin, and the changes of the model behind it."""
-        size = len(self.twin.snapshot())
+        size = len(self.twin.snapshot()) if self.following is None else self.following.snapshot_size(data)
         return data[:size], read_changes(data[size:].decode()) if len(data) > size else {}
 
     def _restore(self, data: bytes) -> None:
@@ -624,7 +681,8 @@ class Session:
         split = end + _WEAR_SIZE + self.outputs.state_size()
         twin_data, changes = self._split_twin(data[split:])
         if changes != self.changes:
-            self.twin, self.changes = changed_twin(self.twin, self._scene, changes), changes
+            self._use(changed_twin(self.twin, self._scene, changes))
+            self.changes = changes
             self.outputs.set_scene(self.twin.scene)
         self.twin.restore(twin_data)
         self.outputs.set_state(data[end + _WEAR_SIZE : split])

@@ -26,6 +26,8 @@ class Cadence(Enum):
 
     #: with each publication
     EACH = "each publication"
+    #: with each publication, where `follow` is `full`
+    FOLLOWED = "each publication, with `follow: full`"
     #: with the first publication in each 0.1 s of stamps
     SLOW = "each 0.1 s of stamps"
     #: with each publication that is marked, and with the first one after it
@@ -96,6 +98,8 @@ class Topic:
         return [np.asarray(one[:, :count] if one.ndim > 1 else one[:, None], np.float64) for one, count in columns]
 
 
+_INTERVALS: Final = (*PAIR_NAMES, *(f"{name}/{point}" for point in ("p05", "p95") for name in PAIR_NAMES))
+
 TOPICS: Final = (
     Topic(
         "contact_forces", JOINT_STATE, Cadence.EACH,
@@ -109,6 +113,23 @@ TOPICS: Final = (
         "message; after late samples since the time that the model went back to",
         names=PAIR_NAMES,
         columns={"position": (("makes", 8),), "velocity": (("impulse", 8),), "effort": (("peak", 8),)},
+        cumulative=True,
+    ),
+    Topic(
+        "force_intervals", JOINT_STATE, Cadence.FOLLOWED,
+        "effort = force [N] of `contact_forces` under `<pair>`, its 5 % and 95 % points under `<pair>/p05`, "
+        "`<pair>/p95`, with the same stamp",
+        names=_INTERVALS, columns={"effort": (("force", 8), ("force_low", 8), ("force_high", 8))},
+    ),
+    Topic(
+        "peak_intervals", JOINT_STATE, Cadence.FOLLOWED,
+        "velocity = impulse [N s] and effort = largest force [N] of `contact_peaks`, and their points, under the same "
+        "names, with the same stamp and over the same span",
+        names=_INTERVALS,
+        columns={
+            "velocity": (("impulse", 8), ("impulse_low", 8), ("impulse_high", 8)),
+            "effort": (("peak", 8), ("peak_low", 8), ("peak_high", 8)),
+        },
         cumulative=True,
     ),
     Topic(
@@ -143,7 +164,7 @@ TOPICS: Final = (
         latched=True, depth=1,
     ),
     Topic(
-        "force_intervals", JOINT_STATE, Cadence.ESTIMATE,
+        "window_forces", JOINT_STATE, Cadence.ESTIMATE,
         "only with `estimate` and `estimate_forces`: `<pair>`, `<pair>/p05`, `<pair>/p95` (median, 5 % and 95 % points "
         "over twins drawn from the estimate), velocity = impulse [N s] and effort = largest force [N] in the last "
         "`estimate_interval` before the stamp, which is the end of the window; without names where there are none",

@@ -1,0 +1,71 @@
+"""What a session drives: a twin, and one that follows measurements too."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol, Self, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from plow_twin.model.scene import Scene
+from plow_twin.run.advance import Advance
+from plow_twin.run.twin import Advanced
+
+Array = NDArray[np.float64]
+
+
+class Driven(Protocol):
+    """A twin, as far as a session needs it: `plow_twin.run.twin.Twin` says what each part does."""
+
+    @property
+    def scene(self) -> Scene: ...  # noqa: D102
+    @property
+    def excitation(self) -> str: ...  # noqa: D102
+    @property
+    def max_evaluations(self) -> int | None: ...  # noqa: D102
+    @property
+    def time(self) -> float: ...  # noqa: D102
+    @property
+    def wrench(self) -> Array: ...  # noqa: D102
+    @property
+    def wear_depth(self) -> Array: ...  # noqa: D102
+    @property
+    def bounded(self) -> int: ...  # noqa: D102
+    @property
+    def signature(self) -> tuple[bool, ...]: ...  # noqa: D102
+
+    def like(self, scene: Scene) -> Self: ...  # noqa: D102
+    def failure(self, status: int) -> str: ...  # noqa: D102
+    def warm_up(self) -> float: ...  # noqa: D102
+    def advance(self, t: float, wrench: ArrayLike | None = None) -> Advance: ...  # noqa: D102
+    def advance_rows(  # noqa: D102
+        self, t: Array, wrench: Array, rows: NDArray[np.void] | None, marks: NDArray[np.int64] = ...
+    ) -> Advanced: ...
+    def reset(self, t: float, *, wear_depth: ArrayLike | None = None, pose: Any = None) -> None: ...  # noqa: D102
+    def set_travel_speed(self, speed_m_s: float) -> None: ...  # noqa: D102
+    def snapshot(self) -> bytes: ...  # noqa: D102
+    def restore(self, data: bytes) -> None: ...  # noqa: D102
+    def digest(self) -> str: ...  # noqa: D102
+
+
+@runtime_checkable
+class Following(Driven, Protocol):
+    """A twin that follows measurements; its rows tell more (`followed` in `plow_twin.solve.state.ROW`)."""
+
+    #: poses and estimates that it has taken in
+    taken: int
+
+    def take_pose(self, t: float, q: ArrayLike) -> None:
+        """Take in a pose measured at model time `t` in s, shape (3,), NaN where it was not measured."""
+
+    def take_estimate(self, text: str, t: float) -> None:
+        """Take in an estimate, JSON, that is known from model time `t` in s on."""
+
+    def follow_parameters(self) -> None:
+        """Go on with one twin that no pose moves, from where the median twin stands."""
+
+    def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
+        """Say which rows of the next `advance_rows` are published, and whether their span begins with the first."""
+
+    def snapshot_size(self, data: bytes) -> int:
+        """Return the length of the snapshot at the beginning of some bytes."""
