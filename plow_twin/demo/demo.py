@@ -21,9 +21,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from plow_twin.demo.comparison import COMPARED_S, Comparison, compare_forces
 from plow_twin.demo.run_summary import SENSES, RunSummary, corner_letters, summarise
 from plow_twin.errors import PlowTwinError
-from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, corner_of
+from plow_twin.model.pairs import CORNER_NAMES, PAIR_COUNT, PAIR_NAMES, corner_of
 from plow_twin.model.scene import Mark, Provenance, Wear
 from plow_twin.scene_file import dump_scene, load_scene
 
@@ -93,6 +94,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
     try:
         watch, sent = _run(speed, seconds, folder, console, quiet)
         summary = summarise(folder / "run")
+        beside = compare_forces(folder / "run", 1e-3 * _SENSOR_MM) if summary.estimate is not None else None
         view = _view(folder)
     except PlowTwinError as error:
         console.print(f"demo failed: {error}", style="red", markup=False, highlight=False)
@@ -100,6 +102,8 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
     lost = _losses(watch, sent, summary)
     if not quiet:
         _print(Console(), watch, summary, sent, lost, fast=speed == "fast")
+        if beside is not None:
+            _print_comparison(Console(), beside)
         _print_places(Console(), folder / "run", view)
     return DONE_WITH_LOSS if any(lost.values()) else DONE
 
@@ -339,6 +343,20 @@ def _print_clearances(console: Console, summary: RunSummary) -> None:
         else:
             text = f"{found['state']} from the synthetic sensor"
         console.print(f"{name} clearance {text}", highlight=False, soft_wrap=True)
+
+
+def _print_comparison(console: Console, beside: Comparison) -> None:
+    """Print the forces of the synthetic machine beside the published ones and those of the nominal scene."""
+    table = Table(title=f"Largest forces of the last {COMPARED_S:g} s in kN")
+    table.add_column("pair", no_wrap=True)
+    names = ("nominal", "followed", "true")
+    for name in names:
+        table.add_column(name, justify="right")
+    for pair, title in enumerate(PAIR_NAMES):
+        table.add_row(title, *(f"{beside.peaks[name][pair] / 1e3:.1f}" for name in names))
+    console.print(table)
+    shares = ", ".join(f"{name} {share:.1%}" for name, share in beside.error.items())
+    console.print(f"error of the forces against the synthetic machine: {shares} of their RMS", highlight=False)
 
 
 def _force_table(summary: RunSummary) -> Table:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -85,6 +85,8 @@ class Drawing:
         self._axis = axis = TimeAxis()
         self.force = Curves(stream, axis, layout.FORCE, span_ns)
         self.force_at_stamp = Curves(stream, axis, layout.FORCE_AT_STAMP, span_ns)
+        self.force_bounds = Curves(stream, axis, layout.FORCE_BOUNDS, span_ns)
+        self.pose, self.measured = (Curves(stream, axis, name, span_ns) for name in (layout.POSE, layout.MEASURED))
         self.penetration = Curves(stream, axis, layout.PENETRATION, span_ns)
         self.load = Curves(stream, axis, layout.LOAD, span_ns)
         self.age = Curves(stream, axis, layout.AGE, span_ns)
@@ -220,6 +222,7 @@ class Drawing:
         if head is not None:
             poses = [(index, entry) for index, entry in sorted(entries.others.items()) if isinstance(entry, Pose)]
             self.residual.add(*self._residuals.compare(poses, steps, head))
+            self._poses(poses, steps, head, np.maximum(steps_before[places(head)], 0))
         self._statuses(batch)
 
     def _entries(self, entries: Entries, stamps: Indexes, steps: Indexes, advance: NDArray[np.bool_]) -> None:
@@ -275,6 +278,8 @@ class Drawing:
                 self.penetration.add(stamps, steps, numbers[:, :PAIR_COUNT] * 1e3)
                 self.force_at_stamp.add(stamps, steps, numbers[:, 2 * PAIR_COUNT :] / 1e3)
                 self.contact_sets.add(stamps, steps, numbers[:, 2 * PAIR_COUNT :])
+            case "force_intervals":
+                self.force_bounds.add(stamps, steps, numbers[:, PAIR_COUNT:] / 1e3)
             case "contact_peaks":
                 peak = numbers[:, 2 * PAIR_COUNT :]
                 self.force.add(stamps, steps, peak / 1e3)
@@ -287,6 +292,17 @@ class Drawing:
                 self.wear.add(stamps, steps, 1e3 * numbers[:, _PADS])
                 self._bands(stamps, steps, numbers)
                 self._pads(stamps, steps, numbers)
+
+    def _poses(self, measured: Sequence[tuple[int, Pose]], steps: Indexes, head: Rows, at: Indexes) -> None:
+        """Draw measured poses beside those of the model, where there are any."""
+        if not (measured or self.measured.rows):
+            return
+        theta = 2.0 * np.arctan2(head.numbers[:, 2], head.numbers[:, 3])
+        self.pose.add(head.stamp_ns, at, 1e3 * np.column_stack((head.numbers[:, :2], theta)))
+        rising = sorted((entry.stamp_ns, max(int(steps[place]), 0), entry.pose) for place, entry in measured)
+        if rising:
+            stamps, places, poses = zip(*rising, strict=True)
+            self.measured.add(np.array(stamps), np.array(places), 1e3 * np.array(poses))
 
     def _growth_m(self, numbers: Array) -> Array:
         """Return the growth of the clearances by wear alone [m] with its interval, in the order of `layout.GROWTH`.

@@ -22,6 +22,10 @@ from plow_twin.view.section import ARROW_MM_PER_N, LOAD_COLOR, PAD_MM_PER_MM, PA
 
 FORCE: Final = tuple(f"force/{name}" for name in PAIR_NAMES)
 FORCE_AT_STAMP: Final = tuple(f"force_at_stamp/{name}" for name in PAIR_NAMES)
+#: Bounds of the forces at the stamps, of a twin that follows its machine.
+FORCE_BOUNDS: Final = tuple(f"force_interval/{name}/{point}" for point in ("p05", "p95") for name in PAIR_NAMES)
+POSE: Final = ("pose/x", "pose/y", "pose/theta")
+MEASURED: Final = ("pose/measured/x", "pose/measured/y", "pose/measured/theta")
 PENETRATION: Final = tuple(f"penetration/{name}" for name in PAIR_NAMES)
 LOAD: Final = ("load/fx", "load/fy", "load/moment")
 AGE: Final = ("quality/sample_age_ms",)
@@ -39,6 +43,7 @@ _WITHOUT_BOUNDS: Final = (
     "$origin/**",
     *(f"- $origin/{name}" for name in CLEARANCE_NAMES if name.endswith(("/p05", "/p95"))),
 )
+_FOLLOWED: Final = ("$origin/**", "/force_at_stamp/**")
 _LOAD_NAMES: Final = (("Fx", "Fy", "M"), ("kN", "kN", "kN m"))
 _LOAD_COLORS: Final = (LOAD_COLOR, (86, 180, 233), (200, 200, 200))
 _QUALITY: Final = ((240, 160, 60), (86, 180, 233))
@@ -57,10 +62,10 @@ _BAND_WIDTH: Final = 6.0
 _CLEARANCE_COLORS: Final = {"horizontal": (86, 180, 233), "vertical": (240, 160, 60)}
 
 
-def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb.Blueprint:
+def blueprint(section: Section, exaggerate: float, what_if: bool = False, followed: bool = False) -> rrb.Blueprint:
     """Return the arrangement: the cross-sections beside the curves, the events and data quality below.
 
-    With `what_if` the view of other scenes is in front.
+    With `what_if` the view of other scenes is in front; with `followed` there are intervals of the forces.
     """
     half_x, half_y = (float(half) for half in section.half_view)
     picture = rrb.Spatial2DView(
@@ -98,7 +103,9 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False) -> rrb
             *([_plot("what_if", "What if: largest force [kN]")] if what_if else []),
             _plot("growth", "Growth by wear [µm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             _plot("clearance", "Clearance [mm]", contents=_WITHOUT_BOUNDS),
+            _plot("pose", "Pose, measured and of the twin"),
             _plot("residual", "Residual"),
+            *([_plot("force_interval", "Force and its 5..95 % interval [kN]", contents=_FOLLOWED)] if followed else []),
             _plot("penetration", "Penetration [mm]"),
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
@@ -132,6 +139,14 @@ def style_curves(stream: rr.RecordingStream) -> None:
     style_load(stream, (0.0, 0.0, 0.0))
     for entity, name, color in zip((*AGE, *INTERVAL), ("age of a sample", "time between two"), _QUALITY, strict=True):
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
+    for entity in FORCE_BOUNDS:
+        _, pair, point = entity.split("/")
+        shade = tuple(round(0.6 * part) for part in PAIR_COLORS[PAIR_NAMES.index(pair)])
+        _style(stream, entity, f"{pair} {point}", shade, AggregationPolicy.MinMax, 1.0)
+    for entity, measured, name, color in zip(POSE, MEASURED, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
+        _style(stream, entity, name, color, AggregationPolicy.MinMax)
+        shade = tuple(round(0.6 * part) for part in color)
+        _style(stream, measured, f"{name}, measured", shade, AggregationPolicy.MinMax, 1.0)
     for entity, name, color in zip(RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
@@ -202,6 +217,7 @@ Where a corner of the frame meets a wall of the cavity, an arrow shows the force
 - growth of the clearance: over the clearance without wear, in micrometres, with the band of its 5..95 % interval
 - head's outline and corners that carry force: blue stops a counter-clockwise swing, orange a clockwise one, violet both
 - force along the face: the largest in each piece, the newest pass bright; residual: measured pose less the model's
+- a twin that follows its machine (`follow: full`): its forces at the stamps with their 5..95 % interval
 - timelines: `{ROS_TIME}` is the stamp, `{RUN_TIME}` the time since the first one, `{STEP}` counts the advances
 - beside it the same with the clearance drawn several times as wide; walls that touch are orange; bars inside the frame
   are the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each µm

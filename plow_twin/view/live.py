@@ -50,7 +50,7 @@ def follow(
     scene = reader.header.scene(reader.path)
     wide = exaggerate or Section.of(scene).exaggeration()
     stream = rr.RecordingStream("plow_twin")
-    sink(stream, layout.blueprint(Section.of(scene), wide, bool(others)))
+    sink(stream, layout.blueprint(Section.of(scene), wide, bool(others), reader.header.follow == "full"))
     drawing = Drawing(
         stream,
         reader.header,

@@ -101,7 +101,7 @@ def to_rrd(
     stream = rr.RecordingStream("plow_twin")
     duration_s = reader.duration_s()
     with RrdFile(out) as file:
-        file.attach(stream, layout.blueprint(Section.of(scene), wide, bool(others)))
+        file.attach(stream, layout.blueprint(Section.of(scene), wide, bool(others), reader.header.follow == "full"))
         drawing = Drawing(
             stream,
             reader.header,

@@ -1,0 +1,98 @@
+"""The forces of the demo's synthetic machine beside those that the twin published and those of its nominal scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.scene import Scene
+from plow_twin.record.entries import OutputRecord
+from plow_twin.record.messages import JointState
+from plow_twin.record.reader import RunReader
+from plow_twin.run.advance import AdvanceSeries
+from plow_twin.run.twin import Twin
+
+Array = NDArray[np.float64]
+
+#: The newest seconds that are compared: a load period of the paper.
+COMPARED_S: Final = 3.2
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Forces over the newest `COMPARED_S` of a run.
+
+    Attributes
+    ----------
+    peaks : dict of str to ndarray, shape (8,)
+        Largest force of each pair in N, by `nominal`, `followed` and `true`.
+    error : dict of str to float
+        RMS of the difference from the true forces over their RMS, by `nominal` and `followed`.
+    """
+
+    peaks: dict[str, Array]
+    error: dict[str, float]
+
+
+def compare_forces(run: Path, wider_m: float) -> Comparison | None:
+    """Return the forces of a run beside those of a machine whose clearances are larger; None without forces.
+
+    Parameters
+    ----------
+    run : Path
+        The recording.
+    wider_m : float
+        By which the machine's clearances exceed those of the scene in m.
+    """
+    reader = RunReader(run)
+    stamps, wrench, told = _read(reader)
+    if not len(stamps) or not told:
+        return None
+    scene = reader.header.scene(reader.path)
+    clearance = replace(
+        scene.clearance,
+        horizontal_m=scene.clearance.horizontal_m + wider_m,
+        vertical_m=scene.clearance.vertical_m + wider_m,
+    )
+    times = (stamps - stamps[0]) * 1e-9
+    motions = {
+        name: _motion(one, times, wrench)
+        for name, one in (("nominal", scene), ("true", replace(scene, clearance=clearance)))
+    }
+    late = times >= times[-1] - COMPARED_S
+    here = np.flatnonzero(late & np.isin(stamps, np.fromiter(told, np.int64)))
+    followed = np.array([told[stamp] for stamp in stamps[here].tolist()])
+    true = motions["true"].force[here]
+    peaks = {name: motion.peak[late].max(axis=0) for name, motion in motions.items()}
+    size = float(np.sqrt((true**2).mean()))
+    error = {
+        name: float(np.sqrt(((force - true) ** 2).mean())) / size
+        for name, force in (("nominal", motions["nominal"].force[here]), ("followed", followed))
+    }
+    return Comparison({**peaks, "followed": followed.max(axis=0)}, error)
+
+
+def _motion(scene: Scene, times: Array, wrench: Array) -> AdvanceSeries:
+    return Twin(scene, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
+
+
+def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array]]:
+    """Return stamps [ns] and wrenches of the samples, and the published forces by stamp."""
+    topic = reader.header.topic("contact_forces")
+    stamps, wrench, told = [], [], {}
+    for batch in reader.batches():
+        there = np.flatnonzero(batch.entries.sample)
+        stamps.append(batch.entries.stamp_ns[there])
+        wrench.append(batch.entries.wrench[there])
+        for part in batch.outputs:
+            for place in range(len(part.messages)):
+                record = part.record(place)
+                if isinstance(record, OutputRecord) and record.topic == topic:
+                    message = record.message()
+                    if isinstance(message, JointState):
+                        told[message.stamp_ns] = message.effort
+    return np.concatenate(stamps), np.concatenate(wrench), told
