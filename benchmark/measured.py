@@ -140,22 +140,56 @@ def rigid_impact(before: np.ndarray, model: Any, e: float, mu: float) -> np.ndar
     return found
 
 
-def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3):  # type: ignore[no-untyped-def]
-    """Return impulses after Routh with Poisson's restitution: Coulomb's friction at each bit of the normal impulse.
+def routh(slip, rate, tt, nn, tn, e, mu, bit=2e-3, energetic=False):  # type: ignore[no-untyped-def]
+    """Return impulses after Routh: Coulomb's friction at each bit of the normal impulse.
 
-    Routh, Dynamics of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635.
+    It ends by Poisson's restitution, of the impulses, or by Stronge's, of the work of the normal force. Routh, Dynamics
+    of a system of rigid bodies, 1860; Wang and Mason, J. Appl. Mech. 59 (1992) 635; Mirtich, thesis, Berkeley 1996.
     """
     along, away, end = np.zeros_like(slip), np.zeros_like(slip), np.full_like(slip, np.inf)
+    work, least = np.zeros_like(slip), np.zeros_like(slip)
     for _ in range(round(8.0 / bit)):
         now = slip + tt * along + tn * away
         drag = np.clip(-(now + tn * bit) / tt, -mu * bit, mu * bit)
-        going = away < end
+        going = work < (1.0 - e**2) * least - 1e-12 if energetic else away < end
+        going |= np.isinf(end)
+        before = rate + nn * away + tn * along
         along, away = along + np.where(going, drag, 0.0), away + np.where(going, bit, 0.0)
-        turned = (rate + nn * away + tn * along >= 0.0) & np.isinf(end)
+        after = rate + nn * away + tn * along
+        work += np.where(going, 0.5 * bit * (before + after), 0.0)
+        turned = (after >= 0.0) & np.isinf(end)
+        least = np.where(turned, work, least)
         end = np.where(turned, (1.0 + e) * away, end)
         if not going.any():
             break
     return along, away
+
+
+def mirtich(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
+    """Return impulses after Routh with Stronge's restitution of the work."""
+    return routh(slip, rate, tt, nn, tn, e, mu, energetic=True)  # type: ignore[no-untyped-call]
+
+
+def drumwright_shell(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
+    """Return impulses that leave the least kinetic energy within Coulomb's cone, with Poisson's restitution.
+
+    Drumwright and Shell, Algorithmic Foundations of Robotics IX (2010) 249.
+    """
+    determinant = tt * nn - tn**2
+    away, along = (tn * slip - tt * rate) / determinant, (tn * rate - nn * slip) / determinant
+    slides = np.abs(along) > mu * away
+    side = np.sign(along)
+    # on the edge p = (side mu, 1) away: least energy, but no approach is left
+    least = -(side * mu * slip + rate) / (tt * mu**2 + 2.0 * side * mu * tn + nn)
+    stopped = -rate / (nn + tn * mu * side)
+    away = np.where(slides, np.maximum(least, stopped), away)
+    return np.where(slides, mu * side * away, along), (1.0 + e) * away
+
+
+def anitescu_potra_newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
+    """Return impulses of the complementarity problem with Newton's restitution: both are scaled."""
+    along, away = newton(slip, rate, tt, nn, tn, 0.0, mu)  # type: ignore[no-untyped-call]
+    return (1.0 + e) * along, (1.0 + e) * away
 
 
 def newton(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-def]
@@ -178,7 +212,14 @@ def anitescu_potra(slip, rate, tt, nn, tn, e, mu):  # type: ignore[no-untyped-de
     return along, (1.0 + e) * away
 
 
-RIGID = {"Routh, Poisson": routh, "Whittaker, Newton": newton, "Anitescu-Potra, Poisson": anitescu_potra}
+RIGID = {
+    "Routh, Poisson": routh,
+    "Mirtich, Stronge": mirtich,
+    "Whittaker, Newton": newton,
+    "Anitescu-Potra, Poisson": anitescu_potra,
+    "Anitescu-Potra, Newton": anitescu_potra_newton,
+    "Drumwright-Shell, Poisson": drumwright_shell,
+}
 
 
 def by_law(impacts: Impacts) -> dict[str, Any]:
