@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -13,6 +14,20 @@ class PlowTwinError(Exception):
 
 #: Problems that a message lists.
 _MOST_SHOWN: Final = 50
+
+
+#: Categories of characters that act on a terminal or turn the direction of writing.
+_ACTING: Final = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
+
+
+def printable(text: str) -> str:
+    """Return a text, as of a file, that does nothing to a terminal: control characters are escaped, line ends stay."""
+    if text.isprintable():
+        return text
+    return "".join(
+        sign if sign in "\n\t" or unicodedata.category(sign) not in _ACTING else sign.encode("unicode_escape").decode()
+        for sign in text
+    )
 
 
 @dataclass(frozen=True)

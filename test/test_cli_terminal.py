@@ -22,7 +22,7 @@ from plow_twin.cli import info as info_verb
 from plow_twin.cli import replay as replay_verb
 from plow_twin.cli import simulate as simulate_verb
 from plow_twin.cli.app import run
-from plow_twin.cli.console import progress
+from plow_twin.cli.console import PlainConsole, progress
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.scene_file import load_scene
 from plow_twin.scene_file.presets import scene_path
@@ -37,7 +37,7 @@ WIDTH = 80
 def printed(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[str]]:
     text = io.StringIO()
     for module in (analyse_verb, doctor_verb, estimate_verb, info_verb, replay_verb, simulate_verb, paper_verb):
-        monkeypatch.setattr(module, "output_console", lambda: Console(file=text, width=WIDTH))
+        monkeypatch.setattr(module, "output_console", lambda: PlainConsole(file=text, width=WIDTH))
 
     def lines(*arguments: object, code: int = 0) -> list[str]:
         if arguments:

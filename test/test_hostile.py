@@ -1,8 +1,9 @@
-"""YAML from anybody: a few lines that stand for millions of values, nesting without end, files without end."""
+"""Files from anybody: lines that stand for millions of values, nesting without end, names that act on a terminal."""
 
 from __future__ import annotations
 
 import os
+import pty
 import subprocess
 import sys
 from collections.abc import Callable
@@ -155,3 +156,49 @@ def test_thousands_of_unknown_keys_are_listed_up_to_a_number(tmp_path: Path) -> 
     with pytest.raises(SceneError) as caught:
         loads_scene("version: " + "x" * 1_000_000)
     assert len(str(caught.value)) < 2000 and "(1000000 characters)" in str(caught.value)
+
+
+SCENE = """
+version: 1
+head: {mass_kg: {value: 2430, mark: given, source: "\\e]0;owned\\a[red]:smile:"}, inertia_kg_m2: 1265, rotation: paper}
+frame: {width_m: 0.33, height_m: 0.27}
+clearance: {horizontal_m: 0.025, vertical_m: 0.030}
+contact: {law: hunt_crossley, stiffness: 9.6975e6, exponent: 1, damping: 0.72154}
+loads: [{name: "\\e[2J\\u202e[bold]<b>", constant: {force_n: [1, 2], moment_n_m: 0}}]
+"""
+
+
+def _on_a_terminal(*arguments: str, folder: Path) -> str:
+    """Return all that a command writes to a terminal."""
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "plow_twin", *arguments],
+        cwd=folder, env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "200", "TERM": "xterm"},
+        stdin=theirs, stdout=theirs, stderr=theirs,
+    )  # fmt: skip
+    os.close(theirs)
+    written = b""
+    try:
+        while data := os.read(ours, 1 << 16):
+            written += data
+    except OSError:  # its end
+        pass
+    os.close(ours)
+    process.wait()
+    return written.decode()
+
+
+def test_names_and_texts_of_a_file_do_nothing_to_a_terminal(tmp_path: Path) -> None:
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    (tmp_path / "wrong.yaml").write_text(SCENE + '"\\e]0;owned\\a": 1\n')
+    (tmp_path / "\x1b]0;owned\x07.yaml").write_text("version: 2")
+    for arguments, shown in (
+        (["info", "scene.yaml"], ("\\x1b]0;owned[red]:smile:", "\\x1b[2J\\u202e[bold]<b>")),
+        (["info", "wrong.yaml"], ("\\x1b]0;owned\\x07",)),
+        (["info", "\x1b]0;owned\x07.yaml"], ("\\x1b]0;owned\\x07.yaml",)),
+        (["live", "load.csv", "--set", "\x1b]0;owned\x07=1"], ("\\x1b]0;owned\\x07",)),
+        (["simulate", "--\x1b]0;owned\x07"], ("\\x1b]0;owned\\x07",)),
+    ):
+        written = _on_a_terminal(*arguments, folder=tmp_path)
+        assert not any(acting in written for acting in ("\x1b]", "\x1b[2J", "\x07", "\u202e")), (arguments, written)
+        assert all(text in written for text in shown), (arguments, written)

@@ -51,7 +51,7 @@ def _set(running: Bench, name: str, given: Any) -> Any:
 @pytest.fixture(scope="module")
 def waiting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """A node that a manager configures: without `autostart` it stays unconfigured."""
-    with bench(tmp_path_factory.mktemp("managed"), "unconfigured", autostart="false") as running:
+    with bench(tmp_path_factory.mktemp("managed"), "unconfigured", autostart="false", file_root="/") as running:
         yield running
 
 

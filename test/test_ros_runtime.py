@@ -26,6 +26,7 @@ from rclpy.serialization import serialize_message
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sensor_msgs.msg import JointState
 
+from plow_twin.live.parameters import ParameterError
 from plow_twin.live.tool_forces import ToolForces
 from plow_twin.model.scene import Constant, Table
 from plow_twin.record.entries import EntryRecord
@@ -90,6 +91,45 @@ def test_a_failed_configure_leaves_nothing_behind(tmp_path: Path) -> None:
             assert set(threading.enumerate()) == threads
             assert (len(list(node.publishers)), len(list(node.subscriptions)), len(list(node.timers))) == before
         assert [node.count_publishers(topic) for topic in topics] == [0] * len(topics)
+
+
+def _refused(node: TwinNode, **values: Any) -> str:
+    return str(node.set_parameters_atomically([Parameter(*item) for item in _typed(values)]).reason)
+
+
+def _typed(values: dict[str, Any]) -> list[tuple[str, Any, Any]]:
+    return [(name, Parameter.Type.STRING, str(value)) for name, value in values.items()]
+
+
+def test_whoever_reaches_the_graph_names_no_file_outside_the_root(tmp_path: Path) -> None:
+    with _node() as node:
+        for name in ("scene", "record_path", "wear_state_path"):
+            assert f"{name}: names a file, and is read-only without" in _refused(node, **{name: tmp_path / "x"})
+        assert _refused(node, scene="bench_kv") == ""
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "link").symlink_to(tmp_path)
+    with _node(file_root=str(root), services_off="set_wear, acknowledge_alarms") as node:
+        for path in (tmp_path / "run", root / ".." / "run", root / "link" / "run", "/proc/self/wear"):
+            for name in ("scene", "record_path", "wear_state_path"):
+                assert "expected a path within file_root" in _refused(node, **{name: path}), (name, path)
+        assert _refused(node, record_path=root / "run", wear_state_path=root / "wear") == ""
+        assert node.set_parameters([Parameter("file_root", value="/")])[0].successful is False
+        assert node.start()
+        assert node._front is not None
+        for name in ("set_wear", "acknowledge_alarms"):
+            assert node._front.answer(name) == (False, f"{name}: switched off by the parameter services_off")
+        assert node._front.answer("mark")[0]
+    with (
+        pytest.raises(ParameterError, match=r"record_path: got .*expected a path within file_root"),
+        _node(file_root=str(root), record_path=str(tmp_path / "run")),
+    ):
+        pass
+    with (
+        pytest.raises(ParameterError, match="services_off: got 'set_waer', expected some of reset, "),
+        _node(services_off="set_waer"),
+    ):
+        pass
 
 
 def test_no_runtime_outlives_its_cycle() -> None:

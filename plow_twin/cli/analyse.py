@@ -11,7 +11,6 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.markup import escape
 
 from plow_twin.cli.console import (
     DONE,
@@ -201,7 +200,7 @@ def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
             f"{largest[place] / 1e3:.2f}",
             place if largest[place] else "",
         )
-        shown.add_row(escape(facts["run"]), *numbers)
+        shown.add_row(facts["run"], *numbers)
     console.print(shown)
     if len(results) > 1:
         console.print("Whether they differ by more than chance, pad by pad: plow-twin compare RUN...", highlight=False)
@@ -235,7 +234,7 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         for name, signal in facts["signals"].items():
             numbers = (signal[key] for key in ("bias", "rms", "correlation", "lag_s"))
             shown.add_row(
-                escape(f"{name} [{signal_unit(name)}]"),
+                f"{name} [{signal_unit(name)}]",
                 str(signal["n"]),
                 *("" if value is None else f"{value:.4g}" for value in numbers),
             )

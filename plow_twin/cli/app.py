@@ -108,7 +108,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         code = commands.main(args=arguments, prog_name="plow-twin", standalone_mode=False)
         return code if isinstance(code, int) else 0
     except click.ClickException as error:
-        error.show()
+        hint = error.ctx.get_usage() + "\n" if isinstance(error, click.UsageError) and error.ctx else ""
+        say_error(f"{hint}Error: {error.format_message()}")
         return error.exit_code
     except RunInterrupted as error:
         return _fail(str(error))

@@ -11,7 +11,7 @@ from plow_twin.live.service_names import SERVICES
 
 
 @click.command(
-    short_help="Ask a running `plow-twin live` to acknowledge its alarms, set a mark, reset, ...",
+    short_help="Ask a running `plow-twin live` to acknowledge its alarms, set a mark or reset.",
     epilog="Exit codes: 0 done, 1 refused or no answer, 2 wrong usage.",
 )
 @click.argument("socket", type=click.Path(path_type=Path))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, Final
 
 import click
-from rich.console import Console
-from rich.markup import escape
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import (
     BarColumn,
     Progress,
@@ -23,8 +22,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
+
+from plow_twin.errors import printable
 
 DONE: Final = 0
 FAILED: Final = 1
@@ -41,7 +43,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="The result a
 def say_error(text: str) -> None:
     """Print a line on standard error; a full disk or a closed terminal does not end the work."""
     with suppress(OSError):
-        click.echo(text, err=True)
+        click.echo(printable(text), err=True)
 
 
 class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.3 on
@@ -63,14 +65,26 @@ class PositiveNumber(click.ParamType):  # type: ignore[type-arg]  # generic from
 POSITIVE: Final = PositiveNumber()
 
 
+class PlainConsole(Console):
+    """A console on which texts from files do nothing: no markup, no emoji codes, no control characters."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield the parts of what is shown; control codes of the console itself are marked as such."""
+        for part in super().render(renderable, options):
+            yield part if part.control else Segment(printable(part.text), part.style)
+
+
 def output_console() -> Console:
     """Return the console for results."""
-    return Console()
+    return PlainConsole()
 
 
 def error_console() -> Console:
     """Return the console for progress, which never mixes with results."""
-    return Console(stderr=True)
+    return PlainConsole(stderr=True)
 
 
 class _RateColumn(ProgressColumn):
@@ -137,10 +151,10 @@ def busy(title: str, quiet: bool) -> Iterator[None]:
 
 
 def table(title: str, *columns: str) -> Table:
-    """Return a table of a text column and columns of numbers; brackets of units are no markup."""
-    result = Table(title=escape(title), title_justify="left")
+    """Return a table of a text column and columns of numbers."""
+    result = Table(title=title, title_justify="left")
     for index, name in enumerate(columns):
-        result.add_column(escape(name), justify="left" if index == 0 else "right", no_wrap=index == 0)
+        result.add_column(name, justify="left" if index == 0 else "right", no_wrap=index == 0)
     return result
 
 

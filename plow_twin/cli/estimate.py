@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.markup import escape
 
 from plow_twin.cli.console import (
     DONE,
@@ -315,7 +314,7 @@ def _show(result: Estimate, scene: Scene) -> None:
     )
     for name, value, factor, form, state in rows:
         numbers = (format(factor * number, form) for number in (value.mean, value.p05, value.p95))
-        view.add_row(escape(name), *numbers, state)
+        view.add_row(name, *numbers, state)
     console = output_console()
     console.print(view)
     console.print(f"model {result.model}, sensor {result.sensor}", highlight=False)

@@ -12,8 +12,8 @@ from typing import Any
 
 import click
 from rich.console import Console
-from rich.markup import escape
 from rich.padding import Padding
+from rich.text import Text
 
 from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts, table
 from plow_twin.scene_file.presets import PRESETS
@@ -100,13 +100,13 @@ def _print_numbers(console: Console, target: str, rows: Sequence[dict[str, Any]]
         name, _, key = row["key"].partition(".")
         if name != section:
             stated.add_section()
-            stated.add_row(f"[bold]{escape(name)}[/bold]")
+            stated.add_row(Text(name, "bold"))
             section = name
         mark = f"{row['mark']} {1 + sources.index(row['source']):2}" if row["source"] else row["mark"]
-        stated.add_row(f"  {escape(key)}", f"{row['value']:g}", row["unit"], mark)
+        stated.add_row(f"  {key}", f"{row['value']:g}", row["unit"], mark)
     console.print(stated)
     for index, source in enumerate(sources, 1):
-        console.print(Padding(f"{index:2}: {escape(source)}", (0, 0, 0, 2)), highlight=False)
+        console.print(Padding(f"{index:2}: {source}", (0, 0, 0, 2)), highlight=False)
 
 
 def _recording(path: Path, as_json: bool) -> int:

@@ -98,10 +98,7 @@ class Control:
         text = asked.get("text") if isinstance(asked, dict) else None
         if name not in SERVICES or self.services is None:
             return False, f"service: got {name!r}, expected one of {', '.join(SERVICES)}"
-        if name == "mark":
-            return self.services.mark(text if isinstance(text, str) else "")
-        done: tuple[bool, str] = getattr(self.services, name)()
-        return done
+        return self.services.call(name, text if isinstance(text, str) else "")
 
 
 def call(path: Path, service: str, text: str = "") -> tuple[bool, str]:

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from plow_twin.errors import InputError, Problem
+from plow_twin.live.file_root import outside
+from plow_twin.live.service_names import SERVICES
 from plow_twin.stream.topics import Cadence, names_of
 
 #: Topics of the estimate and of results that follow from it.
@@ -59,6 +61,15 @@ class Settings:
 
     autostart: bool = _plain(True, Effect.START, "configure and activate at start; false: wait for lifecycle requests")
     hardware_id: str = _plain("plough_head", Effect.START, "serial number of the head, shown in status and diagnostics")
+    file_root: str = _plain(
+        "",
+        Effect.START,
+        "folder that scene, record_path and wear_state_path must stay within; empty: these cannot be changed after the "
+        "start, except for the name of a preset",
+    )
+    services_off: str = _plain(
+        "", Effect.START, "services that are refused, separated by commas, e.g. set_wear,acknowledge_alarms"
+    )
     priority: int = _number(
         0,
         "SCHED_FIFO",
@@ -478,7 +489,23 @@ def settings(values: Mapping[str, Any]) -> Settings:
     found = problems(values)
     if found:
         raise ParameterError(found)
-    return Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
+    made = Settings(**{name: coerce(name, value) for name, value in values.items() if name in SPECS})
+    found = [*outside(made), *_unknown_services(made)]
+    if found:
+        raise ParameterError(found)
+    return made
+
+
+def services_off(given: Settings) -> frozenset[str]:
+    """Return the names of the services that are refused."""
+    return frozenset(name.strip() for name in given.services_off.split(",") if name.strip())
+
+
+def _unknown_services(given: Settings) -> list[Problem]:
+    unknown_names = sorted(services_off(given) - set(SERVICES))
+    return (
+        [Problem("services_off", ", ".join(unknown_names), f"some of {', '.join(SERVICES)}")] if unknown_names else []
+    )
 
 
 def model_changes(given: Settings) -> dict[str, float]:

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from plow_twin.errors import ArgumentError
+from plow_twin.live.file_root import outside
 from plow_twin.live.inputs import Inputs
 from plow_twin.live.parameters import MODEL, ParameterError, Settings, model_changes
 from plow_twin.live.publishing import Front, Outgoing, Publishing
@@ -97,6 +98,9 @@ class Runtime:
         self.identity = scene_identity(self.scene)
         kept = kept_wear.get(self.identity)
         depth = kept.depth_m if kept else None
+        misplaced = outside(settings)
+        if misplaced:
+            raise ParameterError(misplaced)
         self.alarms = alarms_of(asdict(settings))
         # refuses, here and not while samples come, what the settings would change
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))

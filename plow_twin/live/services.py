@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
+from plow_twin.live.parameters import services_off
 from plow_twin.live.runtime import Runtime
 from plow_twin.record.alarms import ACKNOWLEDGED
 from plow_twin.record.wear_state import check_depth
@@ -25,6 +26,15 @@ class Services:
     def __init__(self, runtime: Runtime, changed: Callable[[], None]) -> None:
         self._runtime, self._changed = runtime, changed
         self._kept: Snapshot | None = None
+
+    def call(self, name: str, text: str = "") -> tuple[bool, str]:
+        """Do what the service `name` does, unless the parameter `services_off` names it; `text` is that of a mark."""
+        if name in services_off(self._runtime.settings):
+            return False, f"{name}: switched off by the parameter services_off"
+        if name == "mark":
+            return self.mark(text)
+        done: tuple[bool, str] = getattr(self, name)()
+        return done
 
     def mark(self, text: str = "") -> tuple[bool, str]:
         """Put a text, or else that of the parameter `mark`, into the journal and have the ring written, if any."""

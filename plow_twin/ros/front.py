@@ -148,8 +148,7 @@ class RosFront:
         with self.turns:
             if self.runtime.waits_for_clock:
                 return False, "use_sim_time is set and nothing has come on /clock yet"
-            done: tuple[bool, str] = getattr(self._services, name)()
-            return done
+            return self._services.call(name)
 
     def close(self) -> list[str]:
         """Release everything, last things first; return what was lost, in words."""

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
+from plow_twin.errors import printable
 from plow_twin.live.stop import StopRequested, StopSignals
 
 if TYPE_CHECKING:
@@ -77,7 +78,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)
     except (ParameterError, RosArgumentsError) as error:
-        print(f"twin: {error}", file=sys.stderr)
+        print(f"twin: {printable(str(error))}", file=sys.stderr)
         return 2
     finally:
         stop.interrupt = False

@@ -11,6 +11,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from plow_twin.live import parameters
+from plow_twin.live.file_root import refused_changes
 from plow_twin.live.parameters import SPECS, Effect, Settings
 
 
@@ -109,7 +110,8 @@ class ParameterServer:
                 reasons.append(f"use_sim_time: takes effect {Effect.CONFIGURE.value}")
         if not reasons:
             known = {name: parameters.coerce(name, value) for name, value in values.items() if name in SPECS}
-            reasons += self._refusals(replace(self.settings, **known))
+            after = replace(self.settings, **known)
+            reasons += refused_changes(self.settings, after) or self._refusals(after)
         return SetParametersResult(successful=not reasons, reason="; ".join(reasons))
 
     def _sim_time(self) -> bool:

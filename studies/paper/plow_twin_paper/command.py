@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import click
 from rich.console import Console
-from rich.markup import escape
 from rich.padding import Padding
 from rich.text import Text
 
@@ -75,7 +74,7 @@ def _print(study: PaperStudy, out: Path) -> None:
     group = ""
     for row in study.rows:
         if row.group != group:
-            console.print(f"\n[bold]{escape(row.group)}[/bold]", highlight=False)
+            console.print(Text(f"\n{row.group}", "bold"))
             group = row.group
         _print_row(console, row, percent(row.difference))
     console.print()
