@@ -18,6 +18,7 @@ EXTRAS = {
     "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18", "lz4>=4.3", "zstandard>=0.22", "isal>=1.6"],
     "mqtt": ["paho-mqtt>=2.0"],
     "opcua": ["asyncua>=2.1"],
+    "dashboard": ["starlette>=0.31", "uvicorn>=0.27", "websockets>=13"],
     "view": ["rerun-sdk>=0.41", "matplotlib>=3.8"],
     "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1", "rainflow>=3.2"],
     "dask": ["distributed>=2024.1"],
@@ -56,7 +57,7 @@ setup(
     author_email="maintainers@users.noreply.github.com",
     license="Apache-2.0",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "study/templates/*.j2"]},
+    package_data={NAME: ["py.typed", "study/templates/*.j2", "dashboard/page/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

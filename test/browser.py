@@ -63,6 +63,12 @@ class Page:
         elif message.get("method") == "Runtime.exceptionThrown":
             self.errors.append(str(message["params"]["exceptionDetails"]))
 
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of an expression in the page."""
+        found = self.call("Runtime.evaluate", expression=expression)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
     def picture(self) -> bytes:
         """Return the page as a PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot")["data"])

@@ -35,8 +35,10 @@ SUBPACKAGES = {
     "study": CORE | {"build", "scene_file", "stream", "estimate", "record", "view"},
     "live": CORE | {"scene_file", "stream", "estimate", "record"},
     "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "live"},
+    "dashboard": CORE | {"scene_file", "stream", "record", "live", "ros"},
     "demo": CORE | {"scene_file", "stream", "record", "view", "live", "ros"},
-    "cli": CORE | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "demo"},
+    "cli": CORE
+    | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "dashboard", "demo"},
     "__init__": CORE | {"scene_file", "record"},
     "__main__": {"cli"},
 }
@@ -79,6 +81,7 @@ LIBRARIES = {
     },
     "live": {"scipy", "yaml", "paho", "asyncua", "cryptography"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", *MESSAGES},
+    "dashboard": {"starlette", "uvicorn", "rclpy", "rcl_interfaces", "std_srvs", *MESSAGES},
     "demo": {"rclpy", "rich", *MESSAGES},
     "cli": {"click", "rich"},
 }
@@ -189,8 +192,21 @@ def _imported_names(path: Path) -> set[str]:
         ("import plow_twin.cli.app, plow_twin.record.replay", {*SCIPY, "mcap", "rosbags", "rerun", "rclpy"}),
         (
             "import plow_twin.cli.live, plow_twin.live.front",
-            {*SCIPY, "mcap", "rosbags", "rerun", "rclpy", "paho", "asyncua"},
+            {
+                *SCIPY,
+                "mcap",
+                "rosbags",
+                "rerun",
+                "rclpy",
+                "paho",
+                "asyncua",
+                "starlette",
+                "uvicorn",
+                "plow_twin.dashboard",
+            },
         ),
+        # the server of the screen is a process of its own, beside the twin: it needs no numbers
+        ("import numpy, plow_twin.dashboard.server", {"numba", "scipy", "plow_twin.model.scene", "plow_twin.live"}),
         ("import plow_twin.ros.node", {*SCIPY, "mcap", "rosbags", "rerun"}),
         (
             "import plow_twin.run.twin, plow_twin.cli.app, plow_twin.study",

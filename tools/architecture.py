@@ -15,6 +15,7 @@ COLUMN = 470
 SUBPACKAGES = (
     (("cli", "plow-twin"),),
     (("demo", "publisher, summary"), ("study", "calibration, sweep, analysis")),
+    (("dashboard", "the operator's screen"),),
     (("ros", "the node"),),
     (("live", "runtime, bridges"),),
     (("record", "MCAP, replay"), ("view", "rerun")),

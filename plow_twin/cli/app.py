@@ -16,6 +16,7 @@ from plow_twin.cli.analyse import analyse
 from plow_twin.cli.call import call
 from plow_twin.cli.compare import compare
 from plow_twin.cli.console import FAILED, WRONG_INPUT, say_error
+from plow_twin.cli.dashboard import dashboard
 from plow_twin.cli.demo import demo
 from plow_twin.cli.doctor import doctor
 from plow_twin.cli.estimate import estimate
@@ -47,6 +48,9 @@ EXTRA_OF_MODULE: Final = {
     "rosbags": "record",
     "paho": "mqtt",
     "asyncua": "opcua",
+    "starlette": "dashboard",
+    "uvicorn": "dashboard",
+    "websockets": "dashboard",
     "rerun": "view",
     "rainflow": "study",
     "matplotlib": "study",
@@ -71,6 +75,7 @@ for _verb in (
     demo,
     live,
     call,
+    dashboard,
     estimate,
     forecast,
     record,

@@ -58,6 +58,8 @@ def _environment() -> dict[str, Any]:
         "rosbags",
         "paho-mqtt",
         "asyncua",
+        "starlette",
+        "uvicorn",
         "rerun-sdk",
         "matplotlib",
         "pyarrow",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,9 +25,12 @@ from plow_twin.cli.console import (
     show_facts,
     unit_option,
 )
+from plow_twin.cli.dashboard import access_of, access_options, dashboard_option, say_where, stay
 from plow_twin.cli.live_report import Report
 
 if TYPE_CHECKING:
+    from plow_twin.dashboard.access import PageAccess
+    from plow_twin.dashboard.screen import Screen
     from plow_twin.live.bridge.access import Access
     from plow_twin.live.bridge.source import Bridge
     from plow_twin.live.control import Control
@@ -68,6 +71,8 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option(
     "--control", type=click.Path(path_type=Path), help="Socket to open, for plow-twin call SOCKET acknowledge_alarms."
 )
+@dashboard_option
+@access_options
 @json_option
 @quiet_option
 def live(source: str, as_json: bool, quiet: bool, lines: bool, seconds: float | None, **options: Any) -> int:
@@ -97,6 +102,7 @@ def _live(
 
     try:
         settings = _settings(options)
+        access = access_of(options) if options["dashboard"] else None
         bridge = _bridge(source, options, settings.expected_rate)
         for refused in apply_realtime(settings):
             say_error(f"plow-twin: refused by the system: {refused}")
@@ -108,12 +114,15 @@ def _live(
         def on_error(text: str) -> None:
             say_error(f"plow-twin: {text}")
 
-        with _control(options["control"]) as control:
+        with _control(options["control"]) as control, ExitStack() as opened:
             front = BridgeFront(bridge, options["mapping"], settings, prepared, report.say, on_error, options["units"])
             if control is not None:
                 _answer_on(control, front)
+            screen = opened.enter_context(_screen(front, access, source)) if access is not None else None
             stop.interrupt = False
             lost = front.run(lambda: stop.stopped, seconds or float("inf"))
+            if screen is not None and bridge.finished and not stop.stopped:
+                stay(screen, lambda: stop.stopped)
     except StopRequested:
         return leave(DONE)
     parts = front.parts()
@@ -138,6 +147,15 @@ def _answer_on(control: Control, front: BridgeFront) -> None:
 
     control.services = Services(front.runtime, front.changed)
     front.timers.append(Timer(TURN_S, control.turn))
+
+
+def _screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
+    """Open the screen of a twin."""
+    from plow_twin.dashboard.live import open_screen
+
+    screen = open_screen(front, access, source)
+    say_where(screen, access)
+    return screen
 
 
 def _control(path: Path | None) -> AbstractContextManager[Control | None]:

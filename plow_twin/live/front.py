@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from plow_twin.errors import UnitError
 from plow_twin.live import diagnostics
@@ -24,6 +24,7 @@ from plow_twin.record.messages import DiagnosticStatus, JointState, Message
 from plow_twin.record.sources import Arrived
 from plow_twin.record.times import time_text
 from plow_twin.record.unit_check import CHECKED, check_units
+from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS
 
 NAME: Final = "/plow_twin"
@@ -33,6 +34,16 @@ _REPORT_S: Final = 1.0
 
 #: Receives `status`, `alarms` or a part of the diagnostics by name, with level, message and values.
 Say = Callable[[str, Part], None]
+
+
+class Watcher(Protocol):
+    """Gets what is said and each publication."""
+
+    def publication(self, published: Published) -> None:
+        """Take in a publication of at least one row."""
+
+    def part(self, name: str, part: Part) -> None:
+        """Take in what is said."""
 
 
 class BridgeFront:
@@ -92,6 +103,12 @@ class BridgeFront:
         self._health = diagnostics.Health()
         #: what has its turn while the source is read
         self.timers: list[Timer] = []
+        self._watcher: Watcher | None = None
+
+    def attach(self, watcher: Watcher) -> None:
+        """Let somebody look on from now on."""
+        self._watcher = watcher
+        self.runtime.publishing.watch = watcher.publication
 
     def now_ns(self) -> int:
         """Return the system's time, or that of the samples where they bring their own [ns]."""
@@ -101,11 +118,16 @@ class BridgeFront:
     def send(self, topic: str, message: memoryview | Message) -> None:
         """Say an alarm, an estimate or what follows from it (of forces their peaks); the recording holds the motion."""
         if isinstance(message, DiagnosticStatus):
-            self._say(topic, (message.level, message.message, dict(message.values)))
+            self._tell(topic, (message.level, message.message, dict(message.values)))
         elif isinstance(message, JointState):
             numbers = message.position if len(message.position) else message.effort
             values = zip(message.name, numbers.tolist(), strict=True)
-            self._say(topic, (0, "", {name: repr(value) for name, value in values}))
+            self._tell(topic, (0, "", {name: repr(value) for name, value in values}))
+
+    def _tell(self, name: str, part: Part) -> None:
+        self._say(name, part)
+        if self._watcher is not None:
+            self._watcher.part(name, part)
 
     def look_for_senders(self, topic: str) -> None:
         """Do nothing: the feeder knows its sender."""
@@ -127,7 +149,7 @@ class BridgeFront:
         if (level, message, values) == self._said:
             return
         self._said = level, message, values
-        self._say("status", self._said)
+        self._tell("status", self._said)
         head = self._settings.hardware_id
         self.runtime.record_status(DiagnosticStatus(level, self.name, message, head, tuple(values.items())))
 
@@ -182,6 +204,9 @@ class BridgeFront:
         if self._settings.publish_mode == "fixed_rate":
             self.runtime.publish_due()
         self.changed()
+        if self._watcher is not None:
+            for name, part in self.parts().items():
+                self._watcher.part(name, part)
 
     def _messages(self, timeout_s: float) -> list[Arrived]:
         """Return the next messages: first those that the check of units has read already."""
@@ -193,7 +218,7 @@ class BridgeFront:
     def _report(self) -> None:
         self.changed()
         for name, part in self.parts().items():
-            self._say(name, part)
+            self._tell(name, part)
 
 
 def _load_role(roles: Mapping[str, Role]) -> str:

@@ -111,6 +111,8 @@ class Publishing:
         #: steady time at which the samples of the next publication were received [ns]; 0: it answers no message
         self.received_ns = 0
         self._newest: Rows | None = None
+        #: takes each publication beside the front, where somebody watches
+        self.watch: Callable[[Published], object] | None = None
 
     @property
     def q(self) -> NDArray[np.float64] | None:
@@ -149,6 +151,8 @@ class Publishing:
             self.age.add((time.time_ns() - stamp_ns) * 1e-9)
         if self.recording:
             self.recording.publication(published, {topic: data.tobytes() for topic, data in sent})
+        if self.watch is not None:
+            self.watch(published)
         if changed:
             yield from self.alarms_changed(stamp_ns)
 

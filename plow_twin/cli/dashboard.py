@@ -1,0 +1,99 @@
+"""Options of the screen, and `plow-twin dashboard`: the screen beside a node or a recording."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import DONE, say_error
+
+if TYPE_CHECKING:
+    from plow_twin.dashboard.access import PageAccess
+    from plow_twin.dashboard.screen import Screen
+
+
+def access_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--listen` and `--token-file`, which arrive as the parameters `listen` and `token_file`."""
+    for option in (
+        click.option(
+            "--token-file",
+            type=click.Path(path_type=Path, exists=True, dir_okay=False),
+            help="File whose first line is the token of the screen; else PLOW_TWIN_DASHBOARD_TOKEN.",
+        ),
+        click.option(
+            "--listen",
+            metavar="HOST:PORT",
+            default="127.0.0.1:8070",
+            show_default=True,
+            help="Address of the screen; other machines need a token. Port 0: a free one.",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+dashboard_option = click.option("--dashboard", is_flag=True, help="Show the run on a page in the browser.")
+
+
+def access_of(options: dict[str, Any]) -> PageAccess:
+    """Return the access that the options ask for, before a twin is made; raises as `PageAccess.of` and `listening`."""
+    from plow_twin.dashboard.access import PageAccess, listening
+
+    access = PageAccess.of(options["listen"], options["token_file"])
+    listening(access).close()
+    return access
+
+
+def say_where(screen: Screen, access: PageAccess) -> None:
+    """Print the address of the page."""
+    say_error(f"screen: {screen.url}" + ("#token=... (the token's file has the rest)" if access.token else ""))
+
+
+def stay(screen: Screen, stopped: Callable[[], bool]) -> None:
+    """Keep the page until a stop is asked for or its server has gone."""
+    say_error("the input has ended; the page stays until Ctrl-C")
+    while not (stopped() or screen.has_ended):
+        screen.feed.turn()
+        time.sleep(0.2)
+
+
+@click.command(
+    short_help="Show a node or a recording on a page in the browser.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage.",
+)
+@click.argument("run", type=click.Path(path_type=Path), required=False)
+@click.option("--ros", is_flag=True, help="Show a node, by its topics.")
+@click.option("--namespace", default="", help="Its namespace.")
+@click.option("--name", default="plow_twin", show_default=True, help="Its name.")
+@click.option("--scene", help="Its scene, where the name that it has there cannot be read here.")
+@click.option(
+    "--wait", type=click.FloatRange(0.0), default=10.0, show_default=True, help="How long to look for either [s]."
+)
+@access_options
+def dashboard(
+    run: Path | None, ros: bool, namespace: str, name: str, scene: str | None, wait: float, **options: Any
+) -> int:
+    """Show RUN, a recording, also while it is written, or a node (--ros) until interrupted."""
+    if ros == (run is not None):
+        raise click.UsageError("expected a recording or --ros")
+    if scene is not None and not ros:
+        raise click.UsageError("--scene is for --ros: a recording has its scene")
+    from plow_twin.cli.interruption import interruptible
+
+    access = access_of(options)
+    with interruptible() as stopped:
+        if run is None:
+            from plow_twin.dashboard.node import show_node
+
+            show_node(namespace, name, scene, access, wait, stopped, lambda screen: say_where(screen, access))
+        else:
+            from plow_twin.dashboard.run import show_run
+            from plow_twin.record.running import find_run
+
+            found = run if run.exists() else find_run(run, wait, stopped)
+            show_run(found, access, stopped, lambda screen: say_where(screen, access))
+    return DONE

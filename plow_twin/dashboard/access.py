@@ -1,0 +1,124 @@
+"""Who may look at the screen: the address it is offered on, the token, and the names it may be asked for under."""
+
+from __future__ import annotations
+
+import hmac
+import os
+import socket
+from dataclasses import dataclass
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+from plow_twin.errors import InputError, Problem
+
+#: Where the token stands, where it is in no file.
+TOKEN_VARIABLE: Final = "PLOW_TWIN_DASHBOARD_TOKEN"
+DEFAULT: Final = "127.0.0.1:8070"
+#: Fewest characters of a token.
+_SHORTEST: Final = 16
+
+
+class DashboardError(InputError):
+    """The screen cannot be offered as asked for."""
+
+    def __init__(self, key: str, got: object, expected: str) -> None:
+        super().__init__([Problem(key, got, expected)], "dashboard")
+
+
+@dataclass(frozen=True)
+class PageAccess:
+    """Address of the screen, and its token; without one everybody on this machine may look and acknowledge."""
+
+    host: str
+    port: int
+    token: str = ""
+
+    @classmethod
+    def of(cls, listen: str, token_file: Path | None) -> PageAccess:
+        """Return the access for HOST:PORT; the token is the first line of a file, or in the environment.
+
+        Raises
+        ------
+        DashboardError
+            The address cannot be read, or is of another machine's network and there is no token.
+        OSError
+            The file cannot be read.
+        """
+        try:
+            parts = urlsplit(f"//{listen}")
+            host, port = parts.hostname or "", parts.port
+        except ValueError:
+            host, port = "", None
+        if not host or port is None or parts.path or parts.username:
+            raise DashboardError("--listen", listen, "HOST:PORT, as 127.0.0.1:8070; port 0: a free one")
+        if token_file is None:
+            token = os.environ.get(TOKEN_VARIABLE, "").strip()
+        else:
+            token = token_file.read_text(encoding="utf-8").partition("\n")[0].strip()
+        if token and (len(token) < _SHORTEST or not token.isascii() or not token.isprintable()):
+            raise DashboardError("token", f"{len(token)} characters", f"at least {_SHORTEST} of ASCII, without spaces")
+        if not token and not is_loopback(host):
+            expected = f"127.0.0.1, or a token: --token-file, or {TOKEN_VARIABLE} in the environment"
+            raise DashboardError("--listen", listen, expected)
+        return cls(host, port, token)
+
+    def admits(self, token: object) -> bool:
+        """Return whether a token is the right one, in a time that does not depend on how much of it is right."""
+        given = token if isinstance(token, str) else ""
+        return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode())
+
+    def answers_to(self, host: str) -> bool:
+        """Return whether the page may be asked for under a name, as in `Host`: a name that others own may not.
+
+        Else a page of theirs could have its name lead here and read the screen (DNS rebinding).
+        """
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        if is_loopback(name) or name == self.host.lower():
+            return True
+        return not is_loopback(self.host) and (_is_address(name) or name in (socket.gethostname(), socket.getfqdn()))
+
+    def is_own(self, origin: str | None, host: str) -> bool:
+        """Return whether a connection comes from the page itself, or from a program that is no browser."""
+        return origin is None or urlsplit(origin).netloc.lower() == host.lower()
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host is this machine's own."""
+    return host == "localhost" or (_is_address(host) and ip_address(host).is_loopback)
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def listening(access: PageAccess) -> socket.socket:
+    """Return a socket that listens on the address.
+
+    Raises
+    ------
+    DashboardError
+        It is taken, or not one of this machine.
+    """
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(access.host, access.port, type=socket.SOCK_STREAM)[0]
+        found = socket.socket(family, kind)
+        try:
+            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            found.bind(address)
+            found.listen()
+        except OSError:
+            found.close()
+            raise
+    except OSError as error:
+        got = f"{access.host}:{access.port}"
+        raise DashboardError("--listen", got, f"a free address of this machine ({error.strerror})") from error
+    return found

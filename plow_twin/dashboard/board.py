@@ -1,0 +1,71 @@
+"""What the server of the screen knows: the newest of everything, the hour, and what each page lacks."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from typing import Any, Final
+
+from plow_twin.dashboard.history import History
+
+#: Most events that are kept.
+_EVENTS: Final = 200
+
+
+class Board:
+    """The newest of everything, each with the number of the update that brought it."""
+
+    def __init__(self) -> None:
+        self.version = 0
+        self._facts: dict[str, Any] = {}
+        self._facts_version = self._anew_version = 0
+        self._parts: dict[str, tuple[int, Any]] = {}
+        self._events: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_EVENTS)
+        self._motion: dict[str, Any] | None = None
+        self._history = History()
+        self._not_taken = 0
+        self._updated_s = time.monotonic()
+        #: set, and replaced, at each update
+        self.news = asyncio.Event()
+        self.pages = 0
+
+    def take(self, update: dict[str, Any]) -> None:
+        """Take in an update of the feed."""
+        self.version = version = self.version + 1
+        self._updated_s = time.monotonic()
+        self._not_taken = update["not_taken"]
+        if "facts" in update:
+            self._facts, self._facts_version = update["facts"], version
+        for name, part in update.get("parts", {}).items():
+            self._parts[name] = (version, part)
+        if "motion" in update:
+            self._motion = update["motion"]
+            if self._history.add(self._motion, version):
+                self._anew_version = version
+        self._events.extend((version, event) for event in update.get("events", ()))
+        self.tell()
+
+    def tell(self) -> None:
+        """Wake the pages."""
+        news, self.news = self.news, asyncio.Event()
+        news.set()
+
+    def since(self, version: int) -> dict[str, Any]:
+        """Return what a page lacks that has had the update of that number; 0: it has had none."""
+        found: dict[str, Any] = {
+            "version": self.version,
+            "age": round(time.monotonic() - self._updated_s, 2),
+            "not_taken": self._not_taken,
+            "pages": self.pages,
+        }
+        if self.version == version:
+            return found
+        if self._facts_version > version:
+            found["facts"] = self._facts
+        found["parts"] = {name: part for name, (at, part) in self._parts.items() if at > version}
+        found["events"] = [event for at, event in self._events if at > version]
+        found["anew"] = self._anew_version > version
+        found["seconds"] = self._history.since(0 if found["anew"] else version)
+        found["motion"] = self._motion
+        return found

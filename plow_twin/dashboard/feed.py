@@ -1,0 +1,215 @@
+"""The feed of the screen: what has happened is summed up ten times a second, and handed over where there is room.
+
+An update that is not taken is not queued: its peaks, and the newest of everything else, stay for the next one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.dashboard.link import Link, number, numbers
+from plow_twin.live.part import Part
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.record.messages import DiagnosticStatus, JointState, Message
+from plow_twin.stream.intake import NS_PER_S
+from plow_twin.stream.outputs import CLEARANCE_NAMES, Published
+
+Array = NDArray[np.float64]
+
+#: Updates a second.
+RATE_HZ: Final = 10.0
+#: Most publications that wait to be summed up.
+_MOST: Final = 256
+#: Most events that wait.
+_EVENTS: Final = 20
+#: Longest text that is passed on.
+_LONGEST: Final = 1000
+#: Most wishes of operators that are heard at once.
+_MOST_ASKED: Final = 8
+_NO_LOAD: Final = np.full(3, np.nan)
+
+
+class Motion:
+    """The newest motion, and the extremes since they were last cleared."""
+
+    def __init__(self) -> None:
+        #: stamp reached [ns]; 0: nothing has come
+        self.stamp_ns = 0
+        self.pose = np.full(3, np.nan)
+        self.penetration = np.full(PAIR_COUNT, np.nan)
+        self.force = np.full(PAIR_COUNT, np.nan)
+        self.clearance: Array | None = None
+        self.load = _NO_LOAD
+        self.held = False
+        self.clear()
+
+    def clear(self) -> None:
+        """Let the extremes begin anew."""
+        self.peak = np.zeros(PAIR_COUNT)
+        self.lowest = self.highest = self.load
+        self.was_held = False
+
+    def add_load(self, wrench: Array) -> None:
+        """Take in loads Fx, Fy [N], M [N m], shape (n, 3)."""
+        self.load = wrench[-1]
+        self.lowest = np.fmin(self.lowest, np.fmin.reduce(wrench))
+        self.highest = np.fmax(self.highest, np.fmax.reduce(wrench))
+
+    def add_peaks(self, peak: Array) -> None:
+        """Take in the largest forces [N] since the rows before, shape (n, 8)."""
+        self.peak = np.maximum(self.peak, peak.max(axis=0))
+
+    def add_rows(self, published: Published) -> None:
+        """Take in publications of a twin."""
+        rows, slow = published
+        newest = rows[-1]
+        self.stamp_ns = int(newest["stamp_ns"])
+        self.pose, self.penetration, self.force = newest["q"], newest["penetration"], newest["force"]
+        self.add_peaks(rows["peak"])
+        self.held = bool(newest["held"])
+        self.was_held |= bool(rows["held"].any())
+        if len(slow):
+            self.clearance = slow["clearance"][-1]
+
+    def update(self) -> dict[str, Any]:
+        """Return all of it for the page."""
+        found = {
+            "t": self.stamp_ns * 1e-9,
+            "pose": numbers(self.pose),
+            "penetration": numbers(self.penetration),
+            "force": numbers(self.force),
+            "peak": numbers(self.peak),
+            "load": numbers(self.load),
+            "load_low": numbers(self.lowest),
+            "load_high": numbers(self.highest),
+            "held": self.held,
+            "was_held": self.was_held,
+        }
+        if self.clearance is not None:
+            found["clearance"] = {
+                name: number(value) for name, value in zip(CLEARANCE_NAMES, self.clearance.tolist(), strict=True)
+            }
+        return found
+
+
+class Feed:
+    """What a twin, or a reader beside it, tells the screen.
+
+    Parameters
+    ----------
+    link
+        The way to the server.
+    facts
+        What the page shows of the machine (`facts.facts_of`).
+    answer
+        Does what an operator asks for, `acknowledge` or `mark` with a text; returns whether it was done, and a text.
+        None: nothing can be asked for.
+    load
+        Returns the newest load Fx, Fy [N], M [N m] that is known with a publication, shape (3,).
+    on_error
+        Receives the reason why nothing is shown any more.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        facts: dict[str, Any],
+        answer: Callable[[str, str], tuple[bool, str]] | None = None,
+        load: Callable[[], Array] | None = None,
+        on_error: Callable[[str], object] = lambda text: None,
+    ) -> None:
+        self._link, self._answer, self._load, self._on_error = link, answer, load, on_error
+        self._ended = False
+        self._news: dict[str, Any] = {"facts": {**facts, "can_ask": answer is not None}}
+        self._parts: dict[str, Part] = {}
+        self._events: list[dict[str, Any]] = []
+        self._waiting: list[Published] = []
+        self._loads: list[Array] = []
+        self.motion = Motion()
+        #: second of stamps that the newest update has told of
+        self._second = 0
+        #: updates that the server took, and those that it had no room for
+        self.taken = self.not_taken = 0
+
+    def publication(self, published: Published) -> None:
+        """Take in a publication of at least one row: it is kept for the next update."""
+        self._waiting.append(published)
+        if self._load is not None:
+            self._loads.append(self._load())
+        if len(self._waiting) >= _MOST:
+            self._sum_up()
+            # samples that come faster than their time, as from a file: each second has its update
+            if self.motion.stamp_ns // NS_PER_S != self._second:
+                self.send()
+
+    def part(self, name: str, part: Part) -> None:
+        """Take in a status: the newest of each name counts."""
+        level, message, values = part
+        self._parts[name] = level, message[:_LONGEST], {key: text[:_LONGEST] for key, text in values.items()}
+
+    def event(self, kind: str, text: str, *, done: bool = True, stamp_ns: int | None = None) -> None:
+        """Take in an event, at the stamp reached unless it has another [ns]."""
+        at_ns = self.motion.stamp_ns if stamp_ns is None else stamp_ns
+        self._events.append({"t": at_ns * 1e-9, "kind": kind, "text": text[:_LONGEST], "done": done})
+        del self._events[:-_EVENTS]
+
+    def turn(self) -> None:
+        """Do what operators ask for, and send an update: called `RATE_HZ` times a second."""
+        for _ in range(_MOST_ASKED):
+            asked = self._link.receive()
+            if asked is None:
+                break
+            self._do(asked)
+        self.send()
+        if self._link.broken and not self._ended:
+            self._ended = True
+            self._on_error("the server of the screen has ended: nothing is shown any more, the twin goes on")
+
+    def send(self) -> bool:
+        """Send an update; False, and counted, where there was no room."""
+        self._sum_up()
+        self._second = self.motion.stamp_ns // NS_PER_S
+        update: dict[str, Any] = {**self._news, "not_taken": self.not_taken}
+        if self._parts:
+            update["parts"] = self._parts
+        if self._events:
+            update["events"] = self._events
+        if self.motion.stamp_ns:
+            update["motion"] = self.motion.update()
+        if not self._link.send(update):
+            self.not_taken += 1
+            return False
+        self.taken += 1
+        self._news, self._parts, self._events = {}, {}, []
+        self.motion.clear()
+        return True
+
+    def _sum_up(self) -> None:
+        if self._waiting:
+            self.motion.add_rows(Published.joined(self._waiting))
+            self._waiting = []
+        if self._loads:
+            self.motion.add_load(np.array(self._loads))
+            self._loads = []
+
+    def _do(self, asked: dict[str, Any]) -> None:
+        what, text = str(asked.get("do")), str(asked.get("text", ""))
+        if self._answer is None or what not in ("acknowledge", "mark"):
+            self.event(what, "not possible here", done=False)
+            return
+        done, said = self._answer(what, text)
+        self.event(what, f"{text}: {said}" if text else said, done=done)
+
+
+def part_of(message: Message) -> Part:
+    """Return a status or named numbers as they are shown; of forces their peaks."""
+    if isinstance(message, DiagnosticStatus):
+        return message.level, message.message, dict(message.values)
+    if not isinstance(message, JointState):
+        return 0, "", {}
+    values = message.position if len(message.position) else message.effort
+    return 0, "", {name: repr(value) for name, value in zip(message.name, values.tolist(), strict=False)}

@@ -1,0 +1,75 @@
+"""The last hour of the screen: the extremes of each second of stamps."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, Final
+
+#: Seconds of stamps that are kept.
+SPAN_S: Final = 3600
+#: The numbers of a second beside its time, in the order in which they are sent.
+_CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical") for point in ("", "/p05", "/p95"))
+
+
+class History:
+    """The seconds, each a list: time [s], eight peaks, six extremes of the load, six clearances, whether it was held.
+
+    Each has the number of the update that changed it last, so that a page gets what it lacks.
+    """
+
+    def __init__(self) -> None:
+        self._seconds: deque[list[Any]] = deque()
+        self._versions: deque[int] = deque()
+
+    def add(self, motion: dict[str, Any], version: int) -> bool:
+        """Take in the motion of an update; True where the stamps have stepped back and the hour begins anew."""
+        second = int(motion["t"])
+        stepped_back = bool(self._seconds) and second < self._seconds[-1][0]
+        if stepped_back:
+            self._seconds.clear()
+            self._versions.clear()
+        clearance = motion.get("clearance", {})
+        row = [
+            second,
+            *motion["peak"],
+            *motion["load_low"],
+            *motion["load_high"],
+            *(clearance.get(name) for name in _CLEARANCES),
+            int(motion["was_held"]),
+        ]
+        if self._seconds and self._seconds[-1][0] == second:
+            row = _joined(self._seconds.pop(), row)
+            self._versions.pop()
+        self._seconds.append(row)
+        self._versions.append(version)
+        while self._seconds[0][0] <= second - SPAN_S:
+            self._seconds.popleft()
+            self._versions.popleft()
+        return stepped_back
+
+    def since(self, version: int) -> list[list[Any]]:
+        """Return the seconds that an update after that one has changed, in order."""
+        count = 0
+        for found in reversed(self._versions):
+            if found <= version:
+                break
+            count += 1
+        return list(self._seconds)[len(self._seconds) - count :]
+
+
+def _joined(before: list[Any], now: list[Any]) -> list[Any]:
+    """Return a second of which more has come: extremes of peaks and loads, the newest clearances."""
+    largest = [_extreme(max, *pair) for pair in zip(before[1:9], now[1:9], strict=True)]
+    lowest = [_extreme(min, *pair) for pair in zip(before[9:12], now[9:12], strict=True)]
+    highest = [_extreme(max, *pair) for pair in zip(before[12:15], now[12:15], strict=True)]
+    clearances = [
+        later if later is not None else earlier for earlier, later in zip(before[15:21], now[15:21], strict=True)
+    ]
+    return [now[0], *largest, *lowest, *highest, *clearances, before[21] | now[21]]
+
+
+def _extreme(choose: Any, first: float | None, second: float | None) -> float | None:
+    if first is None or second is None:
+        return second if first is None else first
+    found: float = choose(first, second)
+    return found

@@ -1,0 +1,85 @@
+"""The way between a twin and the screen's server: whole messages both ways, bounded, and nobody waits."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+from contextlib import suppress
+from typing import Any, Final
+
+#: Most bytes of one message, and room for those that the other side has not taken yet [B].
+LONGEST: Final = 1 << 16
+_ROOM: Final = 1 << 18
+
+
+class Link:
+    """One end of the way; each message is a JSON object.
+
+    Parameters
+    ----------
+    end
+        A socket of type SOCK_SEQPACKET.
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        end.setblocking(False)
+        end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _ROOM)
+        self._end = end
+        #: whether the other side has gone
+        self.broken = False
+
+    def fileno(self) -> int:
+        """Return the descriptor, for whoever waits for messages."""
+        return self._end.fileno()
+
+    def send(self, message: dict[str, Any]) -> bool:
+        """Send a message; False where it is not taken: there is no room, it is too long, or nobody is there."""
+        data = json.dumps(message, separators=(",", ":")).encode()
+        if self.broken or len(data) > LONGEST:
+            return False
+        try:
+            return self._end.send(data) == len(data)
+        except BlockingIOError:
+            return False
+        except OSError:
+            self.broken = True
+            return False
+
+    def receive(self) -> dict[str, Any] | None:
+        """Return the next message; None where none has come."""
+        if self.broken:
+            return None
+        try:
+            data = self._end.recv(LONGEST)
+        except BlockingIOError:
+            return None
+        except OSError:
+            data = b""
+        if not data:
+            self.broken = True
+            return None
+        found: dict[str, Any] = json.loads(data)
+        return found
+
+    def close(self) -> None:
+        """Close this end: the other one finds it broken."""
+        with suppress(OSError):
+            self._end.close()
+        self.broken = True
+
+
+def pair() -> tuple[Link, socket.socket]:
+    """Return this side's end and the socket for the other process."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    return Link(ours), theirs
+
+
+def number(value: float) -> float | None:
+    """Return a number as JSON has it, with seven digits; None where it is not finite."""
+    return float(f"{value:.7g}") if math.isfinite(value) else None
+
+
+def numbers(values: Any) -> list[float | None]:
+    """Return the numbers of an array."""
+    return [number(value) for value in values.tolist()]

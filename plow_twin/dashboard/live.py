@@ -1,0 +1,31 @@
+"""The screen of a live twin without ROS."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+from plow_twin.dashboard.access import PageAccess
+from plow_twin.dashboard.facts import facts_of
+from plow_twin.dashboard.feed import RATE_HZ, part_of
+from plow_twin.dashboard.screen import Screen
+from plow_twin.live.front import BridgeFront
+from plow_twin.live.services import Services
+from plow_twin.live.timer import Timer
+from plow_twin.record.alarms import ALARMS, alarms_message
+
+
+def open_screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
+    """Return the screen of a twin that has not begun to run; raises as `Screen`."""
+    runtime = front.runtime
+    services = Services(runtime, front.changed)
+
+    def answer(what: str, text: str) -> tuple[bool, str]:
+        return services.acknowledge_alarms() if what == "acknowledge" else services.mark(text)
+
+    facts = facts_of(runtime.scene, asdict(runtime.settings), source)
+    load = (lambda: runtime.driver.session.twin.wrench) if facts["loads"] else None
+    screen = Screen(access, facts, answer, load, front.say_error)
+    screen.feed.part(ALARMS, part_of(alarms_message(runtime.alarms, front.name, "")))
+    front.attach(screen.feed)
+    front.timers.append(Timer(1.0 / RATE_HZ, screen.feed.turn))
+    return screen

@@ -1,0 +1,222 @@
+"""The screen of a node: from its topics, by a process beside it; wishes go to its services."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import WrenchStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import parameter_value_to_python
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger
+
+from plow_twin.dashboard.access import DashboardError, PageAccess
+from plow_twin.dashboard.facts import facts_of
+from plow_twin.dashboard.feed import RATE_HZ, Feed, part_of
+from plow_twin.dashboard.run import pose_of
+from plow_twin.dashboard.screen import Screen
+from plow_twin.live.part import Part
+from plow_twin.live.timer import Timer
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.record import messages as plain
+from plow_twin.record.cdr import decode
+from plow_twin.ros.connections import WithoutEvents
+from plow_twin.ros.main import make_executor
+from plow_twin.ros.messages import UNREADABLE, read_wrench
+from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS, sensor_input
+from plow_twin.scene_file import load_scene
+from plow_twin.scene_file.presets import scene_path
+from plow_twin.stream.topics import Cadence, names_of
+
+#: Parameters of the node that the page shows.
+_SHOWN: Final = (
+    "scene", "hardware_id", "excitation_source", "forecast_limits", "alarm_force", "alarm_clearance",
+    "alarm_clearance_rate", "alarm_wear_rate", "alarm_residual", "alarm_duration",
+)  # fmt: skip
+#: How long a service may take to answer [s].
+_PATIENCE_S: Final = 5.0
+#: Depth of a topic of which only the newest message counts, and of one of which each counts.
+_NEWEST, _ALL = 1, 1000
+
+
+class NodeWatch:
+    """Listens to a node.
+
+    Parameters
+    ----------
+    namespace, name
+        Of the node.
+    wait_s
+        How long to wait for the node [s].
+    stopped
+        Whether to wait no longer.
+
+    Raises
+    ------
+    DashboardError
+        There is no such node.
+    """
+
+    def __init__(self, namespace: str, name: str, wait_s: float, stopped: Callable[[], bool]) -> None:
+        self.node = WithoutEvents(
+            "plow_twin_screen", namespace=namespace, start_parameter_services=False, enable_rosout=False
+        )
+        self._executor = make_executor()
+        self._executor.add_node(self.node)
+        space = self.node.get_namespace().rstrip("/")
+        self.name = f"{space}/{name}"
+        self._ask = self.node.create_client(GetParameters, f"{self.name}/get_parameters")
+        self._set = self.node.create_client(SetParameters, f"{self.name}/set_parameters")
+        self._services = {
+            service: self.node.create_client(Trigger, f"{self.name}/{service}")
+            for service in ("acknowledge_alarms", "mark")
+        }
+        self.feed: Feed | None = None
+        waited = 0.0
+        while not self._ask.service_is_ready():
+            if waited >= wait_s or stopped():
+                raise DashboardError("--ros", self.name, f"a running node within {wait_s:g} s")
+            self.spin()
+            waited += 0.1
+
+    def spin(self) -> None:
+        """Take what has come, waiting a little."""
+        self._executor.spin_once(timeout_sec=0.1)
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the node's parameters that are shown."""
+        answer = self._called(self._ask, GetParameters.Request(names=list(_SHOWN)))
+        if answer is None:
+            raise DashboardError("--ros", self.name, f"an answer within {_PATIENCE_S:g} s")
+        values = map(parameter_value_to_python, answer.values)
+        return {name: value for name, value in zip(_SHOWN, values, strict=False) if value is not None}
+
+    def listen(self, feed: Feed, source: str) -> None:
+        """Hand over to a feed what comes from now on."""
+        self.feed = feed
+        best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)
+        self._subscribe(JointState, "contact_peaks", best_effort(depth=_ALL), self._peaks)
+        self._subscribe(Odometry, "head_state", best_effort(depth=_NEWEST), self._pose)
+        self._subscribe(JointState, "clearance", best_effort(depth=_NEWEST), self._clearance)
+        self._subscribe(JointState, "quality", OUTPUTS["quality"], self._quality)
+        for topic in names_of(Cadence.ESTIMATE):
+            self._subscribe(JointState, topic, OUTPUTS[topic], partial(self._said, topic))
+        for topic in names_of(Cadence.CHANGE):
+            self._subscribe(DiagnosticStatus, topic, OUTPUTS[topic], partial(self._said, topic))
+        if source == "excitation":
+            self.node.create_subscription(WrenchStamped, "excitation", self._load, sensor_input(_ALL), raw=True)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, DIAGNOSTICS)
+
+    def answer(self, what: str, text: str) -> tuple[bool, str]:
+        """Call the service that an operator asks for."""
+        service = "acknowledge_alarms" if what == "acknowledge" else "mark"
+        if service == "mark":
+            value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=text)
+            self._called(self._set, SetParameters.Request(parameters=[Parameter(name="mark", value=value)]))
+        answer = self._called(self._services[service], Trigger.Request())
+        return (False, f"no answer within {_PATIENCE_S:g} s") if answer is None else (answer.success, answer.message)
+
+    def close(self) -> None:
+        """End the node of the screen."""
+        self._executor.remove_node(self.node)
+        self.node.destroy_node()  # type: ignore[no-untyped-call]
+
+    def _called(self, client: Any, request: Any) -> Any:
+        future = client.call_async(request)
+        self._executor.spin_until_future_complete(future, timeout_sec=_PATIENCE_S)
+        return future.result() if future.done() else None
+
+    def _subscribe(self, kind: type, topic: str, quality: QoSProfile, take: Callable[[Any], None]) -> None:
+        """Subscribe to an output; the messages come as the plain ones of a recording."""
+        message_type = plain.JointState.TYPE if kind is JointState else plain.DiagnosticStatus.TYPE
+        message_type = plain.Odometry.TYPE if kind is Odometry else message_type
+        self.node.create_subscription(kind, topic, lambda data: take(decode(data, message_type)), quality, raw=True)
+
+    @property
+    def _motion(self) -> Any:
+        assert self.feed is not None
+        return self.feed.motion
+
+    def _forces(self, message: plain.JointState) -> None:
+        motion = self._motion
+        motion.stamp_ns, motion.penetration, motion.force = message.stamp_ns, message.position, message.effort
+
+    def _peaks(self, message: plain.JointState) -> None:
+        if len(message.effort) == PAIR_COUNT:
+            self._motion.add_peaks(message.effort[None])
+
+    def _pose(self, message: plain.Odometry) -> None:
+        self._motion.pose = pose_of(np.array([*message.position[:2], *message.orientation[2:]]))
+
+    def _clearance(self, message: plain.JointState) -> None:
+        self._motion.clearance = message.position
+
+    def _quality(self, message: plain.JointState) -> None:
+        motion = self._motion
+        motion.held = bool(len(message.position) and message.position[0])
+        motion.was_held |= motion.held
+
+    def _load(self, data: bytes) -> None:
+        found = read_wrench(data)
+        if found is not UNREADABLE:
+            self._motion.add_load(np.array([found[1]]))
+
+    def _said(self, topic: str, message: plain.Message) -> None:
+        assert self.feed is not None
+        self.feed.part(topic, part_of(message))
+
+    def _diagnostics(self, message: Any) -> None:
+        assert self.feed is not None
+        for status in message.status:
+            name, _, part = status.name.partition(": ")
+            if name == self.name:
+                values = {found.key: found.value for found in status.values}
+                told: Part = (int.from_bytes(status.level, "little"), status.message, values)
+                self.feed.part(part, told)
+
+
+def show_node(
+    namespace: str,
+    name: str,
+    scene: str | None,
+    access: PageAccess,
+    wait_s: float,
+    stopped: Callable[[], bool],
+    on_open: Callable[[Screen], object],
+) -> None:
+    """Show a node until `stopped`; `scene`: its scene where that cannot be read here under the name it has there.
+
+    Raises
+    ------
+    DashboardError
+        The address cannot be used, or there is no such node.
+    SceneError
+        The scene cannot be read.
+    """
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    watch = None
+    try:
+        watch = NodeWatch(namespace, name, wait_s, stopped)
+        parameters = watch.parameters()
+        found = load_scene(scene_path(scene or str(parameters.get("scene", ""))))
+        with Screen(access, facts_of(found, parameters, f"node {watch.name}"), watch.answer) as screen:
+            watch.listen(screen.feed, str(parameters.get("excitation_source", "")))
+            on_open(screen)
+            timer = Timer(1.0 / RATE_HZ, screen.feed.turn)
+            while not (stopped() or screen.has_ended):
+                watch.spin()
+                timer.look()
+    finally:
+        if watch is not None:
+            watch.close()
+        rclpy.utilities.try_shutdown()

@@ -1,0 +1,152 @@
+"""The screen of a recording: while it is written, and afterwards its last hour."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.dashboard.access import PageAccess
+from plow_twin.dashboard.facts import facts_of
+from plow_twin.dashboard.feed import RATE_HZ, Array, Feed, part_of
+from plow_twin.dashboard.screen import Screen
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.record.entries import Batch
+from plow_twin.record.follow import Tail
+from plow_twin.record.header import RunHeader
+from plow_twin.record.outputs import publication_templates
+from plow_twin.record.reader import RunReader
+from plow_twin.record.rows import Rows, rows_by_topic
+from plow_twin.stream.intake import NS_PER_S
+from plow_twin.stream.journal import Hold, Mark, Unused
+from plow_twin.stream.topics import Cadence, names_of
+
+#: The topics whose messages are decoded one by one.
+_SLOW: Final = names_of(Cadence.ESTIMATE, Cadence.CHANGE)
+#: How long the feed waits for room [s]: nothing is live here that it could hold up.
+_WAIT_S: Final = 2e-3
+
+
+class RunFeed:
+    """Hands a recording to a feed, second by second of its stamps.
+
+    Parameters
+    ----------
+    feed
+        The feed.
+    header
+        Of the recording.
+    stopped
+        Whether to hand over no more.
+    """
+
+    def __init__(self, feed: Feed, header: RunHeader, stopped: Callable[[], bool]) -> None:
+        self._feed, self._stopped = feed, stopped
+        self._templates = publication_templates(header.frame_id, header.child_frame_id)
+        self._topics = {header.topic(name): name for name in self._templates}
+        self._slow = {header.topic(name): name for name in _SLOW}
+        self._counts = Counter({"samples_used": 0})
+        self._source = header.excitation_source
+
+    def add(self, batch: Batch) -> None:
+        """Hand over a batch."""
+        rows = rows_by_topic(batch.outputs, self._topics, self._templates)
+        stamps_ns, wrench = batch.entries.samples()
+        held_ns = []
+        for _, entry in sorted(batch.entries.others.items()):
+            if isinstance(entry, Hold):
+                held_ns.append(entry.stamp_ns)
+            elif isinstance(entry, Mark):
+                self._feed.event("mark", entry.text, stamp_ns=entry.stamp_ns)
+            elif isinstance(entry, Unused):
+                lost = "samples_lost" if entry.reason == "lost" else f"dropped_{entry.reason}"
+                self._counts[lost if entry.topic == self._source else f"{entry.topic}_dropped"] += entry.count
+        self._counts["samples_used"] += len(stamps_ns)
+        counted = {name: str(count) for name, count in self._counts.items()}
+        self._feed.part("input", (0, "", {"source": self._source, **counted}))
+        self._say(batch)
+        loads, held = Rows(stamps_ns, stamps_ns, wrench), np.array(held_ns, np.int64)
+        arrays = [loads.stamp_ns, held, *(found.stamp_ns for found in rows.values())]
+        for second in np.unique(np.concatenate(arrays) // NS_PER_S).tolist():
+            self._second({name: _within(found, second) for name, found in rows.items()}, _within(loads, second))
+            self._feed.motion.held = bool((held // NS_PER_S == second).any())
+            self._feed.motion.was_held |= self._feed.motion.held
+            while not (self._feed.send() or self._stopped()):
+                time.sleep(_WAIT_S)
+
+    def _second(self, rows: dict[str, Rows], loads: Rows) -> None:
+        motion = self._feed.motion
+        for found in (loads, *rows.values()):
+            if len(found):
+                motion.stamp_ns = int(found.stamp_ns[-1])
+        newest = {name: found.numbers[-1] for name, found in rows.items() if len(found)}
+        if len(loads):
+            motion.add_load(loads.numbers)
+        if "contact_peaks" in newest:
+            motion.add_peaks(rows["contact_peaks"].numbers[:, 2 * PAIR_COUNT :])
+        if "contact_forces" in newest:
+            motion.penetration, _, motion.force = newest["contact_forces"].reshape(3, PAIR_COUNT)
+        if "head_state" in newest:
+            motion.pose = pose_of(newest["head_state"])
+        motion.clearance = newest.get("clearance", motion.clearance)
+
+    def _say(self, batch: Batch) -> None:
+        for outputs in batch.outputs:
+            for channel in [number for number, (topic, _) in outputs.topics.items() if topic in self._slow]:
+                for index in np.flatnonzero(outputs.messages.channel == channel).tolist():
+                    record = outputs.record(index)
+                    self._feed.part(self._slow[record.topic], part_of(record.message()))
+
+
+def _within(rows: Rows, second: int) -> Rows:
+    chosen: NDArray[np.bool_] = rows.stamp_ns // NS_PER_S == second
+    return Rows(rows.sequence[chosen], rows.stamp_ns[chosen], rows.numbers[chosen])
+
+
+def pose_of(numbers: Array) -> Array:
+    """Return x, y [m], theta [rad] of the numbers of a message on `head_state`."""
+    return np.array([numbers[0], numbers[1], 2.0 * np.arctan2(numbers[2], numbers[3])])
+
+
+def show_run(path: Path, access: PageAccess, stopped: Callable[[], bool], on_open: Callable[[Screen], object]) -> None:
+    """Show a recording until `stopped`: as it is written, or at once what is there.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    access
+        Address and token.
+    stopped
+        Asked again and again.
+    on_open
+        Called with the screen.
+
+    Raises
+    ------
+    RecordingError
+        It is no recording.
+    DashboardError
+        The address cannot be used.
+    """
+    reader = RunReader(path, Tail(stopped))
+    header = reader.header
+    with Screen(access, facts_of(header.scene(reader.path), header.parameters, str(path))) as screen:
+        on_open(screen)
+        run = RunFeed(screen.feed, header, stopped)
+        for batch in reader.batches():
+            if len(batch.entries) or batch.outputs:
+                run.add(batch)
+            else:  # all that is recorded so far
+                screen.feed.turn()
+            if stopped() or screen.has_ended:
+                return
+        screen.feed.event("end", f"recording: {reader.status.value}")
+        while not (stopped() or screen.has_ended):
+            screen.feed.turn()
+            time.sleep(1.0 / RATE_HZ)

@@ -1,0 +1,210 @@
+"""The server of the screen, a process of its own: `python -m plow_twin.dashboard.server LINK SOCKET`.
+
+Each page is sent what it lacks once it has taken what was sent before: a slow page gets fewer updates, a frozen one
+none, and nobody else waits for either.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
+from starlette.routing import Mount, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from plow_twin.dashboard.access import PageAccess
+from plow_twin.dashboard.board import Board
+from plow_twin.dashboard.link import Link
+
+PAGE: Final = Path(__file__).with_name("page")
+#: Most pages at once; a further one is refused.
+MOST_PAGES: Final = 50
+#: How long a page may take for an update, or to name its token, until it is let go [s].
+_PATIENCE_S: Final = 20.0
+#: Longest time without a word to a page, and shortest between two wishes of one [s].
+_WORD_S, _WISH_S = 1.0, 0.2
+#: Longest wish of a page [B], and longest text of a mark.
+_WISH: Final = 4096
+_MARK: Final = 200
+#: How much the server gives way to the twin (`nice`).
+_NICE: Final = 10
+#: Why a page is let go, in numbers of the protocol of WebSockets.
+TOO_MANY, NO_TOKEN, ENDED = 1013, 4401, 1001
+_HEADERS: Final = {
+    "Content-Security-Policy": "default-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+
+
+class Guard:
+    """Refuses requests under names that are not the screen's own, and those of pages of others."""
+
+    def __init__(self, app: ASGIApp, access: PageAccess) -> None:
+        self._app, self._access = app, access
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        own = self._access.answers_to(host) and self._access.is_own(headers.get("origin"), host)
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_HEADERS)
+            await send(message)
+
+        if own:
+            await self._app(scope, receive, send_with_headers)
+        elif scope["type"] == "websocket":
+            await send({"type": "websocket.close", "code": NO_TOKEN})
+        else:
+            text = "the screen is not offered under this name, or to this page"
+            await PlainTextResponse(text, 403)(scope, receive, send_with_headers)
+
+
+class Pages:
+    """The pages that look at a board.
+
+    Parameters
+    ----------
+    board
+        What they look at.
+    link
+        Where their wishes go.
+    access
+        Who may look.
+    """
+
+    def __init__(self, board: Board, link: Link, access: PageAccess) -> None:
+        self._board, self._link, self._access = board, link, access
+
+    async def page(self, socket: WebSocket) -> None:
+        """Serve one page until it goes."""
+        await socket.accept()
+        if self._board.pages >= MOST_PAGES:
+            await socket.close(TOO_MANY, f"{MOST_PAGES} pages are open")
+            return
+        self._board.pages += 1
+        try:
+            if self._access.token and not await self._is_admitted(socket):
+                await socket.close(NO_TOKEN, "a token is needed")
+                return
+            await self._serve(socket)
+        except (WebSocketDisconnect, TimeoutError, RuntimeError):
+            return  # it has gone, or takes nothing any more
+        finally:
+            self._board.pages -= 1
+
+    async def _is_admitted(self, socket: WebSocket) -> bool:
+        """Ask for the token; a wrong one costs a second."""
+        wish = await asyncio.wait_for(_wish(socket), _PATIENCE_S)
+        if self._access.admits(wish.get("token")):
+            return True
+        await asyncio.sleep(1.0)
+        return False
+
+    async def _serve(self, socket: WebSocket) -> None:
+        tasks = [asyncio.ensure_future(work) for work in (self._tell(socket), self._listen(socket))]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _tell(self, socket: WebSocket) -> None:
+        """Send what the page lacks, again and again; what it was too slow for is counted."""
+        board, version, skipped = self._board, 0, 0
+        while not self._link.broken:
+            news = board.news
+            if board.version == version:
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(news.wait(), _WORD_S)
+            skipped += max(0, board.version - version - 1) if version else 0
+            message = {**board.since(version), "skipped": skipped}
+            version = board.version
+            await asyncio.wait_for(socket.send_text(json.dumps(message, separators=(",", ":"))), _PATIENCE_S)
+        await socket.close(ENDED, "the twin has ended")
+
+    async def _listen(self, socket: WebSocket) -> None:
+        """Pass on what the page wishes."""
+        while True:
+            wish = await _wish(socket)
+            if wish.get("do") in ("acknowledge", "mark"):
+                self._link.send({"do": wish["do"], "text": str(wish.get("text", "")).strip()[:_MARK]})
+                await asyncio.sleep(_WISH_S)
+
+
+async def _wish(socket: WebSocket) -> dict[str, Any]:
+    """Return the next wish of a page; one that cannot be read is none."""
+    try:
+        found = json.loads(await socket.receive_text())
+    except (ValueError, KeyError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def application(board: Board, link: Link, access: PageAccess) -> ASGIApp:
+    """Return the application: the files of the page, and its data."""
+    pages = Pages(board, link, access)
+    routes = [WebSocketRoute("/data", pages.page), Mount("/", StaticFiles(directory=PAGE, html=True))]
+    return Guard(Starlette(routes=routes), access)
+
+
+async def serve(link: Link, listening: socket.socket, access: PageAccess) -> None:
+    """Serve until the other end of the link is closed."""
+    board = Board()
+    config = uvicorn.Config(
+        application(board, link, access),
+        lifespan="off",
+        log_level="error",
+        access_log=False,
+        ws_max_size=_WISH,
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=1,
+    )
+    server = uvicorn.Server(config)
+
+    def take() -> None:
+        while (update := link.receive()) is not None:
+            board.take(update)
+        if link.broken:
+            asyncio.get_running_loop().remove_reader(link.fileno())
+            board.tell()
+            server.should_exit = True
+
+    asyncio.get_running_loop().add_reader(link.fileno(), take)
+    await server.serve(sockets=[listening])
+
+
+def main() -> None:
+    """Run the server on the two descriptors given; the first message names the address and the token."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(_NICE)
+    end, listening = (socket.socket(fileno=int(number)) for number in sys.argv[1:3])
+    access = PageAccess(**json.loads(end.recv(_WISH)))
+    asyncio.run(serve(Link(end), listening, access))
+
+
+if __name__ == "__main__":
+    main()

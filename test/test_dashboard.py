@@ -1,0 +1,385 @@
+"""The operator's screen: what it shows is the twin's, and whatever its readers do, the twin does not notice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import browser
+import numpy as np
+import pytest
+from commands import plow_twin_here, started
+from record_support import PAPER_AMPLITUDE
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from plow_twin.dashboard.access import PageAccess
+from plow_twin.dashboard.feed import Feed
+from plow_twin.dashboard.history import SPAN_S, History
+from plow_twin.dashboard.link import Link, pair
+from plow_twin.dashboard.screen import Screen
+from plow_twin.record.entries import EntryRecord
+from plow_twin.record.reader import RunReader
+from plow_twin.record.recording import read_recording
+from plow_twin.record.replay import replay
+from plow_twin.scene_file import dump_scene, load_scene
+from plow_twin.solve.state import ROW
+from plow_twin.stream.journal import Digest, Mark, Parameter
+from plow_twin.stream.outputs import NOTHING, Published
+
+TOKEN = "a token of the screen"
+FACTS: dict[str, Any] = {"scene": "paper", "pads": [], "thresholds": {}}
+
+
+def _published(second: float, peak: float, load: float = 0.0) -> Published:
+    rows = np.zeros(1, ROW)
+    rows["stamp_ns"], rows["peak"], rows["samples"] = round(second * 1e9), peak, 1
+    return Published(rows, NOTHING.slow)
+
+
+def test_a_feed_that_nobody_reads_waits_for_nothing_and_keeps_the_peaks() -> None:
+    link, theirs = pair()
+    feed = Feed(link, FACTS)
+    for index in range(2000):
+        feed.publication(_published(1.0 + 1e-3 * index, 7e5 if index == 900 else 10.0))
+        feed.part("state", (0, "x" * 10_000, {}))
+        feed.turn()
+    assert feed.not_taken > 0 and feed.taken + feed.not_taken == 2000
+    with theirs:
+        far, updates = Link(theirs), []
+        while (update := far.receive()) is not None:
+            updates.append(update)
+        feed.turn()
+        updates.append(far.receive() or {})
+        # the first has the facts; what was not taken, and its largest force, is in the first one after there is room
+        assert updates[0]["facts"]["can_ask"] is False and len(updates) == feed.taken
+        assert max(update["motion"]["peak"][0] for update in updates) == 7e5
+        assert updates[-1]["not_taken"] == feed.not_taken and updates[-1]["motion"]["t"] == pytest.approx(2.999)
+    feed.turn()
+    assert link.broken
+    link.close()
+
+
+def test_the_hour_is_bounded_has_each_second_once_and_begins_anew_where_stamps_step_back() -> None:
+    history = History()
+    motion = {"load_low": [0, -1, None], "load_high": [0, 1, None], "was_held": False}
+    for version in range(1, 2 * SPAN_S + 1):
+        for peak in (5.0, 9.0, 2.0):
+            stepped_back = history.add({**motion, "t": 100.0 + version, "peak": [peak] * 8}, 3 * version)
+            assert not stepped_back
+    seconds = history.since(0)
+    assert len(seconds) == SPAN_S and seconds[-1][:2] == [100 + 2 * SPAN_S, 9.0]
+    assert history.since(6 * SPAN_S) == [] and len(history.since(6 * SPAN_S - 4)) == 2
+    assert history.add({**motion, "t": 50.0, "peak": [1.0] * 8}, 10**6)
+    assert [row[0] for row in history.since(0)] == [50]
+
+
+@pytest.mark.parametrize(
+    ("listen", "token", "expected"),
+    [
+        ("127.0.0.1", "", "HOST:PORT"),
+        ("127.0.0.1:x", "", "HOST:PORT"),
+        ("me@127.0.0.1:1", "", "HOST:PORT"),
+        ("0.0.0.0:0", "", "127.0.0.1, or a token"),
+        ("127.0.0.1:0", "short", "at least 16"),
+        ("192.0.2.1:0", TOKEN, "a free address of this machine"),
+    ],
+)
+def test_an_address_that_cannot_be_offered_is_refused(
+    listen: str, token: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n0,1,2,3\n0.001,1,2,3\n")
+    (tmp_path / "token").write_text(token + "\n")
+    given = ("--dashboard", "--listen", listen, *(("--token-file", tmp_path / "token") if token else ()))
+    done = plow_twin_here("live", tmp_path / "load.csv", "--scene", "paper", "--quiet", *given)
+    assert done.returncode == 2 and expected in done.stderr and (not token or token not in done.stderr)
+
+
+def test_names_that_others_may_own_are_not_answered_to() -> None:
+    here, beyond = PageAccess("127.0.0.1", 8070), PageAccess("0.0.0.0", 8070, TOKEN)
+    assert all(here.answers_to(name) for name in ("localhost:8070", "127.0.0.1:8070", "[::1]:8070"))
+    assert not any(here.answers_to(name) for name in ("evil.example:8070", "192.168.1.5:8070", "", "["))
+    assert beyond.answers_to("192.168.1.5:8070") and beyond.answers_to(socket.gethostname())
+    assert not beyond.answers_to("evil.example:8070")
+    assert here.is_own("http://localhost:8070", "localhost:8070") and here.is_own(None, "localhost:8070")
+    assert not here.is_own("http://localhost:9000", "localhost:8070") and not here.is_own("null", "localhost:8070")
+
+
+def _data(url: str, **options: Any) -> ClientConnection:
+    return connect(f"{url.replace('http', 'ws')}data", max_size=None, close_timeout=0.1, **options)
+
+
+def _status(url: str, **headers: str) -> int:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code
+
+
+def test_who_has_no_token_comes_from_another_page_or_asks_for_another_name_sees_nothing() -> None:
+    with Screen(PageAccess("127.0.0.1", 0, TOKEN), FACTS) as screen:
+        screen.feed.turn()
+        url = screen.url
+        assert _status(url) == 200 and _status(url + "screen.js") == 200
+        assert _status(url + "../server.py") == _status(url + "%2e%2e/server.py") == 404
+        assert _status(url, Host="evil.example") == _status(url, Origin="http://evil.example") == 403
+        with pytest.raises(InvalidStatus, match="403"):
+            _data(url, origin="http://evil.example")
+        for given in ({"token": TOKEN[:-1]}, {"token": ["x"]}, {}, []):
+            with _data(url) as page, pytest.raises(ConnectionClosed) as closed:
+                page.send(json.dumps(given))
+                page.recv(timeout=10)
+            assert closed.value.rcvd is not None and closed.value.rcvd.code == 4401
+        with _data(url, origin=url.rstrip("/")) as page:
+            page.send(json.dumps({"token": TOKEN}))
+            assert json.loads(page.recv(timeout=10))["facts"]["scene"] == "paper"
+        told = (
+            Path(f"/proc/{screen.process.pid}/cmdline").read_bytes()
+            + Path(f"/proc/{screen.process.pid}/environ").read_bytes()
+        )
+        assert TOKEN.encode() not in told
+    assert screen.process.returncode == 0
+
+
+def _memory_kb(pid: int) -> int:
+    text = Path(f"/proc/{pid}/status").read_text()
+    return int(next(line for line in text.splitlines() if line.startswith("VmRSS")).split()[1])
+
+
+def test_a_frozen_page_costs_no_memory_keeps_nobody_waiting_and_gets_the_newest_when_it_reads_again() -> None:
+    with (
+        Screen(PageAccess("127.0.0.1", 0), FACTS) as screen,
+        socket.create_connection(("127.0.0.1", int(screen.url.rstrip("/").rpartition(":")[2]))) as raw,
+    ):
+        raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        with _data(screen.url, sock=raw, ping_interval=None, max_queue=1) as frozen, _data(screen.url) as page:
+            assert "version" in json.loads(page.recv())
+            before, text = _memory_kb(screen.process.pid), "x" * 900
+            for index in range(600):  # 6 MB
+                screen.feed.publication(_published(1.0 + index, float(index)))
+                screen.feed.part("state", (0, str(index), {str(number): text for number in range(10)}))
+                while not screen.feed.send():
+                    time.sleep(2e-3)
+                if index % 20 == 0:
+                    page.recv(timeout=30)
+            newest = json.loads(page.recv(timeout=30))
+            while newest.get("motion", {}).get("t", 0) < 600.0:
+                newest = json.loads(page.recv(timeout=30))
+            assert _memory_kb(screen.process.pid) - before < 5_000
+            told = json.loads(frozen.recv(timeout=30))
+            while told.get("motion", {}).get("t", 0) < 600.0:
+                told = json.loads(frozen.recv(timeout=30))
+            assert told["skipped"] > 20 and told["seconds"][-1][1] == 599.0
+
+
+def _row(index: int) -> str:
+    phase = float(np.sin(2e-3 * index))
+    return ",".join([repr(1e-3 * index), *(repr(phase * amplitude) for amplitude in PAPER_AMPLITUDE)]) + "\n"
+
+
+COUNT = 6000
+#: An alarm that the load raises; silence is not held, for the samples bring their own time.
+OPTIONS = ("--scene", "paper", "--set", "excitation_timeout=3600", "--set", "alarm_force=[1.5e5,1e9]", "--json")
+
+
+@contextmanager
+def _twin(*options: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Start a twin with its screen on standard input."""
+    command = [sys.executable, "-m", "plow_twin", "live", "-", *OPTIONS, "--dashboard", "--listen", "127.0.0.1:0"]
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    with started([*command, *map(str, options)], **pipes) as process:
+        assert process.stdin is not None
+        process.stdin.write("t,fx,fy,m\n")
+        process.stdin.flush()
+        yield process, _said(process, "screen: ").split()[1]
+
+
+def _said(process: subprocess.Popen[str], begin: str) -> str:
+    """Return the line on standard error that begins so."""
+    assert process.stderr is not None
+    while line := process.stderr.readline():
+        if line.startswith(begin):
+            return line
+    raise AssertionError(f"not said: {begin}")
+
+
+def _feed(process: subprocess.Popen[str], begin: int = 0, end: int = COUNT) -> None:
+    """Send samples at three times their rate."""
+    assert process.stdin is not None
+    for first in range(begin, end, 60):
+        process.stdin.write("".join(map(_row, range(first, min(first + 60, end)))))
+        process.stdin.flush()
+        time.sleep(0.02)
+
+
+def _stopped(process: subprocess.Popen[str]) -> dict[str, Any]:
+    """End the input and the twin; return its diagnostics, and what it said meanwhile."""
+    assert process.stdin is not None
+    process.stdin.close()
+    process.stdin = None
+    _said(process, "the input has ended")
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    found: dict[str, Any] = json.loads(out)
+    return found
+
+
+def _digests(run: Path) -> list[Digest]:
+    entries = (record.entry for record in RunReader(run) if isinstance(record, EntryRecord))
+    return [entry for entry in entries if isinstance(entry, Digest)]
+
+
+def test_ten_readers_a_frozen_a_killed_page_and_a_frozen_server_change_nothing_of_the_twin(tmp_path: Path) -> None:
+    (tmp_path / "load.csv").write_text("t,fx,fy,m\n" + "".join(map(_row, range(COUNT))))
+    done = plow_twin_here("live", tmp_path / "load.csv", *OPTIONS, "--record", tmp_path / "alone")
+    with _twin("--record", tmp_path / "watched") as (process, url), ExitStack() as pages:
+        _feed(process, 0, 60)
+        open_pages = [pages.enter_context(_data(url, ping_interval=None, max_queue=1)) for _ in range(12)]
+        killed, *_, last = open_pages
+        killed.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        killed.socket.close()
+        _feed(process, 60, COUNT // 2)
+        assert json.loads(last.recv())["motion"]["t"] >= 0.0
+        server = int(next(Path(f"/proc/{process.pid}/task").glob("*/children")).read_text().split()[0])
+        os.kill(server, signal.SIGSTOP)
+        _feed(process, COUNT // 2)
+        os.kill(server, signal.SIGCONT)
+        told = _stopped(process)
+    alone = json.loads(done.stdout)
+    assert told["input"]["samples_used"] == alone["input"]["samples_used"] == str(COUNT)
+    assert _digests(tmp_path / "watched") == _digests(tmp_path / "alone") != []
+    assert not told["recorder"]["lost"] and not Path(f"/proc/{server}").exists()
+
+
+def test_an_operator_acknowledges_and_marks_and_the_journal_has_both(tmp_path: Path) -> None:
+    with _twin("--record", tmp_path / "run") as (process, url), _data(url) as page:
+        _feed(process)
+        told: dict[str, Any] = {}
+        events: list[dict[str, Any]] = []
+
+        def see(reached: Callable[[], bool]) -> None:
+            while not reached():
+                message = json.loads(page.recv(timeout=30))
+                events.extend(message.get("events", ()))
+                told.update({name: part[2] for name, part in message.get("parts", {}).items()})
+                told.update({key: message[key] for key in ("motion", "seconds") if message.get(key)})
+
+        see(lambda: told.get("motion", {}).get("t", 0) >= 0.999e-3 * COUNT)
+        assert told["alarms"]["force_latched"] == "warn" and told["motion"]["clearance"]["horizontal"] > 0.02
+        page.send("no JSON")
+        page.send(json.dumps({"do": "reset"}))  # not a wish of the page
+        page.send(json.dumps({"do": "mark", "text": "<b>shift</b> " + "x" * 1000}))
+        page.send(json.dumps({"do": "acknowledge"}))
+        see(lambda: len(events) >= 2)
+        assert [event["kind"] for event in events] == ["mark", "acknowledge"] and all(event["done"] for event in events)
+        _stopped(process)
+    largest = max(max(row[1:9]) for row in told["seconds"])
+    assert largest > 1e5
+    entries = [record.entry for record in RunReader(tmp_path / "run") if isinstance(record, EntryRecord)]
+    marks = [entry.text for entry in entries if isinstance(entry, Mark) and not entry.text.startswith("alarm")]
+    assert marks == [("<b>shift</b> " + "x" * 1000)[:200]]
+    assert [entry.name for entry in entries if isinstance(entry, Parameter)] == ["alarms_acknowledged"]
+    assert replay(tmp_path / "run").exit_code == 0
+
+
+def test_a_killed_server_is_said_once_and_the_twin_goes_on(tmp_path: Path) -> None:
+    with _twin() as (process, _):
+        _feed(process, 0, 600)
+        server = int(next(Path(f"/proc/{process.pid}/task").glob("*/children")).read_text().split()[0])
+        os.kill(server, signal.SIGKILL)
+        _said(process, "plow-twin: the server of the screen has ended")
+        _feed(process, 600)
+        assert process.stdin is not None
+        process.stdin.close()
+        process.stdin = None
+        out, err = process.communicate(timeout=60)  # nothing is left to stay for
+    assert process.returncode == 0 and json.loads(out)["input"]["samples_used"] == str(COUNT)
+    assert "server of the screen" not in err
+
+
+def test_a_recording_is_shown_while_it_is_written_and_afterwards_and_nothing_can_be_asked_of_it(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "plow_twin", "dashboard", str(tmp_path / "run"), "--listen", "127.0.0.1:0"]
+    with _twin("--record", tmp_path / "run") as (process, _):
+        _feed(process, 0, 600)
+        with started(command, stderr=subprocess.PIPE) as shown, _data(_said(shown, "screen: ").split()[1]) as page:
+            seconds: dict[int, list[Any]] = {}
+            told: dict[str, Any] = {}
+
+            def see(reached: Callable[[], bool]) -> None:
+                while not reached():
+                    message = json.loads(page.recv(timeout=30))
+                    seconds.update({row[0]: row for row in message.get("seconds", ())})
+                    told.update({key: message[key] for key in ("facts", "motion", "events") if message.get(key)})
+                    told.update(message.get("parts", {}))
+
+            see(lambda: bool(seconds))
+            _feed(process, 600)
+            _stopped(process)
+            see(lambda: any("recording: complete" in event["text"] for event in told.get("events", ())))
+            shown.send_signal(signal.SIGINT)
+            assert shown.wait(20) == 0
+    _, peaks = read_recording(tmp_path / "run")["contact_peaks"].numpy()
+    assert told["facts"]["can_ask"] is False and told["input"][2]["samples_used"] == str(COUNT)
+    assert told["alarms"][2]["force_place"] and told["motion"]["clearance"]["vertical"] == pytest.approx(0.03)
+    assert max(max(row[1:9]) for row in seconds.values()) == pytest.approx(peaks[:, 16:].max(), rel=1e-6)
+
+
+#: What the page says, read by its own means.
+_SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').length,
+    colors: [...document.querySelectorAll('#section rect.pad')].map((pad) => pad.getAttribute('fill')),
+    alarms: document.getElementById('alarms').innerText, clearance: document.getElementById('clearance').innerText,
+    inputs: document.getElementById('inputs').innerText, load: document.getElementById('load').innerText,
+    source: document.getElementById('source').innerText, events: document.getElementById('events').innerText,
+    banner: document.getElementById('banner').innerText, charts: document.querySelectorAll('#charts canvas').length,
+    seconds: screenState.seconds.length, fooled: Boolean(window.fooled)})"""
+
+
+@pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
+def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_elsewhere(tmp_path: Path) -> None:
+    name = "<img src=x onerror='window.fooled=1'>"
+    scene = tmp_path / f"{name.replace('/', '')}.yaml"
+    scene.write_text(dump_scene(load_scene("paper")))
+    given = ("--scene", scene, "--set", f"hardware_id={name}", "--token-file", tmp_path / "token")
+    (tmp_path / "token").write_text(TOKEN + "\n")
+    with _twin(*given) as (process, said), ExitStack() as opened:
+        url = said.partition("#")[0]
+        page = opened.enter_context(browser.page(tmp_path / "browser", f"{url}#token={TOKEN.replace(' ', '%20')}"))
+
+        def seen(reached: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+            give_up = time.monotonic() + 60.0
+            while not reached(found := json.loads(page.evaluate(_SEEN))):
+                assert time.monotonic() < give_up, (found, page.errors)
+                time.sleep(0.2)
+            return found
+
+        seen(lambda found: not found["banner"])
+        _feed(process)
+        found = seen(lambda found: "6000" in found["inputs"] and "was warn" in found["alarms"])
+        assert found["pads"] == 8 and found["charts"] == 3 and len(set(found["colors"])) > 1
+        assert "25.000 mm" in found["clearance"] and "assumed" in found["clearance"]
+        assert found["seconds"] >= 6 and "kN m" in found["load"] and name in found["source"]
+        page.evaluate("document.getElementById('mark-text').value = \"<img src=x onerror='window.fooled=1'>\"")
+        page.evaluate("document.querySelector('#mark button').click()")
+        page.evaluate("document.getElementById('acknowledge').click()")
+        found = seen(lambda found: "acknowledge" in found["events"] and "was" not in found["alarms"])
+        assert name in found["events"] and not found["fooled"]
+        assert page.evaluate("location.hash + location.search") == ""
+        _stopped(process)
+        seen(lambda found: "ended" in found["banner"] or "lost" in found["banner"])
+        assert not page.errors and {urlsplit(asked).netloc for asked in page.requests} == {urlsplit(url).netloc}
