@@ -44,7 +44,7 @@ def pinned() -> dict[str, Any]:
     figures: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if path != own:
         for case in figures.values():
-            del case["digest"]
+            case.pop("digest", None)
     return figures
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scenes import preset
+from test_solve_rest import fallen
 
 from plow_twin import Friction, Head, Scene, Twin, TwinBatch, Wear
 from plow_twin.model.loads import compile_loads
@@ -33,9 +34,23 @@ def samples(count: int) -> np.ndarray:
     return wrench * np.linspace(0.8, 1.2, count)[:, None, None]
 
 
+def in_lanes() -> dict[str, list[Scene]]:
+    """Return scenes that go eight to a vector, by the form of their law."""
+    laws = {
+        "C d'": {},
+        "lambda d'": {"law": "hunt_crossley", "damping": 0.7},
+        "D / v0": {"law": "exact_restitution", "damping": None, "restitution": 0.4},
+    }
+    return {
+        name: [dataclasses.replace(one, contact=dataclasses.replace(one.contact, **law)) for one in members()]
+        for name, law in laws.items()
+    }
+
+
 @pytest.mark.parametrize("workers", [1, 2])
-def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
-    scenes = members()
+def test_a_member_beside_the_lanes_is_its_single_run_bit_for_bit(workers: int) -> None:
+    hard = dataclasses.replace(preset("bench_hc").contact, stiffness=3e8)
+    scenes = [dataclasses.replace(one, contact=hard) for one in members()]
     wrench = samples(len(scenes))
     together = TwinBatch(scenes, tol=1e-7, workers=workers).advance_samples(TIMES, wrench)
     assert len(together) == len(scenes)
@@ -44,6 +59,37 @@ def test_each_member_is_its_single_run_bit_for_bit(workers: int) -> None:
         for name in FIELDS:
             assert np.array_equal(getattr(together[index], name), getattr(alone, name)), (index, name)
     assert together.makes.sum() > 0
+
+
+@pytest.mark.parametrize("law", in_lanes())
+def test_a_member_in_lanes_has_its_own_bits_and_the_motion_of_a_twin(law: str) -> None:
+    scenes = in_lanes()[law]
+    # a pause, a jump and samples that come often: series of few orders and of all
+    times = np.concatenate([TIMES[:250], TIMES[250:] + 0.2, [0.7, 0.7]])
+    wrench = np.concatenate([samples(len(scenes)), samples(len(scenes))[:, :2]], axis=1)
+    together = TwinBatch(scenes, tol=1e-9).advance_samples(times, wrench)
+    shared = TwinBatch(scenes[::-1], tol=1e-9, workers=2).advance_samples(times, wrench[::-1])
+    for index, scene in enumerate(scenes):
+        alone = TwinBatch([scene], tol=1e-9).advance_samples(times, wrench[index])
+        twin = Twin(scene, tol=1e-9, excitation="sampled").advance_samples(times, wrench[index])
+        for name in FIELDS:
+            assert np.array_equal(getattr(together[index], name), getattr(alone[0], name)), (index, name)
+            assert np.array_equal(getattr(together[index], name), getattr(shared[-1 - index], name)), (index, name)
+        assert np.array_equal(together[index].makes, twin.makes) and not together.status[index].any()
+        for name in ("q", "v", "penetration", "rate", "force", "peak", "impulse"):
+            found, expected = getattr(together[index], name), getattr(twin, name)
+            assert np.abs(found - expected).max() < 1e-7 * max(np.abs(expected).max(), 1e-3), (index, name)
+    assert together.makes.sum() > 0 and together.steps.sum() > 1.05 * together.steps.size
+
+
+def test_a_twin_at_rest_costs_next_to_nothing() -> None:
+    scene = fallen()
+    twins, twin = TwinBatch([scene] * 3), Twin(scene, excitation="sampled")
+    for t in (600.0, 3600.0):
+        row, alone = twins.advance(t), twin.advance(t)
+        assert row.status.tolist() == [[0]] * 3 and row.steps.max() <= alone.steps
+        assert np.abs(row.q[1, 0] - alone.q).max() < 1e-9 and np.array_equal(row.force[0], row.force[2])
+    assert row.steps.max() < 40  # a step is no longer than 100 s
 
 
 def test_one_sample_a_call_a_pause_and_a_restored_snapshot_change_no_bit() -> None:

@@ -6,6 +6,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -15,10 +16,12 @@ from plow_twin.errors import ArgumentError, LimitError, RunInterrupted
 from plow_twin.model import geometry
 from plow_twin.model.scene import Scene, check_travel_speed
 from plow_twin.run.advance import AdvanceBatch, check_times
+from plow_twin.run.lane_twins import LaneTwins
 from plow_twin.run.pace import MOST_SECONDS, OutOfTimeError, Pace, check_limits
 from plow_twin.run.twin import DEFAULT_BUDGET, read_snapshot
 from plow_twin.solve import loop
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene, inertias, wear_rate
+from plow_twin.solve.lanes.record import fits_lanes
 from plow_twin.solve.method.implicit import new_implicit
 from plow_twin.solve.modes import settle_moved
 from plow_twin.solve.state import ROW, SEGMENT, TOTALS, WORK, Parts, Terms, new_records, new_work, state_type
@@ -59,7 +62,9 @@ class TwinBatch:
     Notes
     -----
     At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: all twins stand as before the call.
-    Each member has the bits of a `Twin` of its own, where that has the same terms; else it agrees to the tolerance.
+    Where every contact has exponent 1 and no scene has wear, friction, support, locks, an offset centre of mass or
+    overdamped contact, twins advance eight to a SIMD vector: each has the same bits alone and in any batch, and those
+    of a `Twin` to the tolerance. Other members have the bits of a `Twin` with the same terms.
     """
 
     def __init__(
@@ -87,10 +92,12 @@ class TwinBatch:
         self._wrench = np.zeros((len(scenes), 3))
         self._masses = np.array([inertias(scene) for scene in scenes])[:, None]
         self._max_steps, self._max_wall_s = max_steps, max_wall_s
-        self._workers = [
-            _Worker.of(terms, self._compiled, max_wall_s) for _ in range(max(1, min(workers, os.cpu_count() or 1)))
-        ]
+        count = max(1, min(workers, os.cpu_count() or 1, len(scenes)))
+        self._workers = [_Worker.of(terms, self._compiled, max_wall_s) for _ in range(count)]
         self._edges = [len(scenes) * index // len(self._workers) for index in range(len(self._workers) + 1)]
+        if all(fits_lanes(one, sampled=True) for one in self._compiled):
+            spans = [range(*span) for span in pairwise(self._edges)]
+            self._workers = [one.with_lanes(self, terms, span) for one, span in zip(self._workers, spans, strict=True)]
         self._pool = ThreadPoolExecutor(len(self._workers)) if len(self._workers) > 1 else None
         self.reset(start)
 
@@ -163,7 +170,7 @@ class TwinBatch:
         ArgumentError
             For a time before the present one, or anything that is not finite; nothing has changed then.
         """
-        times, samples = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
+        times, samples = np.ascontiguousarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
         check_times(self.time, times)
         shape = (len(self), len(times), 3)
         if samples.shape not in (shape, shape[1:]) or not np.isfinite(samples).all():
@@ -295,14 +302,23 @@ class TwinBatch:
 
     def _run(self, times: NDArray[np.float64], ends: NDArray[np.float64], rows: NDArray[np.void]) -> None:
         def run(index: int) -> None:
-            worker = self._workers[index]
-            worker.pace.run(loop.advance_rows, (
-                self._params, worker.parts, self._states, worker.pace.saved, worker.work, worker.totals,
-                *self._edges[index : index + 2], times, ends, self._max_steps, rows, _NO_MARKS, self._states[:0], None,
-                worker.pace.record,
-            ))  # fmt: skip
+            worker, (first, last) = self._workers[index], self._edges[index : index + 2]
+            if worker.lanes is None:
+                worker.advance(self._params, self._states, first, last, times, ends, self._max_steps, rows)
+                return
 
-        before, begun = self._states.copy(), []
+            def alone(member: int, i: int) -> None:
+                one, row = slice(member, member + 1), np.zeros((1, 1), ROW)
+                line = np.ascontiguousarray(ends[one, i : i + 2])
+                records = self._params[one], self._states[one]
+                worker.advance(*records, 0, 1, times[i : i + 1], line, self._max_steps, row)
+                rows[member, i] = row[0, 0]
+
+            worker.lanes.advance(times, ends, rows, worker.pace, alone)
+
+        # as bytes: numpy copies a record field by field
+        states, begun = self._states.view(np.uint8), list[Future[None]]()
+        before = states.copy()
         try:
             if self._pool is None:
                 run(0)
@@ -312,7 +328,7 @@ class TwinBatch:
                     one.result()
         except (OutOfTimeError, KeyboardInterrupt) as stop:
             self._stop(begun)
-            self._states[...] = before
+            states[...] = before
             late = isinstance(stop, OutOfTimeError)
             what = f"max_wall_s = {self._max_wall_s:g} reached" if late else "interrupted"
             message = f"{what} in advances from t = {self.time:.9g} s to {float(times[-1]):.9g} s of {len(self)} twins"
@@ -327,6 +343,8 @@ class TwinBatch:
             worker.pace.stopped = False
             for name in ("peak", "impulse", "time_in_contact", "makes"):
                 worker.totals[name] = 0
+            if worker.lanes is not None:
+                worker.lanes.clear()
 
 
 class _Worker(NamedTuple):
@@ -336,6 +354,7 @@ class _Worker(NamedTuple):
     work: NDArray[np.void]
     totals: NDArray[np.void]
     pace: Pace
+    lanes: LaneTwins | None
 
     @staticmethod
     def of(terms: Terms, compiled: Sequence[CompiledScene], max_wall_s: float) -> _Worker:
@@ -343,7 +362,22 @@ class _Worker(NamedTuple):
         parts = Parts(terms, None, np.zeros(1, SEGMENT), new_implicit(terms.support is not None) if stiff else None)
         work = new_records(WORK, 1)
         work[0] = new_work()
-        return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s))
+        return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s), None)
+
+    def with_lanes(self, batch: TwinBatch, terms: Terms, members: range) -> _Worker:
+        """Return the same with lanes for some twins."""
+        found = LaneTwins(batch._params, batch._states, terms, members, self.work, batch._max_steps)
+        return self._replace(lanes=found)
+
+    def advance(
+        self, params: NDArray[np.void], states: NDArray[np.void], first: int, last: int, times: _Array, ends: _Array,
+        max_steps: int, rows: NDArray[np.void],
+    ) -> None:  # fmt: skip
+        """Advance twins `first` to `last` - 1 through all samples in the loop of a single scene."""
+        self.pace.run(loop.advance_rows, (
+            params, self.parts, states, self.pace.saved, self.work, self.totals, first, last, times, ends, max_steps,
+            rows, _NO_MARKS, states[:0], None, self.pace.record,
+        ))  # fmt: skip
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:

@@ -14,7 +14,7 @@ from plow_twin.solve.compiled_scene import CompiledScene
 from plow_twin.solve.lanes.loop import OTHER_METHOD, Members, run_lanes
 from plow_twin.solve.lanes.record import new_lanes
 from plow_twin.solve.modes import settle_many
-from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, new_records
+from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, first_of, new_records
 
 #: Steps that each lane takes in the first slice.
 _FIRST_SLICE: Final = 256
@@ -74,7 +74,8 @@ class LaneRun:
         terms = one.parts.terms
         run_lanes(
             self._members, terms.harmonics, terms.second, terms.viscous, terms.hysteretic, terms.flight, terms.rest,
-            int(one.params.order), new_lanes(), work, waiting, self._t_end, self._max_steps, self._size, self._times,
+            int(one.params.order), first_of(new_lanes()), work, waiting, self._t_end, self._max_steps, self._size,
+            self._times,
         )  # fmt: skip
         self._size = next_slice(self._size, _time.perf_counter() - begin)
         for index in waiting[self.status[waiting] == OTHER_METHOD].tolist():

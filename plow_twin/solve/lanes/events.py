@@ -163,9 +163,14 @@ def _leaves(lanes, pair, order):
 
 
 @kernel()
-def _take_column(lanes, lane, guard, order) -> None:
-    """Write one guard of a lane to its column, and how far it is searched to `lanes.reach`."""
+def _take_column(lanes, lane, guard, order, full) -> None:
+    """Write one guard of a lane to its column, and how far it is searched to `lanes.reach`.
+
+    A column has `full` orders whatever the series have: Bernstein coefficients depend on it.
+    """
     lanes.guarded[lane] = guard
+    for k in range(order + 1, full + 1):
+        lanes.column[k, lane] = 0.0
     if guard < AGAIN:
         lanes.reach[lane] = lanes.step[lane]
         for k in range(order + 1):
@@ -184,7 +189,7 @@ def _take_column(lanes, lane, guard, order) -> None:
 
 
 @kernel()
-def _next_columns(lanes, order) -> int:
+def _next_columns(lanes, order, full) -> int:
     """Take the next guard of each lane that has one; return a bit for each such lane."""
     bits = 0
     for lane in range(WIDTH):
@@ -195,7 +200,7 @@ def _next_columns(lanes, order) -> int:
         while lanes.todo[lane] >> guard & 1 == 0:
             guard += 1
         lanes.todo[lane] &= ~(1 << guard)
-        _take_column(lanes, lane, guard, order)
+        _take_column(lanes, lane, guard, order, full)
         bits |= 1 << lane
     return bits
 
@@ -280,8 +285,11 @@ def _note_root(lanes, lane, root) -> None:
 
 
 @kernel()
-def first_events(states, lanes, w, order, viscous, hysteretic) -> None:
-    """Let each lane's step end at its first event; note the guard in `lanes.event`, -1 without one."""
+def first_events(states, lanes, w, order, full, viscous, hysteretic) -> None:
+    """Let each lane's step end at its first event; note the guard in `lanes.event`, -1 without one.
+
+    `order` is that of the series, `full` the one that they may have.
+    """
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
         set_row(lanes.parted, pair, never)
@@ -289,24 +297,24 @@ def first_events(states, lanes, w, order, viscous, hysteretic) -> None:
         lanes.event[lane] = -1
     _write_guards(lanes, order, viscous, hysteretic)
     while True:
-        bits = _next_columns(lanes, order)
+        bits = _next_columns(lanes, order, full)
         if bits == 0:
             return
         # an event found before may be sooner
-        bits &= _unsafe(lanes.column, order, lanes.reach)
+        bits &= _unsafe(lanes.column, full, lanes.reach)
         if bits == 0:
             continue
-        single, several = _isolate(lanes, w, order, bits)
+        single, several = _isolate(lanes, w, full, bits)
         if single != 0:
-            _cross(lanes, order, single)
+            _cross(lanes, full, single)
         for lane in range(WIDTH):
             if (single | several) >> lane & 1:
                 states[lanes.member[lane]].guard_roots += 1
                 if several >> lane & 1:
                     column = w.column[0]
-                    for k in range(order + 1):
+                    for k in range(full + 1):
                         column[k] = lanes.column[k, lane]
-                    lanes.root[lane] = first_root(column, order, lanes.reach[lane], w)
+                    lanes.root[lane] = first_root(column, full, lanes.reach[lane], w)
                 if lanes.root[lane] < lanes.reach[lane]:
                     _note_root(lanes, lane, lanes.root[lane])
 

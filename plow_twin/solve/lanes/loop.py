@@ -21,6 +21,7 @@ from plow_twin.solve.lanes.record import (
     penetration_at,
     save_lane,
     weigh_lanes,
+    write_place,
 )
 from plow_twin.solve.lanes.series import accurate_steps, expand, expand_loads
 from plow_twin.solve.lanes.totals import add_step, sum_step
@@ -54,14 +55,14 @@ _DONE: Final = 7
 
 
 @kernel()
-def _lane_in_range(lanes, p, state, lane) -> bool:
-    for i in range(COMPONENTS):
-        state.y[i] = lanes.y[i, lane]
+def lane_in_range(lanes, p, state, lane) -> bool:
+    """Tell whether the model holds for the scene in a lane."""
+    write_place(state, lanes, lane)
     return within_range(p, state, state.y)
 
 
 @kernel()
-def _bits_in_range(lanes):
+def bits_in_range(lanes):
     """Return a bit for each lane in which surely the model holds (`modes.within_range`)."""
     c, s = exact_row(lanes.y, COS), exact_row(lanes.y, SIN)
     bits = below(magnitude(exact_row(lanes.y, THETA)), exact_splat(LARGEST_ANGLE))
@@ -78,21 +79,14 @@ def _another_method(p, harmonics, extent, flight, rest, state, lanes, lane, w, s
         if flight is not None:
             for j in range(3):
                 w.wrench[0, j], w.wrench[1, j] = p.constant[j], 0.0
-            _write_state(state, lanes, lane)
+            write_place(state, lanes, lane)
             first = extent[0]
             return safe_time(p, harmonics[first : first + extent[1]], state, w, span) > 0.0
         return False
     if rest is not None:
-        _write_state(state, lanes, lane)
+        write_place(state, lanes, lane)
         return slow_enough(p, state.y)
     return False
-
-
-@kernel()
-def _write_state(state, lanes, lane) -> None:
-    for i in range(COMPONENTS):
-        state.y[i] = lanes.y[i, lane]
-    state.step_start = lanes.time[lane]
 
 
 @kernel()
@@ -100,13 +94,13 @@ def _look(members, flight, rest, lanes, lane, w, t_end, budget, in_range) -> int
     """Return `OK` where the scene in a lane takes its next step there, else the status it leaves with."""
     member = lanes.member[lane]
     p, state = members.params[member], members.states[member]
-    if not in_range and not _lane_in_range(lanes, p, state, lane):
+    if not in_range and not lane_in_range(lanes, p, state, lane):
         return _RANGE
     if lanes.time[lane] >= t_end:
         return _DONE
     if state.steps >= budget:
         return _BUDGET
-    lanes.whole[lane] = min(t_end - lanes.time[lane], LONGEST_STEP)
+    lanes.stop[lane], lanes.whole[lane] = t_end, min(t_end - lanes.time[lane], LONGEST_STEP)
     if _another_method(
         p, members.harmonics, members.extent[member], flight, rest, state, lanes, lane, w, lanes.whole[lane]
     ):
@@ -131,8 +125,8 @@ def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
             for k in range(order - 1, -1, -1):
                 value = fused(value, at, exact_splat(series[k, lane]))
             set_row(lanes.out, component, value)
-        _turn(lanes.out, X, Y)
-        _turn(lanes.out, VX, VY)
+        turn(lanes.out, X, Y)
+        turn(lanes.out, VX, VY)
         for j in range(count):
             q[i + j, 0], q[i + j, 1], q[i + j, 2] = lanes.out[X, j], lanes.out[Y, j], lanes.out[THETA, j]
             v[i + j, 0], v[i + j, 1], v[i + j, 2] = lanes.out[VX, j], lanes.out[VY, j], lanes.out[OMEGA, j]
@@ -141,7 +135,7 @@ def _fill_rows(lanes, lane, order, t, i, end, q, v) -> int:
 
 
 @kernel()
-def _turn(out, first, second) -> None:
+def turn(out, first, second) -> None:
     """Resolve a vector at eight instants along world axes."""
     c, s, x, y = exact_row(out, COS), exact_row(out, SIN), exact_row(out, first), exact_row(out, second)
     set_row(out, first, fused(c, x, s * y * -1.0))
@@ -186,24 +180,24 @@ def _switch(p, state, sums, lanes, lane, hysteretic) -> None:
 
 
 @kernel(inline="source")
-def _end_of(lanes, lane, t_end):
+def end_of(lanes, lane):
     """Return the time at which a lane's step ends."""
     if lanes.ends_at_stop[lane] == 1 and lanes.whole[lane] < LONGEST_STEP:
-        return t_end
+        return lanes.stop[lane]
     return lanes.time[lane] + lanes.step[lane]
 
 
 @kernel()
-def _complete(p, state, sums, lanes, lane, order, t_end, hysteretic) -> None:
+def complete(p, state, sums, lanes, lane, hysteretic) -> None:
     """Move a lane to the end of its step: time, counts and modes; its state has been moved."""
     begin, parted = lanes.time[lane], False
     state.steps += 1
-    state.evaluations += order
+    state.evaluations += lanes.orders[lane]
     for pair in range(PAIR_COUNT):
         parted |= lanes.parted[pair, lane] < lanes.step[lane]
     if parted:
         _part(state, sums, lanes, lane)
-    end = _end_of(lanes, lane, t_end)
+    end = end_of(lanes, lane)
     lanes.time[lane] = end
     at_once = end - begin <= ONE_INSTANT * (1.0 + abs(begin))
     if not at_once:
@@ -220,7 +214,7 @@ def _complete(p, state, sums, lanes, lane, order, t_end, hysteretic) -> None:
 
 
 @kernel()
-def _move(lanes) -> None:
+def move(lanes) -> None:
     """Add the changes over the steps to the states; set cosine and sine from the angle anew."""
     for component in range(COMPONENTS):
         set_row(lanes.y, component, exact_row(lanes.y, component) + exact_row(lanes.change, component))
@@ -228,14 +222,14 @@ def _move(lanes) -> None:
 
 
 @kernel()
-def _go_past_an_instant(members, lanes) -> None:
+def go_past_an_instant(params, states, lanes) -> None:
     """Go on past an instant at which modes flip without end, with the modes as they are."""
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and lanes.event[lane] >= 0:
             lanes.ends_at_stop[lane] = 0
-            state = members.states[member]
-            if state.events_at_once > members.params[member].max_events:
+            state = states[member]
+            if state.events_at_once > params[member].max_events:
                 state.recoveries += 1
                 lanes.step[lane] = max(lanes.step[lane], min(lanes.accurate[lane], PAST_AN_INSTANT))
                 lanes.event[lane] = -1
@@ -285,7 +279,7 @@ def run_lanes(
     members, queue, t = _unowned_members(members), unowned(queue), unowned(t)
     waiting = 0
     for _ in range(iterations):
-        in_range, live = _bits_in_range(lanes), 0
+        in_range, live = bits_in_range(lanes), 0
         for lane in range(WIDTH):
             sure = in_range >> lane & 1 == 1
             while True:
@@ -308,7 +302,7 @@ def run_lanes(
         if lanes.stale[0] == 1 and hysteretic is None:
             weigh_lanes(lanes)
             lanes.stale[0] = 0
-        _step(members, waves, second, viscous, hysteretic, order, lanes, w, t_end, t)
+        _step(members, waves, second, viscous, hysteretic, order, lanes, w, t)
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0:
             _leave(members, lanes, lane, _PAUSED, t)
@@ -316,34 +310,31 @@ def run_lanes(
 
 
 @kernel()
-def _step(members, waves, second, viscous, hysteretic, order, lanes, w, t_end, t) -> None:
+def _step(members, waves, second, viscous, hysteretic, order, lanes, w, t) -> None:
     """Take one step in each lane."""
     if waves is not None:
         expand_loads(members.harmonics, members.extent, second, lanes, w, order)
-    expand(lanes, w, order, waves, second, viscous, hysteretic)
+    expand(lanes, w, order, waves, second, viscous, hysteretic, None)
     infinite = accurate_steps(members.params, lanes, order)
     if infinite != 0:
         for lane in range(WIDTH):
             if infinite >> lane & 1:
                 _leave(members, lanes, lane, _NON_FINITE, t)
-    first_events(members.states, lanes, w, order, viscous, hysteretic)
-    _go_past_an_instant(members, lanes)
+    first_events(members.states, lanes, w, order, order, viscous, hysteretic)
+    go_past_an_instant(members.params, members.states, lanes)
     note_switches(lanes, order, viscous, hysteretic)
     sum_step(lanes, w, order)
-    add_step(members.totals, lanes, w, order, viscous, hysteretic)
+    add_step(members.totals, lanes, w, order, order, viscous, hysteretic)
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0 and members.first[member] < t.size:
-            first, end = members.first[member], _end_of(lanes, lane, t_end)
+            first, end = members.first[member], end_of(lanes, lane)
             if t[first] < end:
                 members.first[member] = _fill_rows(
                     lanes, lane, order, t, first, end, members.q[member], members.v[member]
                 )
-    _move(lanes)
+    move(lanes)
     for lane in range(WIDTH):
         member = lanes.member[lane]
         if member >= 0:
-            _complete(
-                members.params[member], members.states[member], members.totals[member], lanes, lane, order, t_end,
-                hysteretic,
-            )  # fmt: skip
+            complete(members.params[member], members.states[member], members.totals[member], lanes, lane, hysteretic)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import choose, exact_row, exact_splat, fused, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.compiled_scene import CompiledScene
-from plow_twin.solve.state import CLIPPED, MAX_ORDER, OFF, ON, Terms, new_record
+from plow_twin.solve.state import CLIPPED, COS, MAX_ORDER, OFF, ON, Terms, new_records
 
 #: Scenes in a vector.
 WIDTH: Final = 8
@@ -25,7 +26,6 @@ AGAIN: Final = 2 * PAIR_COUNT
 _ROWS: Final = MAX_ORDER + 1
 _PAIRS: Final = (PAIR_COUNT, WIDTH)
 _LANES_OF: Final = (WIDTH,)
-Lanes: TypeAlias = np.record
 
 LANES: Final = np.dtype(
     [
@@ -47,6 +47,11 @@ LANES: Final = np.dtype(
         ("along", "f8", (2, 6, WIDTH)),  # higher orders of the forces: of c, s, X or Y, their rates
         ("turn", "f8", (2, 8, WIDTH)),  # and of the factors in the moment: of c, s, X, Y, their rates
         ("constant", "f8", (3, WIDTH)),
+        ("slope", "f8", (3, WIDTH)),  # sampled loads: rise from the last sample to the next one
+        ("sample", "f8", (3, WIDTH)),  # the last one
+        ("held", "f8", (3, WIDTH)),  # load at the step's start, the constant one with it
+        ("knot", "f8", _LANES_OF),  # time of the last sample
+        ("small", "f8", _LANES_OF),  # size of a term over the longest step wanted that has vanished
         ("direction", "f8", (4, WIDTH)),
         ("inverse_mass", "f8", _LANES_OF),
         ("inverse_inertia", "f8", _LANES_OF),
@@ -62,6 +67,7 @@ LANES: Final = np.dtype(
         ("size", "f8", (2, WIDTH)),  # of the last two orders as velocities
         ("step", "f8", _LANES_OF),  # step size in s
         ("accurate", "f8", _LANES_OF),  # step size before an event ends the step
+        ("stop", "f8", _LANES_OF),  # time at which a step must end
         ("whole", "f8", _LANES_OF),  # the longest step wanted
         ("reach", "f8", _LANES_OF),  # how far a column is searched
         ("root", "f8", _LANES_OF),  # its first root
@@ -69,7 +75,8 @@ LANES: Final = np.dtype(
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
-        ("out", "f8", (COMPONENTS, WIDTH)),  # one scene at eight instants
+        ("out", "f8", (COMPONENTS, WIDTH)),  # one scene at eight instants, or eight scenes
+        ("told", "f8", (3, PAIR_COUNT, WIDTH)),  # penetration, rate, force
         ("time", "f8", _LANES_OF),
         ("member", "i8", _LANES_OF),  # the scene in a lane, -1 for an empty lane
         ("mode", "i8", _PAIRS),
@@ -82,6 +89,9 @@ LANES: Final = np.dtype(
         ("ends_at_stop", "i8", _LANES_OF),
         ("todo", "i8", _LANES_OF),  # a bit for each guard that is still to be searched
         ("guarded", "i8", _LANES_OF),  # the guard in the column
+        ("orders", "i8", _LANES_OF),  # of the series of each lane: the terms beyond have vanished
+        ("vanished", "i8", (1,)),  # a bit for each lane whose series ends early
+        ("before", "i8", _LANES_OF),  # steps before the sample
         ("carrying", "i8", _LANES_OF),  # a bit for each pair that is on
         ("stale", "i8", (1,)),  # 1 where modes or scenes have changed since the maps were summed
     ]
@@ -92,22 +102,22 @@ LANES: Final = np.dtype(
 _COVERED: Final = {"harmonics", "second", "viscous", "hysteretic", "flight", "rest"}
 
 
-def fits_lanes(compiled: CompiledScene) -> bool:
+def fits_lanes(compiled: CompiledScene, *, sampled: bool = False) -> bool:
     """Tell whether the lanes take the steps of a scene.
 
-    Its exponent is 1, it has no other term than damping and harmonics, and the head carries the walls.
+    Its exponent is 1, it has no other term than damping and harmonics or samples, and the head carries the walls.
     """
-    parts = compiled.parts
+    parts = compiled.parts._replace(terms=compiled.parts.terms._replace(segments=None)) if sampled else compiled.parts
     there = (name for name, term in zip(Terms._fields, parts.terms, strict=True) if term is not None)
     return parts.implicit is None and _COVERED.issuperset(there) and compiled.scene.head.carries == "walls"
 
 
-def new_lanes() -> Lanes:
-    """Return empty lanes."""
-    lanes = new_record(LANES)
-    lanes.member[:] = -1
+def new_lanes() -> NDArray[np.void]:
+    """Return empty lanes, shape (1,)."""
+    lanes = new_records(LANES, 1)
+    lanes["member"] = -1
     # an empty lane computes with a scene that stands still
-    lanes.y[5], lanes.half_cavity[:], lanes.whole[:] = 1.0, 1.0, 1.0
+    lanes["y"][:, COS] = lanes["half_cavity"] = lanes["whole"] = 1.0
     return lanes
 
 
@@ -141,13 +151,27 @@ def load_lane(p, state, totals, lanes, lane, member) -> None:
 
 
 @kernel()
-def save_lane(state, totals, lanes, lane) -> None:
-    """Take a scene out of its lane."""
+def write_place(state, lanes, lane) -> None:
+    """Write to a state's record where its lane stands."""
     for i in range(COMPONENTS):
         state.y[i] = lanes.y[i, lane]
-    state.step_start = state.time = lanes.time[lane]
+    state.step_start = lanes.time[lane]
+
+
+@kernel()
+def write_state(state, lanes, lane) -> None:
+    """Write all that a lane has of a state to its record."""
+    write_place(state, lanes, lane)
+    state.time = lanes.time[lane]
     for pair in range(PAIR_COUNT):
         state.mode[pair], state.damping_factor[pair] = lanes.mode[pair, lane], lanes.factor[pair, lane]
+
+
+@kernel()
+def save_lane(state, totals, lanes, lane) -> None:
+    """Take a scene out of its lane."""
+    write_state(state, lanes, lane)
+    for pair in range(PAIR_COUNT):
         totals.peak[pair], totals.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
         totals.time_in_contact[pair] = lanes.time_in_contact[pair, lane]
     clear_lane(lanes, lane)

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from plow_twin.kernel.compiler import kernel
-from plow_twin.kernel.simd import choose, exact_row, exact_splat, fused, magnitude, set_row
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, magnitude, set_row
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.solve.lanes.record import DC, DS, DX, DY, WIDTH, damped_at, penetration_at
 from plow_twin.solve.lanes.waves import turn_lanes
@@ -20,6 +20,9 @@ from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
 #: A term beyond this is not finite, or will not be when it is multiplied.
 _FINITE = 1e300
+#: A series that ends because its terms vanish has at least so many orders.
+_FEWEST_ORDERS = 4
+_ALL = 2**WIDTH - 1
 
 
 @kernel()
@@ -73,8 +76,12 @@ def expand_loads(harmonics, extent, second, lanes, w, order) -> None:
 
 
 @kernel()
-def expand(lanes, w, order, waves, second, viscous, hysteretic) -> None:
-    """Write the series of the state up to `order`, and those of `lanes.turning` up to the order before."""
+def expand(lanes, w, limit, waves, second, viscous, hysteretic, segments) -> int:
+    """Write the series of the state and, up to the order before, those of `lanes.turning`; return the order.
+
+    Under sampled loads a lane's terms are zero beyond the order from which on they vanish over the longest step wanted:
+    what the others go on with moves no bit of it.
+    """
     series, turning, moment = lanes.series, lanes.turning, lanes.moment
     zero = exact_splat(0.0)
     x0, y0, vx0, vy0 = (exact_row(lanes.y, X), exact_row(lanes.y, Y), exact_row(lanes.y, VX), exact_row(lanes.y, VY))
@@ -82,11 +89,31 @@ def expand(lanes, w, order, waves, second, viscous, hysteretic) -> None:
         exact_row(lanes.y, OMEGA), exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, THETA),
     )  # fmt: skip
     x, y, vx, vy, om, c, s = x0, y0, vx0, vy0, om0, c0, s0
-    start_x, start_y = exact_row(lanes.constant, 0), exact_row(lanes.constant, 1)
+    start_x, start_y, turned_at = (
+        exact_row(lanes.constant, 0),
+        exact_row(lanes.constant, 1),
+        exact_row(lanes.constant, 2),
+    )
+    active = calm = 0
+    before_c = before_s = zero
+    reach = exact_splat(1.0)
+    if segments is not None:
+        start_x, start_y, turned_at = exact_row(lanes.held, 0), exact_row(lanes.held, 1), exact_row(lanes.held, 2)
+        active = _live(lanes)
     m, i = exact_row(lanes.inverse_mass, 0), exact_row(lanes.inverse_inertia, 0)
     along, turn, load, direction = lanes.along, lanes.turn, lanes.load, lanes.direction
-    for k in range(order):
+    order = limit
+    for k in range(limit):
         _set_state(series, k, x, y, vx, vy, om, c, s, angle)
+        if segments is not None and k > 0:
+            reach = reach * exact_row(lanes.whole, 0)
+            quiet = below(_size(lanes, vx, vy, om, c, s) * reach, exact_row(lanes.small, 0))
+            if k >= _FEWEST_ORDERS and quiet & calm & active != 0:
+                active = _end_series(lanes, active, quiet & calm, k)
+                if active == 0:
+                    order = k
+                    break
+            calm = quiet
         # a product's newest orders come last: most of the sum need not wait for them
         px = py = pvx = pvy = pc = ps = zero
         for j in range(1, k):
@@ -103,12 +130,23 @@ def expand(lanes, w, order, waves, second, viscous, hysteretic) -> None:
         pvx, pvy = fused(om, vx0, fused(early, vx, pvx)), fused(om, vy0, fused(early, vy, pvy))
         pc, ps = fused(om, c0, fused(early, c, pc)), fused(om, s0, fused(early, s, ps))
         dx, dy, dc, ds = vx + py, vy - px, ps * -1.0, pc
+        if segments is not None and active != _ALL:
+            dx, dy, dc, ds = (
+                choose(active, dx, zero), choose(active, dy, zero), choose(active, dc, zero), choose(active, ds, zero),
+            )  # fmt: skip
         set_row(turning[DC], k, dc)
         set_row(turning[DS], k, ds)
         set_row(turning[DX], k, dx)
         set_row(turning[DY], k, dy)
         ax, ay = fused(start_x, c, fused(start_y, s, pvy)), fused(start_y, c, (fused(start_x, s, pvx)) * -1.0)
-        turned_by = exact_row(lanes.constant, 2) * (1.0 - share)
+        turned_by = turned_at * (1.0 - share)
+        if segments is not None:
+            rise_x, rise_y = exact_row(lanes.slope, 0), exact_row(lanes.slope, 1)
+            ax = fused(rise_x, before_c, fused(rise_y, before_s, ax))
+            ay = fused(rise_y, before_c, fused(rise_x, before_s * -1.0, ay))
+            if k == 1:
+                turned_by = exact_row(lanes.slope, 2)
+            before_c, before_s = c, s
         if waves is not None:
             wc, ws = _waves(load[0], series, k, c0, s0, c, s, share)
             ax = fused(exact_row(direction, 0), wc, fused(exact_row(direction, 1), ws, ax))
@@ -119,7 +157,10 @@ def expand(lanes, w, order, waves, second, viscous, hysteretic) -> None:
                 ay = fused(exact_row(direction, 3), wc, fused(exact_row(direction, 2), ws * -1.0, ay))
             turned_by = turned_by + exact_row(load[2], k)
         if hysteretic is not None:
-            fx, fy, gc, gs = _push(lanes, w, k, c, s, x, y, dc, ds, dx, dy)
+            acts = _ALL
+            if segments is not None:
+                acts = active
+            fx, fy, gc, gs = _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy)
         elif k == 0:
             _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy)
             fx, fy, gc, gs = (
@@ -146,12 +187,36 @@ def expand(lanes, w, order, waves, second, viscous, hysteretic) -> None:
         other = fused(s * share, exact_row(moment[DS], 0), fused(y * share, exact_row(moment[DY], 0), other))
         torque = fused(c0, gc, fused(x0, gx, torque)) + fused(s0, gs, fused(y0, gy, other))
         ax, ay, turned_by = fused(m, fx, ax), fused(m, fy, ay), fused(i, torque, turned_by)
+        if segments is not None and active != _ALL:
+            ax, ay, turned_by = choose(active, ax, zero), choose(active, ay, zero), choose(active, turned_by, zero)
+            om = choose(active, om, zero)
         part = w.inverse[k + 1]
         x, y, vx, vy, c, s = dx * part, dy * part, ax * part, ay * part, dc * part, ds * part
         angle, om = om * part, turned_by * part
-        if k >= order - 2:
-            set_row(lanes.size, k - (order - 2), _size(lanes, vx, vy, om, c, s))
+        if k >= limit - 2:
+            set_row(lanes.size, k - (limit - 2), _size(lanes, vx, vy, om, c, s))
     _set_state(series, order, x, y, vx, vy, om, c, s, angle)
+    return order
+
+
+@kernel()
+def _live(lanes) -> int:
+    """Return a bit for each lane that has a scene; none of their series has ended."""
+    bits = 0
+    for lane in range(WIDTH):
+        bits |= 1 << lane if lanes.member[lane] >= 0 else 0
+    lanes.vanished[0] = 0
+    return bits
+
+
+@kernel()
+def _end_series(lanes, active, ended, k) -> int:
+    """Note that the series of some lanes end at order k; return the others."""
+    for lane in range(WIDTH):
+        if (ended & active) >> lane & 1:
+            lanes.orders[lane] = k
+    lanes.vanished[0] |= ended & active
+    return active & ~ended
 
 
 @kernel(inline="code")
@@ -204,7 +269,7 @@ def _write_start(lanes, viscous, c, s, x, y, dc, ds, dx, dy) -> None:
 
 
 @kernel(inline="code")
-def _push(lanes, w, k, c, s, x, y, dc, ds, dx, dy):
+def _push(lanes, w, k, acts, c, s, x, y, dc, ds, dx, dy):
     """Return order k of the forces along X and Y and of the factors of cosine and sine in the contacts' moment.
 
     For F = K d (1 + lambda d'), pair by pair. Writes the penetrations of the next order and F / K.
@@ -214,6 +279,7 @@ def _push(lanes, w, k, c, s, x, y, dc, ds, dx, dy):
         on = lanes.on[pair]
         if on == 0:
             continue
+        on &= acts
         rows, arms, depth = lanes.rows[pair], lanes.arms[pair], lanes.depth[pair]
         place, rate = (x, dx) if pair % 2 == 1 else (y, dy)
         if k == 0:
@@ -278,9 +344,10 @@ def accurate_steps(params, lanes, order) -> int:
     for lane in range(WIDTH):
         member, whole = lanes.member[lane], lanes.whole[lane]
         lanes.ends_at_stop[lane] = 1
-        lanes.step[lane] = whole
-        if member < 0:
+        lanes.step[lane] = lanes.accurate[lane] = whole
+        if member < 0 or lanes.vanished[0] >> lane & 1:
             continue
+        lanes.orders[lane] = order
         p, least = params[member], np.inf
         for k in range(order, order - 2, -1):
             size = lanes.size[k - order + 1, lane]

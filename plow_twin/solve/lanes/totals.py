@@ -37,9 +37,15 @@ def sum_step(lanes, w, order) -> None:
 
 
 @kernel()
-def add_step(totals, lanes, w, order, viscous, hysteretic) -> None:
-    """Add the steps that have been laid out to the totals."""
-    h = exact_row(lanes.step, 0)
+def add_step(totals, lanes, w, order, full, viscous, hysteretic) -> None:
+    """Add the steps that have been laid out to the sums in the lanes, and the times of sets to totals if there are any.
+
+    `order` and `full` are as for `first_events`.
+    """
+    h, last = exact_row(lanes.step, 0), order - 1
+    if totals is None:
+        # under samples the series of a lane may end before; then its guard has one more term
+        last = order
     for pair in range(PAIR_COUNT):
         on = lanes.on[pair]
         if on == 0:
@@ -64,16 +70,18 @@ def add_step(totals, lanes, w, order, viscous, hysteretic) -> None:
         time = exact_row(lanes.time_in_contact, pair)
         set_row(lanes.time_in_contact, pair, choose(on, time + h, time))
         if hysteretic is not None:
-            _raise_peaks(lanes, w, lanes.push[pair], pair, order - 1, on)
+            _raise_peaks(lanes, w, lanes.push[pair], pair, order - 1, full - 1, on)
         else:
-            _raise_peaks(lanes, w, lanes.guard[pair], pair, order - 1, on)
+            _raise_peaks(lanes, w, lanes.guard[pair], pair, last, last + full - order, on)
+    if totals is None:
+        return
     for lane in range(WIDTH):
         if lanes.member[lane] >= 0 and lanes.carrying[lane] != 0:
             add_set_times(totals[lanes.member[lane]], lanes.carrying[lane], lanes.step[lane])
 
 
 @kernel()
-def _raise_peaks(lanes, w, push, pair, order, on) -> None:
+def _raise_peaks(lanes, w, push, pair, order, full, on) -> None:
     """Raise the peaks of a pair by the series of F / K: first a bound, the maximum only where that exceeds the peak.
 
     Between its ends a function exceeds them by h^2 / 8 times its largest curvature downward at most.
@@ -112,9 +120,9 @@ def _raise_peaks(lanes, w, push, pair, order, on) -> None:
         for lane in range(WIDTH):
             if (exceeds & ~known) >> lane & 1:
                 column, k = w.column[0], lanes.stiffness[lane]
-                for i in range(order + 1):
-                    column[i] = k * push[i, lane]
-                lanes.peak[pair, lane] = maximum(column, order, lanes.step[lane], lanes.peak[pair, lane], w)
+                for i in range(full + 1):
+                    column[i] = k * push[i, lane] if i <= order else 0.0
+                lanes.peak[pair, lane] = maximum(column, full, lanes.step[lane], lanes.peak[pair, lane], w)
 
 
 @kernel()

@@ -1,0 +1,93 @@
+"""Live twins in the lanes of a SIMD vector: slices of their advances, and those that lanes leave to another method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.kernel.compiler import for_arguments
+from plow_twin.run.pace import Pace
+from plow_twin.solve.lanes.advance import Samples, advance_lanes
+from plow_twin.solve.lanes.record import WIDTH, new_lanes
+from plow_twin.solve.state import STATE, TOTALS, Terms, new_records
+
+#: Steps of all lanes in a slice, which takes about a millisecond.
+_SLICE: Final = 256
+
+_Array = NDArray[np.float64]
+
+
+class LaneTwins:
+    """Twins that advance side by side, in one thread.
+
+    Parameters
+    ----------
+    params, states : ndarray of records, shape (m,)
+        Of all twins of a batch.
+    terms : Terms
+        Of all of them.
+    members : range
+        Those that advance here.
+    work : ndarray of `WORK`, shape (1,)
+        Scratch space.
+    max_steps : int
+        Steps that an advance may take.
+    """
+
+    def __init__(
+        self,
+        params: NDArray[np.void],
+        states: NDArray[np.void],
+        terms: Terms,
+        members: range,
+        work: NDArray[np.void],
+        max_steps: int,
+    ) -> None:
+        self._params, self._states, self._terms, self._work = params, states, terms, work
+        self._members, self._max_steps, self._order = np.array(members), max_steps, int(params["order"][members[0]])
+        self._saved, self._place = new_records(STATE, WIDTH), np.zeros(len(params), np.int64)
+        self._other, self._progress = np.zeros(len(params), np.int64), np.zeros(2, np.int64)
+        self._kernel: Callable[..., bool] | None = None
+        self.clear()
+
+    def clear(self) -> None:
+        """Leave nothing in the lanes of a call that has been stopped."""
+        self._lanes, self._totals = new_lanes(), np.zeros(WIDTH, TOTALS)
+
+    def advance(
+        self, times: _Array, wrench: _Array, rows: NDArray[np.void], pace: Pace, alone: Callable[[int, int], None]
+    ) -> None:
+        """Advance to all times; `alone` advances one twin to one of them by other methods.
+
+        `wrench` and `rows` are those of `Samples`.
+        """
+        if not len(times):
+            return
+        self._place[self._members] = 0
+        waiting: Sequence[int] | _Array | NDArray[np.int64] = self._members
+        while len(waiting):
+            self._progress[:] = 0
+            samples = Samples(
+                self._params, self._states, self._saved, self._totals, times, wrench, rows, self._place,
+                np.array(waiting), self._progress, self._other,
+            )  # fmt: skip
+            terms = self._terms
+            arguments = (
+                samples, terms.viscous, terms.hysteretic, terms.rest, self._order, self._lanes, self._work,
+                self._max_steps, _SLICE,
+            )  # fmt: skip
+            if self._kernel is None:
+                self._kernel = for_arguments(advance_lanes, arguments)
+            pace.run(self._kernel, arguments)
+            waiting = self._advance_others(len(times), alone) if self._progress[1] else ()
+
+    def _advance_others(self, count: int, alone: Callable[[int, int], None]) -> list[int]:
+        """Let the others take one advance of `count`; return those that have more before them."""
+        others: list[int] = self._other[: self._progress[1]].tolist()
+        for member in others:
+            alone(member, int(self._place[member]))
+            self._place[member] += 1
+        return [member for member in others if self._place[member] < count]

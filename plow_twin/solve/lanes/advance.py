@@ -1,0 +1,313 @@
+"""Many live twins under sampled loads in lanes: each goes from sample to sample, and a row tells of each sample.
+
+Under a load that is sampled often a step ends at the next sample, long before its series stops being accurate: a series
+ends where its terms vanish over that step (`series.expand`).
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.kernel.arrays import unowned
+from plow_twin.kernel.compiler import kernel
+from plow_twin.kernel.simd import below, choose, exact_row, exact_splat, fused, set_row
+from plow_twin.model.pairs import PAIR_COUNT
+from plow_twin.solve.dense_output import pair_outputs
+from plow_twin.solve.kinematics import pose_of
+from plow_twin.solve.lanes.events import first_events, note_switches
+from plow_twin.solve.lanes.loop import (
+    OTHER_METHOD,
+    bits_in_range,
+    complete,
+    go_past_an_instant,
+    lane_in_range,
+    move,
+    turn,
+)
+from plow_twin.solve.lanes.record import (
+    COMPONENTS,
+    WIDTH,
+    damped_at,
+    load_lane,
+    penetration_at,
+    save_lane,
+    weigh_lanes,
+    write_place,
+    write_state,
+)
+from plow_twin.solve.lanes.series import accurate_steps, expand
+from plow_twin.solve.lanes.totals import add_step, sum_step
+from plow_twin.solve.method.rest import slow_enough
+from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, Status, X, Y
+from plow_twin.solve.step import LONGEST_STEP
+
+#: Steps to one sample after which a head that a constant load holds may be at rest: it costs as much to find out.
+_MAY_REST: Final = 32
+#: A share of what the last order may have, below which a term has vanished (`method.series`).
+_VANISHED: Final = 0.4
+_SHORTEST_SPAN: Final = 1e-100
+
+_OK, _RANGE, _NON_FINITE = int(Status.OK), int(Status.OUT_OF_RANGE), int(Status.NON_FINITE)
+_BUDGET: Final = int(Status.BUDGET)
+_AT_SAMPLE: Final = 7
+
+
+class Samples(NamedTuple):
+    """What twins are advanced through, and where they stand."""
+
+    params: NDArray[np.void]  #: of all twins, shape (m,)
+    states: NDArray[np.void]
+    saved: NDArray[np.void]  #: states of the scenes in the lanes at the sample before, shape (8,)
+    totals: NDArray[np.void]  #: touches since then of the scenes in the lanes, shape (8,)
+    times: NDArray[np.float64]  #: of the samples, shape (n,)
+    wrench: NDArray[np.float64]  #: per mass and inertia, the last sample first, shape (m, n + 1, 3)
+    rows: NDArray[np.void]  #: shape (m, n)
+    place: NDArray[np.int64]  #: samples that each twin has passed, shape (m,)
+    queue: NDArray[np.int64]  #: twins that wait for a lane
+    progress: NDArray[np.int64]  #: twins taken from the queue; twins that have left for another method
+    other: NDArray[np.int64]  #: their numbers, shape (m,)
+
+
+@kernel(inline="source")
+def _unowned_samples(s):
+    """Return the arrays without counting who holds them."""
+    return Samples(
+        unowned(s.params), unowned(s.states), unowned(s.saved), unowned(s.totals), unowned(s.times), unowned(s.wrench),
+        unowned(s.rows), unowned(s.place), unowned(s.queue), unowned(s.progress), unowned(s.other),
+    )  # fmt: skip
+
+
+@kernel()
+def _begin_sample(s, lanes, lane) -> None:
+    """Let the load of a lane run straight to the next sample; keep its state from before."""
+    member = lanes.member[lane]
+    i, state = s.place[member], s.states[member]
+    lanes.stop[lane], lanes.knot[lane], lanes.before[lane] = s.times[i], lanes.time[lane], state.steps
+    s.saved[lane] = state
+    span = lanes.stop[lane] - lanes.knot[lane]
+    for j in range(3):
+        before = s.wrench[member, i, j]
+        lanes.sample[j, lane] = before
+        lanes.slope[j, lane] = (s.wrench[member, i + 1, j] - before) / span if span > _SHORTEST_SPAN else 0.0
+
+
+@kernel()
+def _load_next(s, lanes, lane) -> None:
+    """Put the next twin that waits into a lane."""
+    member = s.queue[s.progress[0]]
+    s.progress[0] += 1
+    p = s.params[member]
+    load_lane(p, s.states[member], s.totals[lane], lanes, lane, member)
+    lanes.small[lane], lanes.stale[0] = _VANISHED * p.threshold[p.order], 1
+    _begin_sample(s, lanes, lane)
+
+
+@kernel()
+def _clear_sums(s, lanes, lane) -> None:
+    """Begin to count anew what a row tells."""
+    for pair in range(PAIR_COUNT):
+        lanes.peak[pair, lane] = lanes.impulse[pair, lane] = lanes.time_in_contact[pair, lane] = 0.0
+        s.totals[lane].makes[pair] = 0
+
+
+@kernel()
+def _leave(s, lanes, lane) -> None:
+    """Take a twin out of its lane as it was at the sample before."""
+    member = lanes.member[lane]
+    _clear_sums(s, lanes, lane)
+    save_lane(s.states[member], s.totals[lane], lanes, lane)
+    s.states[member] = s.saved[lane]
+
+
+@kernel()
+def _fail(s, lanes, lane, code) -> None:
+    """Undo the advance of a lane, whose time goes on to the sample; its twin waits for a lane again."""
+    member = lanes.member[lane]
+    i, steps = s.place[member], s.states[member].steps - lanes.before[lane]
+    _leave(s, lanes, lane)
+    p, state, out = s.params[member], s.states[member], s.rows[member, i]
+    state.touch_time += s.times[i] - state.time
+    state.step_start = state.time = s.times[i]
+    out.t, out.status, out.steps = s.times[i], code, steps
+    pose_of(p, state.y, None, out.q, out.v)
+    out.wear_depth[:] = state.wear_depth
+    pair_outputs(p, state, out.wear_depth, state.y, out.penetration, out.rate, out.force)
+    out.peak[:] = out.force
+    s.place[member] += 1
+    if s.place[member] < s.times.size:
+        s.progress[0] -= 1
+        s.queue[s.progress[0]] = member
+
+
+@kernel()
+def _tell(lanes, reached, viscous, hysteretic) -> None:
+    """Write pose, rates, penetrations, their rates and forces of all lanes to `lanes.out` and `lanes.told`.
+
+    The force at the sample raises the peak where one was `reached`.
+    """
+    for i in range(COMPONENTS):
+        set_row(lanes.out, i, exact_row(lanes.y, i))
+    c, s, om = exact_row(lanes.y, COS), exact_row(lanes.y, SIN), exact_row(lanes.y, OMEGA)
+    x, y = exact_row(lanes.y, X), exact_row(lanes.y, Y)
+    dc, ds = om * s * -1.0, om * c
+    dx, dy = fused(om, y, exact_row(lanes.y, VX)), exact_row(lanes.y, VY) - om * x
+    zero, none = exact_splat(0.0), exact_splat(0.0)
+    for pair in range(PAIR_COUNT):
+        place, rate = (x, dx) if pair % 2 == 1 else (y, dy)
+        depth = penetration_at(lanes, pair, c, s, place)
+        closing = damped_at(lanes, pair, exact_splat(1.0), none, dc, ds, rate)
+        push = depth
+        if viscous is not None:
+            push = fused(exact_row(lanes.ratio, pair), closing, depth)
+        if hysteretic is not None:
+            push = fused(exact_row(lanes.factor, pair) * closing, depth, depth)
+        acts = lanes.on[pair] & below(zero, depth) & below(zero, push)
+        force, peak = choose(acts, exact_row(lanes.stiffness, 0) * push, zero), exact_row(lanes.peak, pair)
+        set_row(lanes.told[0], pair, depth)
+        set_row(lanes.told[1], pair, closing)
+        set_row(lanes.told[2], pair, force)
+        set_row(lanes.peak, pair, choose(below(peak, force) & reached, force, peak))
+    turn(lanes.out, X, Y)
+    turn(lanes.out, VX, VY)
+
+
+@kernel()
+def _write_row(s, lanes, lane) -> None:
+    """Write the row of the sample that a lane has reached."""
+    member = lanes.member[lane]
+    state, sums, i, told, now = s.states[member], s.totals[lane], s.place[member], lanes.told, lanes.out
+    out = s.rows[member, i]
+    out.t, out.status, out.steps = s.times[i], _OK, state.steps - lanes.before[lane]
+    out.q[0], out.q[1], out.q[2] = now[X, lane], now[Y, lane], now[THETA, lane]
+    out.v[0], out.v[1], out.v[2] = now[VX, lane], now[VY, lane], now[OMEGA, lane]
+    for pair in range(PAIR_COUNT):
+        out.penetration[pair], out.rate[pair], out.force[pair] = (
+            told[0, pair, lane],
+            told[1, pair, lane],
+            told[2, pair, lane],
+        )
+        out.peak[pair], out.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
+        out.time_in_contact[pair], out.makes[pair] = lanes.time_in_contact[pair, lane], sums.makes[pair]
+        out.wear_depth[pair] = state.wear_depth[pair]
+
+
+@kernel()
+def _go_on(s, lanes, lane) -> None:
+    """Let a lane that has reached a sample go on to the next one, or its twin leave after the last."""
+    member = lanes.member[lane]
+    state = s.states[member]
+    _clear_sums(s, lanes, lane)
+    s.place[member] += 1
+    if s.place[member] == s.times.size:
+        save_lane(state, s.totals[lane], lanes, lane)
+        return
+    write_state(state, lanes, lane)
+    _begin_sample(s, lanes, lane)
+
+
+@kernel(inline="source")
+def _is_steady(lanes, lane) -> bool:
+    slope = lanes.slope
+    return slope[0, lane] == 0.0 and slope[1, lane] == 0.0 and slope[2, lane] == 0.0
+
+
+@kernel()
+def _look(s, rest, lanes, lane, budget, in_range) -> int:
+    """Return `OK` where a lane takes a step, `_AT_SAMPLE` where it has reached one, else why it leaves."""
+    member = lanes.member[lane]
+    p, state = s.params[member], s.states[member]
+    if not in_range and not lane_in_range(lanes, p, state, lane):
+        return _RANGE
+    left, taken = lanes.stop[lane] - lanes.time[lane], state.steps - lanes.before[lane]
+    if left <= 0.0:
+        return _AT_SAMPLE
+    if taken >= budget:
+        return _BUDGET
+    if rest is not None:  # noqa: SIM102 - left out by types
+        if taken >= _MAY_REST and _is_steady(lanes, lane):
+            write_place(state, lanes, lane)
+            if slow_enough(p, state.y):
+                return OTHER_METHOD
+    lanes.whole[lane] = min(left, LONGEST_STEP)
+    return _OK
+
+
+@kernel()
+def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
+    """Write rows of the samples that were reached and fill the lanes; tell whether any lane has a step to take."""
+    while True:
+        in_range, reached, live, changed = bits_in_range(lanes), 0, False, False
+        for lane in range(WIDTH):
+            if lanes.member[lane] < 0:
+                if s.progress[0] < s.queue.size:
+                    _load_next(s, lanes, lane)
+                    changed = True
+                continue
+            code = _look(s, rest, lanes, lane, budget, in_range >> lane & 1 == 1)
+            if code == _OK:
+                live = True
+            elif code == _AT_SAMPLE:
+                reached |= 1 << lane
+            elif code == OTHER_METHOD:
+                s.other[s.progress[1]] = lanes.member[lane]
+                s.progress[1] += 1
+                _leave(s, lanes, lane)
+                changed = True
+            else:
+                _fail(s, lanes, lane, code)
+                changed = True
+        if reached != 0:
+            _tell(lanes, reached, viscous, hysteretic)
+            for lane in range(WIDTH):
+                if reached >> lane & 1:
+                    _write_row(s, lanes, lane)
+                    _go_on(s, lanes, lane)
+        elif not changed:
+            return live
+
+
+@kernel()
+def _step(s, viscous, hysteretic, order, lanes, w) -> None:
+    """Take one step in each lane."""
+    time = exact_row(lanes.time, 0) - exact_row(lanes.knot, 0)
+    for j in range(3):
+        sampled = fused(exact_row(lanes.slope, j), time, exact_row(lanes.sample, j))
+        set_row(lanes.held, j, exact_row(lanes.constant, j) + sampled)
+    if hysteretic is None and lanes.stale[0] == 1:
+        weigh_lanes(lanes)
+        lanes.stale[0] = 0
+    used = expand(lanes, w, order, None, None, viscous, hysteretic, 1)
+    infinite = accurate_steps(s.params, lanes, order)
+    if infinite != 0:
+        for lane in range(WIDTH):
+            if infinite >> lane & 1:
+                _fail(s, lanes, lane, _NON_FINITE)
+    first_events(s.states, lanes, w, used, order, viscous, hysteretic)
+    go_past_an_instant(s.params, s.states, lanes)
+    note_switches(lanes, used, viscous, hysteretic)
+    sum_step(lanes, w, used)
+    add_step(None, lanes, w, used, order, viscous, hysteretic)
+    move(lanes)
+    for lane in range(WIDTH):
+        member = lanes.member[lane]
+        if member >= 0:
+            complete(s.params[member], s.states[member], s.totals[lane], lanes, lane, hysteretic)
+
+
+@kernel(entry=True)
+def advance_lanes(s, viscous, hysteretic, rest, order, eight, work, budget, iterations) -> bool:
+    """Advance the twins in the queue through all samples, eight at a time; return False where `iterations` are used up.
+
+    `eight` and `work`, (1,), are lanes and scratch space. `budget` are the steps that an advance to a sample may take.
+    Where one fails the twin stays as it was, and its time goes on. A twin whose advance is one of rest leaves its lane
+    before it (`Samples.other`).
+    """
+    s, lanes, w = _unowned_samples(s), eight[0], work[0]
+    for _ in range(iterations):
+        if not _get_ready(s, viscous, hysteretic, rest, lanes, budget):
+            return True
+        _step(s, viscous, hysteretic, order, lanes, w)
+    return False
