@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import plow_twin
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,6 +17,7 @@ from plow_twin.kernel.simd import row, set_row
 from plow_twin.model import contact
 from plow_twin.model.contact import power_term, power_terms, root_terms
 from plow_twin.model.contact_laws import DAMPING_NUMBER_CAP, LAWS, exact_damping_number
+from plow_twin.scene_file.presets import config_folder
 
 
 @kernel(entry=True)
@@ -133,3 +136,20 @@ def test_parts_of_the_wrong_kind_are_all_named_at_once() -> None:
     labels = {"a": "top_left", "b": "top_left"}
     with pytest.raises(SceneError, match=r"frame\.labels.*each corner once"):
         Scene(Head(1.0, 1.0), Frame(0.1, 0.1, labels), Clearance(0.01, 0.01), Contact("hertz", 1e7))
+
+
+def test_the_command_line_takes_laws_from_a_file_that_its_user_names(tmp_path: Path) -> None:
+    scene, laws = tmp_path / "scene.yaml", tmp_path / "laws.py"
+    scene.write_text((config_folder() / "paper.yaml").read_text().replace("law: hunt_crossley", "law: of_a_file"))
+    laws.write_text(
+        "import plow_twin\n"
+        "plow_twin.add_law('of_a_file', plow_twin.ContactLaw('own', 'D = 1 - e; made up', lambda e: 1.0 - e))\n"
+    )
+    empty = tmp_path / "empty.py"
+    empty.write_text("")
+    refused = plow_twin("info", scene)
+    assert refused.returncode == 2 and "contact.law: got 'of_a_file'" in refused.stderr
+    assert plow_twin("--laws", laws, "info", scene).returncode == 0
+    for wrong, said in ((empty, "calls plow_twin.add_law"), (tmp_path / "none.py", "No such file")):
+        done = plow_twin("--laws", wrong, "info", scene)
+        assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr

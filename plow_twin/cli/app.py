@@ -66,8 +66,18 @@ EXTRA_OF_MODULE: Final = {
     epilog="Exit codes: 0 done, 1 failed, 2 wrong usage or scene, 3 done with counted loss.",
 )
 @click.version_option(package_version(), "-V", "--version", prog_name="plow-twin")
-def commands() -> None:
+@click.option(
+    "--laws",
+    multiple=True,
+    metavar="MODULE",
+    help="Python file or module that adds contact laws (plow_twin.add_law); its code is run. May be repeated.",
+)
+def commands(laws: tuple[str, ...]) -> None:
     """Digital twin of a coal plough head: contact-impact motion in its guide."""
+    if laws:
+        from plow_twin.model.law_modules import load_laws
+
+        load_laws(laws)
 
 
 for _verb in (

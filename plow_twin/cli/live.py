@@ -197,7 +197,7 @@ def _settings(options: dict[str, Any]) -> Settings:
 
 
 def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
-    from plow_twin.live.bridge.files import Files, StandardInput
+    from plow_twin.live.bridge.files import Files, StandardInput, is_pattern
     from plow_twin.live.bridge.source import BridgeError
 
     if "://" in source:
@@ -225,6 +225,8 @@ def _bridge(source: str, options: dict[str, Any], rate_hz: float) -> Bridge:
     paths = sorted(path.glob("*.csv")) if path.is_dir() else [path]
     if not paths:
         raise BridgeError(f"{path}: got a folder without .csv, expected some")
+    if options["follow"] and not (paths[0].exists() or (is_pattern(path) and any(path.parent.glob(path.name)))):
+        say_error(f"plow-twin: {path}: is not there yet, it is waited for")
     return Files(paths, follow=options["follow"])
 
 

@@ -29,6 +29,7 @@ from plow_twin.estimate.estimate import Guess, warm_up
 from plow_twin.estimate.measurements import Deviation
 from plow_twin.estimate.result import Estimate
 from plow_twin.estimate.window import Window, Windows
+from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.model.scene import Scene
 
 #: Interval at which what was put down is handed on [s].
@@ -87,7 +88,7 @@ class Worker:
 
     def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
-        command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno())]
+        command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
         # one thread of linear algebra: it is to take no more than one core
         environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
@@ -220,11 +221,12 @@ def _take_short_slices() -> None:
 
 
 def main() -> None:
-    """Run the far side; the argument is the descriptor of its end."""
+    """Run the far side; the arguments are the descriptor of its end, and modules of contact laws."""
     # Ctrl-C goes to the whole group: the near side decides when this one ends
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
     _take_short_slices()
+    load_laws(sys.argv[2:])
     try:
         serve(Connection(int(sys.argv[1])))
     except (EOFError, ConnectionError):

@@ -181,7 +181,7 @@ LAWS: Final[Mapping[str, ContactLaw]] = MappingProxyType(_LAWS)
 def add_law(name: str, law: ContactLaw) -> None:
     """Add a law of your own: from now on scenes of this process can name it, and every solver takes it at full speed.
 
-    Other processes (the node, workers of a sweep) do not know it.
+    Other processes (the node, workers of a cluster) do not know it; commands import it by `--laws`.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -377,6 +378,8 @@ def _topic(
     topic = (
         topic if topic in topics else next((name for name in topics if name.lstrip("/") == topic.lstrip("/")), topic)
     )
+    if topic not in topics and len(alike := fnmatch.filter(topics, topic)) == 1:
+        topic = alike[0]
     if topic not in topics:
         raise map_error(path, f"{role}.topic", topic, f"one of {', '.join(sorted(topics))}")
     kind = topics[topic]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any, Final
 
 from plow_twin.live.bridge.source import BATCH, BridgeError, Lines, Rows
 from plow_twin.record.merging import StampOf, merged
-from plow_twin.record.sources import Arrived, TopicType
+from plow_twin.record.sources import Arrived, TopicType, columns_of
 from plow_twin.record.times import NO_TIME
 
 #: Most bytes read from a source at once.
@@ -23,6 +25,8 @@ _BLOCK: Final = 1 << 18
 _REMEMBERED: Final = 256
 #: Interval at which a followed file is read [s].
 _LOOK_S: Final = 0.02
+#: Interval at which files are looked for that are not there yet [s].
+_LOOK_FOR_FILES_S: Final = 0.2
 STDIN_TOPIC: Final = "stdin"
 
 
@@ -31,6 +35,8 @@ class _Tail:
     """One file, read as far as it goes; a file that was cut or replaced is read from its beginning again."""
 
     path: Path
+    #: by default the name of the file without its ending
+    topic: str = ""
     lines: Lines = field(default_factory=Lines)
     rows: Rows = field(default_factory=Rows)
     _file: Any = None
@@ -39,9 +45,21 @@ class _Tail:
     #: lines whose end never came: the file was cut or replaced
     left: int = 0
 
-    @property
-    def topic(self) -> str:
-        return self.path.stem
+    def __post_init__(self) -> None:
+        self.topic = self.topic or self.path.stem
+
+    def columns(self, *, grows: bool) -> list[str] | None:
+        """Return the columns by the first line; None: there is no file, or no line, and a whole one if it `grows`."""
+        rows = Rows()
+        try:
+            with self.path.open("rb") as stream:
+                while rows.columns is None and (line := stream.readline(_BLOCK)):
+                    if grows and not line.endswith(b"\n") and len(line) < _BLOCK:
+                        break
+                    rows.read(line)
+        except FileNotFoundError:
+            return None
+        return rows.columns
 
     def read(self) -> list[Arrived]:
         """Return the messages of the next block."""
@@ -92,6 +110,69 @@ class _Tail:
         self._file = None
 
 
+class _Dated:
+    """The files of a pattern, as one topic under the pattern's name.
+
+    Followed, the newest of them comes first, then each that appears; the one before is read on beside it.
+    """
+
+    def __init__(self, pattern: Path) -> None:
+        self._pattern, self.topic = pattern, pattern.stem
+        self._known: set[Path] = set()
+        self._tails: list[_Tail] = []
+        self._look_s = 0.0
+
+    @property
+    def path(self) -> Path:
+        """Return the present file, or the pattern while there is none."""
+        return self._tails[-1].path if self._tails else self._pattern
+
+    def columns(self, *, grows: bool) -> list[str] | None:
+        """Return the columns of the newest file, as `_Tail.columns`."""
+        there = self.files()
+        return _Tail(max(there, key=_changed_ns)).columns(grows=grows) if there else None
+
+    def files(self) -> list[Path]:
+        """Return the files by the numbers in their names."""
+        return sorted(self._pattern.parent.glob(self._pattern.name), key=_numbered)
+
+    def read(self) -> list[Arrived]:
+        """Return the messages of the next blocks."""
+        found = [arrived for tail in self._tails for arrived in tail.read()]
+        if found or time.monotonic() < self._look_s:
+            return found
+        self._look_s = time.monotonic() + _LOOK_FOR_FILES_S
+        there = self.files()
+        new = [file for file in there if file not in self._known]
+        if new and not self._known:
+            new = [max(new, key=_changed_ns)]
+        self._known.update(there)
+        for file in new:
+            rows = self._tails[-1].rows if self._tails else Rows()
+            left = 0
+            for tail in self._tails[:-1]:
+                left += tail.lines.begun
+                tail.close()
+            self._tails = [*self._tails[-1:], _Tail(file, self.topic, rows=rows, left=left)]
+        return self.read() if new else found
+
+    def close(self) -> None:
+        for tail in self._tails:
+            tail.close()
+
+
+def _changed_ns(path: Path) -> tuple[int, Any]:
+    try:
+        return path.stat().st_mtime_ns, _numbered(path)
+    except FileNotFoundError:  # gone meanwhile
+        return 0, _numbered(path)
+
+
+def _numbered(path: Path) -> list[tuple[int, str]]:
+    """Return a key by which names with numbers are in their order: load_9 before load_10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
+
 def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]:
     """Return the messages of whole lines, received now."""
     now_ns = time.time_ns()
@@ -104,14 +185,14 @@ def messages(topic: str, lines: list[bytes | None], rows: Rows) -> list[Arrived]
 
 
 class Files:
-    """Files, each a topic under its name without ending.
+    """Files, each a topic under its name without ending; those of a pattern (`load_*.csv`) are one topic.
 
     Parameters
     ----------
     paths
-        The files; when they are read once, their messages are put in order by the times in them.
+        The files, or patterns; when they are read once, their messages are put in order by the times in them.
     follow
-        Continue at the end with lines that are appended later.
+        Continue at the end with lines that are appended later, and wait for a file that is not there yet.
 
     Raises
     ------
@@ -125,21 +206,23 @@ class Files:
         self.connected = True
         self.lost = 0
         self.trouble = ""
-        self._tails = [_Tail(path) for path in paths]
+        self._tails = [_Dated(path) if is_pattern(path) else _Tail(path) for path in paths]
         for tail in self._tails:
-            if not tail.path.is_file():
+            if self.ends and not (tail.files() if isinstance(tail, _Dated) else tail.path.is_file()):
                 raise BridgeError(f"{tail.path}: no such file")
+            if not tail.path.parent.is_dir():
+                raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
 
     def topics(self) -> dict[str, TopicType]:
-        """Return columns by topic, by the first line of each file."""
+        """Return columns by topic, by the first line of each file; a followed one is waited for."""
         found: dict[str, TopicType] = {}
         for tail in self._tails:
-            rows = Rows()
-            with tail.path.open("rb") as stream:
-                while rows.columns is None and (line := stream.readline(_BLOCK)):
-                    rows.read(line)
-            found[tail.topic] = rows.header(str(tail.path))
+            columns = tail.columns(grows=not self.ends)
+            while columns is None and not self.ends:
+                time.sleep(_LOOK_FOR_FILES_S)
+                columns = tail.columns(grows=True)
+            found[tail.topic] = columns_of(str(tail.path), columns or ())
         return found
 
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
@@ -169,8 +252,18 @@ class Files:
             tail.close()
 
 
-def _all(tail: _Tail) -> Iterator[Arrived]:
-    """Yield all messages of a file that is read once."""
+def is_pattern(path: Path) -> bool:
+    """Return whether a path stands for all files with such a name."""
+    return any(sign in path.name for sign in "*?[") and not path.exists()
+
+
+def _all(tail: _Tail | _Dated) -> Iterator[Arrived]:
+    """Yield all messages of a file that is read once, or of the files of a pattern one after the other."""
+    if isinstance(tail, _Dated):
+        for file in tail.files():
+            with closing(_Tail(file, tail.topic)) as part:
+                yield from _all(part)
+        return
     while True:
         data = tail._block()
         yield from messages(tail.topic, tail.lines.add(data) if data else tail.lines.end(), tail.rows)

@@ -12,6 +12,7 @@ from multiprocessing import active_children, get_context, parent_process
 from multiprocessing.connection import wait
 from typing import Any
 
+from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.study.analysis.task import RunTask, run_task
 from plow_twin.study.cluster import completed, connect
 
@@ -66,7 +67,7 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
     """Run some tasks and return those that were lost: when a worker dies, with all that had not ended."""
     left = []
     others = active_children()
-    pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _belong_to_the_caller)
+    pool = ProcessPoolExecutor(min(workers, len(waiting)), get_context("spawn"), _begin, (loaded_laws(),))
     try:
         futures = {pool.submit(run_task, tasks[number]): number for number in waiting}
         for future in as_completed(futures):
@@ -81,6 +82,12 @@ def _round(tasks: Sequence[RunTask], waiting: list[int], workers: int, done: _On
     finally:
         pool.shutdown(cancel_futures=True)
     return sorted(left)
+
+
+def _begin(laws: tuple[str, ...]) -> None:
+    """Begin a worker, with the contact laws that its caller has."""
+    _belong_to_the_caller()
+    load_laws(laws)
 
 
 def _belong_to_the_caller() -> None:
