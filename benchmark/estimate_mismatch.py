@@ -83,6 +83,10 @@ class Kind:
 
 
 _HARD = (1e9, 1e11)
+_MILD = Kind(
+    "mild", correlated=0.03, friction=0.02, exponent=1.03, walls=0.05, inertia=0.03, mass=0.02, frame_m=1e-3,
+    radius_m=1e-3, lever_m=2e-3, filter_hz=20.0, theta_scale=3e-3,
+)  # fmt: skip
 KINDS = {
     "none": Kind("nothing"),
     "load_5": Kind("load: correlated error 5 %", correlated=0.05),
@@ -111,37 +115,8 @@ KINDS = {
     "no_theta": Kind("theta missing", theta_missing=True),
     "theta_scale": Kind("theta's scale 1 %", theta_scale=0.01),
     "clock": Kind("clock drift 1e-4", clock=1e-4),
-    "several": Kind(
-        "several mild ones",
-        correlated=0.03,
-        harmonic=0.005,
-        constant=0.005,
-        friction=0.02,
-        exponent=1.03,
-        walls=0.05,
-        inertia=0.03,
-        mass=0.02,
-        frame_m=1e-3,
-        radius_m=1e-3,
-        lever_m=2e-3,
-        filter_hz=20.0,
-        theta_scale=3e-3,
-    ),
-    "several_stochastic": Kind(
-        "several mild ones, cutting load",
-        shape="cutting",
-        correlated=0.03,
-        friction=0.02,
-        exponent=1.03,
-        walls=0.05,
-        inertia=0.03,
-        mass=0.02,
-        frame_m=1e-3,
-        radius_m=1e-3,
-        lever_m=2e-3,
-        filter_hz=20.0,
-        theta_scale=3e-3,
-    ),
+    "several": replace(_MILD, title="several mild ones", harmonic=0.005, constant=0.005),
+    "several_stochastic": replace(_MILD, title="several mild ones, cutting load", shape="cutting"),
     "pressed": Kind("pressed to one side while cutting", shape="pressed"),
     "chatter": Kind("8 Hz chatter", shape="chatter"),
     "vertical": Kind("load vertical, x at rest", shape="vertical"),

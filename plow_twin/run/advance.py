@@ -30,7 +30,27 @@ class _Column(Generic[Number]):
         return self if view is None else view.rows[self._name]
 
 
-class Advance:
+class _View:
+    """Columns that are arrays of one row as of many."""
+
+    __slots__ = ("rows",)
+
+    q = _Column[np.float64]()
+    v = _Column[np.float64]()
+    penetration = _Column[np.float64]()
+    rate = _Column[np.float64]()
+    force = _Column[np.float64]()
+    peak = _Column[np.float64]()
+    impulse = _Column[np.float64]()
+    time_in_contact = _Column[np.float64]()
+    makes = _Column[np.int64]()
+    wear_depth = _Column[np.float64]()
+
+    def __init__(self, rows: Any) -> None:
+        self.rows = rows
+
+
+class Advance(_View):
     """What the head does at a time, and what happened since the advance before: a view of one row.
 
     Attributes
@@ -59,21 +79,7 @@ class Advance:
         Estimated error of the pose in m where `max_evaluations` did not suffice for the tolerance, else 0.
     """
 
-    __slots__ = ("rows",)
-
-    q = _Column[np.float64]()
-    v = _Column[np.float64]()
-    penetration = _Column[np.float64]()
-    rate = _Column[np.float64]()
-    force = _Column[np.float64]()
-    peak = _Column[np.float64]()
-    impulse = _Column[np.float64]()
-    time_in_contact = _Column[np.float64]()
-    makes = _Column[np.int64]()
-    wear_depth = _Column[np.float64]()
-
-    def __init__(self, row: np.void) -> None:
-        self.rows = row
+    __slots__ = ()
 
     @property
     def t(self) -> float:
@@ -96,27 +102,14 @@ class Advance:
         return float(self.rows["error_estimate"])
 
 
-class _Rows:
-    """The columns of many rows."""
+class _Rows(_View):
+    """Columns of many rows: the status as numbers."""
 
-    __slots__ = ("rows",)
+    __slots__ = ()
 
-    q = _Column[np.float64]()
-    v = _Column[np.float64]()
-    penetration = _Column[np.float64]()
-    rate = _Column[np.float64]()
-    force = _Column[np.float64]()
-    peak = _Column[np.float64]()
-    impulse = _Column[np.float64]()
-    time_in_contact = _Column[np.float64]()
-    makes = _Column[np.int64]()
-    wear_depth = _Column[np.float64]()
     steps = _Column[np.int64]()
     status = _Column[np.int64]()
     error_estimate_m = _Column[np.float64]("error_estimate")
-
-    def __init__(self, rows: NDArray[np.void]) -> None:
-        self.rows = rows
 
     def __len__(self) -> int:
         return len(self.rows)

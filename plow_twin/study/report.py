@@ -10,9 +10,12 @@ import math
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from plow_twin.record.durable import whole_file, write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def require(*modules: str) -> None:
@@ -38,13 +41,22 @@ def write_html(path: Path, template: str, context: Mapping[str, Any], package: s
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["image"] = _embedded
+    environment.filters["image"] = lambda picture: _embedded(picture.read_bytes())
     environment.filters["percent"] = percent
     write_whole(path, environment.get_template(template).render(context).encode())
 
 
-def _embedded(picture: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(picture.read_bytes()).decode("ascii")
+def embedded_figure(figure: Figure) -> str:
+    """Return a figure of matplotlib as the address of an image that stands in the page itself."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    stream = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
+    return _embedded(stream.getvalue())
+
+
+def _embedded(png: bytes) -> str:
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def percent(share: float | None) -> str:

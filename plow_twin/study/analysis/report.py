@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.durable import naming, whole_file, write_whole
 from plow_twin.study.analysis.signals import signal_unit
+from plow_twin.study.report import embedded_figure
 
 if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
@@ -64,7 +63,7 @@ measured values of others: {{ part.not_compared or "none" }}.</p>{% endif %}
 {% for b in bins %}{% if b.count %}{{ "%.1f" | format(b.range_n / 1e3) }}: {{ b.count }};
 {% endif %}{% endfor %}</td></tr>{% endfor %}</table>
 {% endfor %}
-<h2>Course</h2><img alt="Pose and forces in time" src="data:image/png;base64,{{ picture }}">
+<h2>Course</h2><img alt="Pose and forces in time" src="{{ picture }}">
 </body></html>
 """
 
@@ -145,8 +144,7 @@ def _write_table(columns: Mapping[str, Any], path: Path) -> None:
 
 
 def _picture(found: Analysis) -> str:
-    """Return a PNG in base64: measured and predicted pose, largest force."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    """Return measured and predicted pose and the largest force as an embedded PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 9), layout="constrained")
@@ -174,9 +172,7 @@ def _picture(found: Analysis) -> str:
         axis.set_ylabel(text)
         axis.legend(loc="upper right", fontsize=8)
     axes[3].set_xlabel("time since the first stamp [s]")
-    stream = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
-    return base64.b64encode(stream.getvalue()).decode()
+    return embedded_figure(figure)
 
 
 def write_table_of_runs(rows: list[dict[str, Any]], out: Path, left_out: Sequence[Path] = ()) -> None:

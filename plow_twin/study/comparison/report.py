@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.durable import whole_file
 from plow_twin.study.comparison.compare import Comparison
 from plow_twin.study.comparison.windows import QUANTITIES
-from plow_twin.study.report import write_html, write_json
+from plow_twin.study.report import embedded_figure, write_html, write_json
 
 
 def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None:
@@ -34,7 +32,6 @@ def write_comparison(found: Comparison, lost: dict[str, Any], out: Path) -> None
 
 def _picture(found: Comparison) -> str:
     """Return the distributions of the peaks by pair and group as an embedded PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 4.5), layout="constrained")
@@ -53,9 +50,7 @@ def _picture(found: Comparison) -> str:
     axis.set_ylabel("largest force in a window [kN]")
     axis.set_title("Box: quartiles and median of the windows; whiskers: 5 % and 95 %")
     axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure).print_png(buffer)  # type: ignore[no-untyped-call]
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return embedded_figure(figure)
 
 
 def _write_windows(found: Comparison, path: Path) -> None:
