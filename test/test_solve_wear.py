@@ -136,7 +136,8 @@ def test_a_ratio_without_a_depth_is_named() -> None:
 
 
 def test_without_wear_its_code_is_not_compiled() -> None:
-    without, with_wear = Twin(preset("paper")), Twin(dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0)))
+    scenes = preset("paper"), dataclasses.replace(preset("paper"), wear=Wear(1e-14, 0.015, 2.0))
+    without, with_wear = (Twin(scene, excitation="sampled") for scene in scenes)
     assert without._parts.terms.wear is None and with_wear._parts.terms.wear is not None
     assert with_wear._parts.terms.sliding is None and with_wear._parts.terms.running_in is None
     assert not without.advance(2.0).wear_depth.any()

@@ -377,9 +377,9 @@ def test_contacts_under_gravity_alone_take_the_energy_of_the_height_lost(rotatio
 
 
 def test_energy_stored_where_a_recording_begins_is_no_gain_of_the_contacts(tmp_path: Path) -> None:
-    """Contacts without damping take nothing, whatever they hold where it begins, 66 J, and where it ends."""
+    """Contacts almost without damping take nothing, whatever they hold where it begins, 66 J, and where it ends."""
     scene = load_scene(PAPER)
-    scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=0.0))
+    scene = replace(scene, initial=Initial(q=(0.0151, 0.0, 0.0)), contact=replace(scene.contact, damping=1e-9))
     (tmp_path / "scene.yaml").write_text(dump_scene(scene))
     (tmp_path / "load.csv").write_text("t,fx,fy,m\n" + "".join(f"{0.002 * n},0,0,0\n" for n in range(200)))
     loads = analyse(tmp_path).predictions[0].loads
