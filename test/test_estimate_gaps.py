@@ -10,7 +10,7 @@ from estimate_support import Truth, draw, known
 from scenes import gaps_at
 
 from plow_twin.estimate.estimate import estimate, with_gaps
-from plow_twin.estimate.gaps import Gaps, GapsError, tell
+from plow_twin.estimate.gaps import Gaps, GapsError, fit_gaps
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.result import State
 
@@ -35,14 +35,16 @@ def test_gaps_give_the_clearances_without_a_contact_model(
     some = np.full_like(gap, np.nan)
     some[:, list(pairs)] = gap[:, list(pairs)]
     gaps, _ = Gaps.of(truth.poses.t, some)
-    told = tell(truth.nominal, gaps, truth.poses)
-    assert told is not None
-    assert (np.abs(told.clearance - truth.clearance) < 3.0 * told.deviation).all() and (told.deviation < 1.5e-4).all()
-    assert len(told.poses.t) == (len(gap) if len(pairs) > 4 else 0)
+    found = fit_gaps(truth.nominal, gaps, truth.poses)
+    assert found is not None
+    assert (np.abs(found.clearance - truth.clearance) < 3.0 * found.deviation).all() and (
+        found.deviation < 1.5e-4
+    ).all()
+    assert len(found.poses.t) == (len(gap) if len(pairs) > 4 else 0)
     if len(pairs) > 4:
-        assert np.abs(np.median(told.poses.q - truth.poses.q, axis=0)).max() < 1e-3
-    assert told.groups.keys() == ({"horizontal_top", "vertical_left"} if len(pairs) < 8 else set(told.groups))
-    for name, value in told.groups.items():
+        assert np.abs(np.median(found.poses.q - truth.poses.q, axis=0)).max() < 1e-3
+    assert found.groups.keys() == ({"horizontal_top", "vertical_left"} if len(pairs) < 8 else set(found.groups))
+    for name, value in found.groups.items():
         true = truth.clearance[0 if name.startswith("horizontal") else 1]
         assert abs(value.mean - true) < 4.0 * SENSOR_ERROR
 
@@ -52,7 +54,7 @@ def test_gaps_at_one_wall_alone_give_no_clearance(gapped: tuple[Truth, np.ndarra
     gap = gap.copy()
     gap[:, [3, 5]] = np.nan  # none at the right wall
     gaps, _ = Gaps.of(truth.poses.t, gap)
-    assert tell(truth.nominal, gaps, truth.poses) is None
+    assert fit_gaps(truth.nominal, gaps, truth.poses) is None
     result = estimate(truth.nominal, truth.load, Poses(truth.poses.t[:0], truth.poses.q[:0]), gaps=gaps)
     assert result.horizontal_state is State.PRIOR
     with pytest.raises(GapsError, match=r"gap \(4, 3\), expected \(n,\) and \(n, 8\)"):
@@ -69,8 +71,8 @@ def test_gaps_without_a_pose_give_an_estimate_and_a_shifted_one_is_found(gapped:
         assert abs(value.mean - true) < 1e-4 and value.p95 - value.p05 < 2e-4
     shifted = gap.copy()
     shifted[:, 1] += 2e-3
-    told = tell(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)
-    assert told is not None and told.contradiction > 5.0
-    result = with_gaps(known()[0][1], told)
+    found = fit_gaps(truth.nominal, Gaps.of(truth.poses.t, shifted)[0], truth.poses)
+    assert found is not None and found.contradiction > 5.0
+    result = with_gaps(known()[0][1], found)
     assert result.horizontal_state is result.vertical_state is State.WITHDRAWN and result.sensor == "suspect"
     assert "gaps:" in result.reasons[0]

@@ -1,4 +1,4 @@
-"""All that a window tells: the estimate, and what is asked beside it, forces with intervals and the time to a limit."""
+"""Answers from one window: the estimate and, if asked for, forces with intervals and the time to a limit."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Asked:
     """What is wanted beside the estimate.
 
     members : twins that the forces' intervals are drawn from; 0: no forces
-    span_s : the end of a window that the forces are told of [s]
+    span_s : length of the end of a window for which forces are given [s]
     plan : limits of the clearances; None: no forecast
     """
 
@@ -40,9 +40,9 @@ class Asked:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The estimate, the guess for the next window, and what was asked beside it, for JSON.
+    """The estimate, the guess for the next window, and the other answers asked for, as JSON values.
 
-    also : `forces` and `forecast` as far as they were asked for; null, with `<name>_error`, where there is none
+    also : `forces` and `forecast` if asked for; null, with `<name>_error`, where there is no answer
     """
 
     estimate: Estimate
@@ -56,7 +56,7 @@ class Answer:
 
 
 def answer(scene: Scene, window: Window, guess: Guess, asked: Asked) -> Answer:
-    """Estimate from a window, beginning at `guess`, and tell what is asked beside that."""
+    """Estimate from a window, beginning at `guess`, and give the other answers asked for."""
     result, following = estimate_window(scene, window.load, window.pose, window.lost, guess, window.gaps)
     also: dict[str, Any] = {}
     if asked.members:
@@ -82,7 +82,7 @@ def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[st
 
 
 def followed(load: Load, period: float) -> Load:
-    """Return what the members of the forces follow of a load: the fewest samples that do."""
+    """Return the load thinned to the fewest samples that the members of the forces can follow."""
     knots = int((load.t[-1] - load.t[0]) / min(_KNOT_S, _KNOT_SHARE * period))
     thin = load.thinned(_FOLLOWED)
     return load.averaged(knots) if len(thin.t) > knots else thin

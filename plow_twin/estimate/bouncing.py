@@ -1,4 +1,4 @@
-"""Clearances of a hard guide: what the whole motion is like is compared, not where the head is at each moment.
+"""Clearances of a hard guide: features of the whole motion are compared, not the pose at each moment.
 
 A hard contact returns the head many times before it rests, and which bounce it is at a moment cannot be foretold. How
 far the corners reach on the whole, and how much the pose scatters at each phase of the load, can. Motions with drawn
@@ -120,7 +120,7 @@ class Bounced:
         normal deviate of how far the drawn ones are from what the others foretell
     law : how much more the motion is like those of another law of the contact, as a normal deviate of how much those
         of the law believed are; 0 where no other is known
-    odds : logarithm of how much likelier the motion is under that law; minus infinity where none is known
+    odds : logarithm of how much likelier the motion is under the other law; minus infinity where no other is known
     """
 
     clearance: Array
@@ -137,12 +137,12 @@ class Bounced:
 
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
-    """Tell whether the contact is seen to be so hard that this way is the right one."""
+    """Return whether the contact is seen to be so hard that this way is the right one."""
     return _reach_noise(unknowns, _whole(poses)) < POSSIBLE and _is_narrow(unknowns, poses)
 
 
 def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
-    """Tell whether the head stops at one place, within the noise: the walls do not give way."""
+    """Return whether the head stops at one place, within the noise: the walls do not give way."""
     q = _whole(poses)
     reach = _reach(unknowns, q)
     return bool(np.median(reach[2] - reach[0]) < max(NARROW * _reach_noise(unknowns, q), NARROW_M))
@@ -216,7 +216,7 @@ def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
 def compare(
     forward: Forward, unknowns: Unknowns, poses: Poses, period: float, near: Array | None = None, seed: int = 0
 ) -> Bounced | None:  # fmt: skip
-    """Compare the measured motion with drawn ones; None where too few can be run, or a hard contact is none.
+    """Compare the measured motion with drawn ones; None where too few can be run, or a hard contact is excluded.
 
     They are those of hard contacts, or have about the softness and damping of `near`, a vector of unknowns.
     """
@@ -252,7 +252,7 @@ def compare(
         found = regress_near(like, targets, seen)
         moved = measured[:2] + found.value[:2] - centre
         centre = centre + moved
-        # what still moves has not been found
+        # a clearance that still moves has not converged
         deviation = np.hypot(found.deviation[:2], moved)
         if near is None and len(features) <= _DRAWS[0] and found.distance > _NOT_HARD:
             return None
@@ -302,7 +302,7 @@ class _Spread:
         return _Spread(mean, _FIRM_SPREAD * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
 
     def narrowed(self, found: _Regressed) -> _Spread:
-        """Return that about what was found."""
+        """Return the spread about a result."""
         deviation = np.minimum(np.maximum(_NARROWED * found.deviation[5:7], _NEAREST), self.deviation)
         return _Spread(found.value[5:7], deviation, _FIRM_BOUNDS)
 
@@ -349,16 +349,16 @@ class _Drawn:
         return numbers
 
     def of_other_law(self) -> _Drawn | None:
-        """Return none yet of the law that the contact may have instead, None where no such is known."""
+        """Return an empty set of draws of the law that the contact may have instead; None without such a law."""
         other = with_other_law(self.unknowns)
         return None if other is None else _Drawn(self.forward.of(other.scene), other, self.eye, self.spread, self.rng)
 
     def like(self) -> Array:
-        """Return what the motions are like, shape (n, m)."""
+        """Return the features of the motions, shape (n, m)."""
         return np.concatenate([np.array(self.features)[:, 5:], np.array(self.changes)], axis=1)
 
-    def told(self) -> Draws:
-        """Return what the motions are like, by phase of the load too, and what they were drawn with."""
+    def draws(self) -> Draws:
+        """Return the features of the motions, by phase of the load too, and the unknowns that they were drawn with."""
         of_draw = np.array(self.targets)[:, [5, 6, 7, 8, 9, 0, 1]]
         return Draws(np.concatenate([self.like(), np.array(self.by_phase)], axis=1), of_draw)
 
@@ -417,14 +417,14 @@ def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) ->
     eye = drawn.eye
     measured = np.concatenate([eye.features(eye.q)[5:], eye.changes(eye.q)])
     more = class_deviate(drawn.like(), other.like(), measured)
-    return more, log_odds(drawn.told(), other.told(), np.concatenate([measured, eye.changes_by_phase(eye.q)]))
+    return more, log_odds(drawn.draws(), other.draws(), np.concatenate([measured, eye.changes_by_phase(eye.q)]))
 
 
 def class_deviate(believed: Array, other: Array, measured: Array) -> float:
     """Return how much more features (m,) are like `other` (k, m) than like `believed` (n, m), as a normal deviate.
 
     A label of the two, each class weighing the same, is regressed; the deviate is among those of the believed ones,
-    each as it is told without it.
+    each predicted by a regression without it.
     """
     features = np.concatenate([believed, other])
     sizes = [len(believed), len(other)]
@@ -436,8 +436,8 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
     inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
     beta = inverse @ (basis.T @ (weight * label))
     leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
-    told = label - (label - basis @ beta) / (1.0 - np.minimum(leverage, 0.95))
-    right = told[: len(believed)]
+    held_out = label - (label - basis @ beta) / (1.0 - np.minimum(leverage, 0.95))
+    right = held_out[: len(believed)]
     return float((beta[0] - right.mean()) / right.std(ddof=1))
 
 
@@ -463,7 +463,7 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
 
 
 def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
-    """Return the mean square distance of a seen path (lags, k) from what the drawn ones (n, lags, k) foretell.
+    """Return the mean square distance of a seen path (lags, k) from the prediction of the drawn ones (n, lags, k).
 
     Weighed by the covariance of what the drawn ones leave over, for what the phases of a path have in common is no
     more than one deviation (Mahalanobis); of its directions the variances are drawn to their mean (Ledoit and Wolf, J.
@@ -492,7 +492,7 @@ class _Regressed:
 class _Near:
     """What a regression on features among the nearest of n draws needs.
 
-    distance, weight : (n,) from what was measured, and how much a draw counts
+    distance, weight : (n,) distance of a draw from the measured features, and its weight
     scale : (m,) scatter of the features
     basis, inverse : (n, m + 1), (m + 1, m + 1) of the normal equations
     leverage : (n,)
@@ -518,7 +518,7 @@ class _Near:
         return _Near(distance, weight, scale, basis, inverse, leverage)
 
     def regress(self, targets: Array) -> tuple[Array, Array]:
-        """Return the targets (n, k) at what was measured, shape (k,), and what is left over of them."""
+        """Return the targets (n, k) predicted at the measured features, shape (k,), and their residuals."""
         beta = self.inverse @ (self.basis.T @ (self.weight[:, None] * targets))
         return beta[0], targets - self.basis @ beta
 
@@ -530,9 +530,9 @@ class _Near:
 
 
 def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed:
-    """Regress targets (n, k) on features (n, m), the nearest to what was measured most.
+    """Regress targets (n, k) on features (n, m), weighting draws near the measured features most.
 
-    The deviations are those of a prediction at `measured`, which may lie at the edge of what was drawn.
+    The deviations are those of a prediction at `measured`, which may lie at the edge of the draws.
     """
     near = _Near.to(features, measured)
     value, error = near.regress(targets)
@@ -544,7 +544,7 @@ def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed
 
 
 def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
-    """Return the variance of what a regression leaves over, at what was measured, shape (k,).
+    """Return the residual variance of a regression at the measured features, shape (k,).
 
     It is another one for softer or noisier draws: the logarithm of the squares is regressed too (Blum and Francois).
     """
@@ -554,8 +554,8 @@ def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> A
     beta = np.linalg.solve(
         basis.T @ (weight[:, None] * basis) + held, basis.T @ (weight[:, None] * np.log(square + _NO_SCATTER))
     )
-    told = np.exp(basis @ beta)
-    size = (weight[:, None] * square / told).sum(axis=0) / weight.sum()
+    predicted = np.exp(basis @ beta)
+    size = (weight[:, None] * square / predicted).sum(axis=0) / weight.sum()
     variance: Array = size * np.exp(beta[0])
     return variance
 
@@ -636,7 +636,7 @@ class MotionFeatures:
         return q if self._there.all() else filled(Poses(self._t, np.where(self._there, q, np.nan)))
 
     def features(self, q: Array) -> Array:
-        """Return reach of the clearances, the bias that is found, then what the motion is like."""
+        """Return reach of the clearances, the bias found, then the other features of the motion."""
         whole = q[self._whole]
         bias = _near_bias(self._unknowns, whole)
         whole = whole - bias

@@ -1,7 +1,7 @@
 """The wear coefficient from clearances that were estimated over weeks.
 
 The clearance grows along one path h(E) of the exposure E = k_s s / A (s the travel), whatever the coefficient k_s is.
-So a history of clearances against travel tells k_s: its posterior is computed on a grid of ln k_s, the clearance at the
+So a history of clearances against travel gives k_s: its posterior is computed on a grid of ln k_s, the clearance at the
 beginning integrated out, from the log-normal prior of the scene's wear.
 """
 
@@ -92,7 +92,7 @@ class Coefficient:
 
 
 def coefficient(scene: Scene, history: History) -> Coefficient:
-    """Return what a history tells of the wear coefficient.
+    """Return the posterior of the wear coefficient from a history.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What load cells at the guides tell: contact forces beside the motion, for stiffness, damping and clearances.
+"""Contact forces measured by load cells at the guides, which add to the motion in stiffness, damping and clearances.
 
 After the fit the motion is known at every moment, and the law gives each pair's force from it. A cell that is not like
 its pair's force is named, and so is the law where all are unlike it; nothing is made better then. Else poses and forces
@@ -26,7 +26,7 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 Array = NDArray[np.float64]
 
-#: Fewest messages from which anything is told.
+#: Fewest messages for an answer.
 FEWEST_MESSAGES: Final = 50
 #: Beyond it a number is no force [N].
 _LARGEST = 1e12
@@ -34,7 +34,7 @@ _LARGEST = 1e12
 MOST_GAIN = 0.25
 #: Delays at which the motion's forces are compared with those measured: the largest and their distance in s.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
-#: Head room in m from which on a pad is in flight for certain, and fewest rows that tell a cell's offset.
+#: Head room in m from which on a pad is in flight for certain, and fewest such rows for a cell's offset.
 _FLIGHT, _FEWEST_FLIGHT = 1e-3, 20
 #: Fewest rows in contact from which a cell tells anything.
 _FEWEST_CONTACT = 10
@@ -44,7 +44,7 @@ _LEAST_CORRELATION = 0.7
 _STUCK_ROWS, _STUCK_FORCE = 12, 0.2
 #: What a cell without contact may show, in the largest force of the motion.
 _MOST_IN_FLIGHT = 0.2
-#: The law as Python has it: kernels call it, Python cannot call what is compiled.
+#: The law as a Python function: Python cannot call the compiled one.
 _LAW = getattr(free_force, "py_func", free_force)
 
 
@@ -93,7 +93,7 @@ class ContactForces:
 class Felt:
     """What the motion gives at the measured times.
 
-    swing : (n,) swing of each row, -1 where it lies in none
+    swing : (n,) swing of each row, -1 outside of all swings
     penetration, force : (n, 8) in m and N; NaN outside the swings
     """
 
@@ -104,10 +104,10 @@ class Felt:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells that tell something.
+    """Usable cells.
 
     pairs : (k,) numbers of their pairs
-    force : (n, 8) what they measured in N, less `offset`, (8,), what they show in flight
+    force : (n, 8) measured forces [N] less `offset`, (8,), the reading in flight
     noise : (8,) standard deviation in N
     delay : by which their stamps are later than the motion, in s
     """
@@ -130,7 +130,7 @@ class Feeling:
         self._depth = depth_of(problem.turns)
 
     def at(self, shared: Array, states: Array, delay: float) -> Felt | None:
-        """Return what is felt with these unknowns; None where the model cannot be run."""
+        """Return penetrations and forces with these unknowns; None where the model cannot be run."""
         own = shared.copy()
         own[BIAS], own[DELAY] = 0.0, delay
         point = self._problem.evaluate(own, states)
@@ -165,7 +165,7 @@ def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> t
 
 
 def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells | None, list[str]]:
-    """Return the cells that tell something, None without any, and what they say against themselves."""
+    """Return the usable cells, None without any, and the reasons against the others."""
     felt = feeling.at(found.shared, found.point.states, 0.0)
     if felt is None:
         return None, []
@@ -200,7 +200,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
 
 
 def _contradiction(measured: Array, felt: Array, pair: int, largest: float, noise: float) -> str:
-    """Return what a cell has against it, from (n, 8) measured and felt at its times; empty for nothing."""
+    """Return the reason against a cell, from (n, 8) measured and modelled forces at its times; empty without one."""
     own = felt[:, pair]
     if (own > 0.0).sum() < _FEWEST_CONTACT:
         most = float(np.abs(measured[:, pair]).max())

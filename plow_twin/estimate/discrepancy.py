@@ -92,9 +92,9 @@ class Graded:
     load : ndarray, shape (3,)
         Standard deviation of the load's error in a swing as a share of half the load's range.
     inflation : ndarray, shape (3,)
-        By what the variance of x, y, theta counts more than the fit's noise.
+        Factor by which the variance of x, y, theta exceeds the fit's noise.
     surprise : float
-        Mean square of what differs in deviations of its prior, at least 1.
+        Mean square of the differences in deviations of their prior, at least 1.
     """
 
     shared: Array
@@ -106,7 +106,7 @@ class Graded:
 
 
 def graded(problem: Problem, found: Fit, seed: int = 0) -> Graded:
-    """Return what a fit tells when the machine may differ from the model.
+    """Return the result of a fit when the machine may differ from the model.
 
     Parameters
     ----------
@@ -184,7 +184,7 @@ def _pushes(problem: Problem, found: Fit, base: Array) -> Array:
 
 
 def _of_sensor(problem: Problem, q: Array, v: Array) -> Iterator[tuple[str, Array]]:
-    """Yield the derivatives of the prediction, (n, 3), by what a sensor's error has."""
+    """Yield the derivatives of the prediction, (n, 3), by each part of a sensor's error."""
     t = problem.window.poses.t
     for index, axis in enumerate(("x", "y", "theta")):
         column = np.zeros_like(q)
@@ -256,7 +256,7 @@ class _Linearised:
         self.inflation, self.load = np.ones(3), np.full(3, _PUSH)
 
     def eliminate(self) -> None:
-        """Eliminate what each swing has of its own."""
+        """Eliminate the unknowns of each swing."""
         held = np.diag(np.concatenate([START_SPREAD**-2.0, self.load**-2.0]))
         self._blocks, self._swings = [], []
         for rows, border, own, residual, there, left in zip(
@@ -293,7 +293,7 @@ class _Linearised:
             self.load = np.maximum(np.sqrt(square / len(self._swings)), _LEAST_PUSH)
 
     def temper(self) -> None:
-        """Let measurements count less by the size of what is left over, and by how long it lasts."""
+        """Weigh measurements down by the size of the residuals and by how long they stay correlated."""
         left = np.full(self._found.point.residual.shape, np.nan)
         for rows, some, there in zip(self._rows, self._left, self._there, strict=True):
             left[rows] = np.where(there, some, np.nan).reshape(-1, 3)
@@ -340,7 +340,7 @@ class _Linearised:
         return mean, second / counted - np.outer(mean, mean), often / counted
 
     def scatter(self) -> float:
-        """Return the variance that the swings' scatter gives over that of the noise, of what moves the head."""
+        """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""
         scores = np.stack([score[:SIZE] for _, score in self._blocks])
         scores = scores - scores.mean(axis=0)
         count, moving = len(scores), list(MOVING)
@@ -352,7 +352,7 @@ class _Linearised:
         return freed * float(ratio[moving].mean())
 
     def surprise(self, mean: Array, often: Array) -> float:
-        """Return the mean square of what differs in deviations of its prior, at least 1: beyond, nothing is linear."""
+        """Return the mean square of the differences in deviations of their prior, at least 1; above, not linear."""
         z = mean[SIZE:] * np.sqrt(self._precision[SIZE:])
         # mean over the draws in which it differs
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))

@@ -14,7 +14,7 @@ from plow_twin.estimate.bouncing import FITTED, SURE, Bounced, bias_of_hard, bou
 from plow_twin.estimate.discrepancy import Graded, graded, variants
 from plow_twin.estimate.fit import MOST_LEFT, Fit, Problem
 from plow_twin.estimate.forward import Forward
-from plow_twin.estimate.gaps import Gaps, Told, tell
+from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
 from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
 from plow_twin.estimate.pads import askew, by_group, of_turns, turned
 from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, State
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
 Array = NDArray[np.float64]
-#: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: none.
+#: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: no guess.
 Guess = tuple[float, ...]
 
 #: Largest standard deviation in m with which a clearance counts as estimated.
@@ -67,7 +67,7 @@ _MOVES = 5.0
 _RESTS, _IDLE_LOAD, _STANDARD_GRAVITY = 1.3, 0.05, 9.81
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
-#: Share of what was measured of x, or y, that the model must foretell: the rest hardly counts in the fit.
+#: Share of the measured x, or y, that the model must predict: the rest hardly counts in the fit.
 FORETOLD = 0.08
 #: Penetration of both walls at most, in that under the reference force: the paper's forces are up to twice as large.
 _GIVEN = 4.0
@@ -107,7 +107,7 @@ MOST_ASKEW = 25.0
 MORE_ASKEW = 3.0
 #: Most that the freedom of the fit adds to the scatter of few swings.
 _MOST_FREED = 3.0
-#: How far gaps may be from each other, and from what the motion says, in standard deviations of theirs.
+#: How far gaps may be from each other, and from the motion's estimate, in their standard deviations.
 MOST_CONTRADICTION = 5.0
 #: Logarithms of the penetrations under the reference force that a contact can have, in m.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
@@ -136,9 +136,9 @@ def estimate(
     lost : int
         Rows that were left out before.
     gaps : Gaps, optional
-        Measured gaps: they tell the clearances directly, and the pose where that is not measured.
+        Measured gaps: they give the clearances directly, and the pose where it is not measured.
     forces : ContactForces, optional
-        Measured contact forces: they tell the contact beside the motion.
+        Measured contact forces: they say more of the contact than the motion alone.
     """
     return estimate_window(scene, load, poses, lost, gaps=gaps, forces=forces)[0]
 
@@ -152,7 +152,7 @@ def estimate_window(
     gaps: Gaps | None = None,
     forces: ContactForces | None = None,
 ) -> tuple[Estimate, Guess]:
-    """Estimate as `estimate` does, from what the window before told; return the guess for the next one too.
+    """Estimate as `estimate` does, from the result of the window before; return the guess for the next one too.
 
     Where the fit from `guess` does not hold, all is searched as without one.
     """
@@ -191,9 +191,9 @@ def _estimate(
     poses = poses.between(span[0], span[1] + 1e-9).fresh()
     poses, spikes = poses.without_spikes(noise_level(filled(poses)))
     lost += spikes
-    told = None if gaps is None else tell(scene, gaps.between(span[0], span[1] + 1e-9), poses)
-    if told is not None and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
-        poses = told.poses
+    by_gaps = None if gaps is None else fit_gaps(scene, gaps.between(span[0], span[1] + 1e-9), poses)
+    if by_gaps is not None and (len(poses.t) < FEWEST_POSES or _lacking(poses)):
+        poses = by_gaps.poses
     if forces is not None:
         forces = forces.between(span[0], span[1] + 1e-9)
     try:
@@ -202,7 +202,7 @@ def _estimate(
         result, following = _without_fit(Unknowns(scene), poses, lost, f"the fit cannot be computed: {error}"), ()
     if forces is not None and result.forces_measured is None:
         result = replace(result, forces_measured=ForcesUsed(unused="the motion is not known moment by moment"))
-    return (result, following) if told is None else (with_gaps(result, told), following)
+    return (result, following) if by_gaps is None else (with_gaps(result, by_gaps), following)
 
 
 def _from_motion(
@@ -236,7 +236,7 @@ def _from_motion(
     if guess:
         numbers = np.array(guess)
         shared, noise, turns = np.split(numbers, [SIZE, SIZE + 3])
-        # a guess is of a fit, and those of contacts harder than this are none
+        # a guess comes from a fit, and contacts harder than this are not fitted
         certain = unknowns.penetration_of(float(shared[SOFTNESS])) > FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, turns, certain)
         verdict = judge(*near, period) if near else None
@@ -293,7 +293,7 @@ def _searched(
 
 
 def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
-    """Return a vector with the clearances, softness and damping that a comparison told."""
+    """Return a vector with the clearances, softness and damping of a comparison."""
     start = shared.copy()
     start[[GX, GY]], start[DAMPING] = bounced.clearance, bounced.ln_damping[0]
     penetration = math.exp(bounced.ln_penetration[0])
@@ -302,7 +302,7 @@ def _from_bounced(unknowns: Unknowns, shared: Array, bounced: Bounced) -> Array:
 
 
 def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
-    """Put together what a fit and a comparison of the same motion tell; what they disagree by widens the interval."""
+    """Combine a fit and a comparison of the same motion; their disagreement widens the interval."""
     values = []
     for value, state, mean, deviation in zip(
         (result.horizontal, result.vertical),
@@ -341,27 +341,27 @@ def _with_turns(found: tuple[Problem, Fit], verdict: Verdict, period: float) -> 
 def _moved_back(result: Estimate, bias: Array) -> Estimate:
     """Return an estimate from poses that a bias was taken out of."""
     x, y, theta = (
-        None if told is None else Interval(told.mean + by, told.p05 + by, told.p95 + by)
-        for told, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
+        None if known is None else Interval(known.mean + by, known.p05 + by, known.p95 + by)
+        for known, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
     )
     return replace(result, bias_x=x, bias_y=y, bias_theta=theta)
 
 
-def with_gaps(result: Estimate, told: Told) -> Estimate:
-    """Put together what the motion and what gap sensors tell; where they contradict each other, nothing holds."""
+def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
+    """Combine the estimate from the motion with that from gap sensors; no state is kept where they contradict."""
     found = []
-    if told.contradiction > MOST_CONTRADICTION:
+    if by_gaps.contradiction > MOST_CONTRADICTION:
         found.append(
-            f"gaps: {told.contradiction:.1f} times their stated error from what they tell together, expected at most "
-            f"{MOST_CONTRADICTION:g}"
+            f"gaps: {by_gaps.contradiction:.1f} times their stated error from the clearances of all sensors, "
+            f"expected at most {MOST_CONTRADICTION:g}"
         )
     values, states = [], []
     for name, value, state, mean, deviation in zip(
         ("horizontal", "vertical"),
         (result.horizontal, result.vertical),
         (result.horizontal_state, result.vertical_state),
-        told.clearance.tolist(),
-        told.deviation.tolist(),
+        by_gaps.clearance.tolist(),
+        by_gaps.deviation.tolist(),
         strict=True,
     ):
         moved = value.deviation
@@ -384,7 +384,7 @@ def with_gaps(result: Estimate, told: Told) -> Estimate:
         vertical=values[1],
         horizontal_state=states[0],
         vertical_state=states[1],
-        groups=result.groups | {name: (value, state) for name, value in told.groups.items()},
+        groups=result.groups | {name: (value, state) for name, value in by_gaps.groups.items()},
         sensor="suspect" if found else result.sensor,
         reasons=(*result.reasons, *found),
     )
@@ -417,7 +417,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         states.append(_state(bool(reasons), observed))
     exponent = unknowns.scene.contact.exponent
     log = Interval.normal(*bounced.ln_penetration)
-    # what a regression extrapolates has no end
+    # a regression that extrapolates gives no bound
     log = Interval(*np.clip([log.mean, log.p05, log.p95], *_LN_PENETRATIONS).tolist())
     mean, soft, hard = (unknowns.force / np.exp(value) ** exponent for value in (log.mean, log.p95, log.p05))
     bias = [Interval.normal(*pair) for pair in zip(bounced.bias, bounced.bias_deviation, strict=True)]
@@ -428,7 +428,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
         vertical=clearances[1],
         horizontal_state=states[0],
         vertical_state=states[1],
-        # it is told by the bounces alone: the hard side stays open
+        # it follows from the bounces alone: the hard side stays open
         stiffness=Interval(float(mean), float(soft), max(float(hard), unknowns.hardest_believed)),
         damping=_damping(unknowns, Interval.normal(*bounced.ln_damping)),
         bias_x=bias[0],
@@ -450,7 +450,7 @@ def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: 
 
 
 def _both(one: tuple[float, float], other: tuple[float, float]) -> tuple[float, float]:
-    """Return mean and deviation of what two independent measurements tell together."""
+    """Return mean and deviation of two independent measurements combined."""
     weights = one[1] ** -2, other[1] ** -2
     return (one[0] * weights[0] + other[0] * weights[1]) / sum(weights), sum(weights) ** -0.5
 
@@ -463,7 +463,7 @@ def _state(withdrawn: bool, observed: bool, rough: bool = False) -> State:
 
 
 def _figures(beside: Graded | None) -> dict[str, float]:
-    """Return the sizes of what differs from the model."""
+    """Return the sizes of the differences from the model."""
     if beside is None:
         return {}
     named = zip(("fx", "fy", "m"), beside.load.tolist(), strict=True)
@@ -476,7 +476,7 @@ def _figures(beside: Graded | None) -> dict[str, float]:
 
 
 def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
-    """Return what the fit tells where the machine may differ from the model; None where data contradict themselves.
+    """Return the result of the fit where the machine may differ from the model; None where data contradict themselves.
 
     Linked swings, and walls that were found turned, are taken as they are while nothing is against the model. A fit
     that has not come to its end may be in another optimum: None too where its swings are linked, or where far more than
@@ -499,7 +499,7 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 
 
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
-    """Leave out of a load what the motion does not feel; tell whether it is broad-band: nearly every sample counts."""
+    """Thin a load to what the motion feels; return whether it is broad-band, so that nearly every sample counts."""
     most = KNOTS * max(1.0, float(load.t[-1] - load.t[0]) / period)
     shares = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
     significance = load.significance(shares[0])
@@ -509,7 +509,7 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    # where every sample is another one, their means are what moves the head
+    # where every sample is another one, their means move the head
     return load.averaged(_MOST_KNOTS * int(most)) if len(thin.t) > _MOST_KNOTS * most else thin, broad
 
 
@@ -531,7 +531,7 @@ def warm_up(scene: Scene) -> None:
 
 
 def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: ContactForces | None = None) -> Estimate:
-    """Turn a fit into values, intervals and states, with what measured contact forces tell beside it."""
+    """Turn a fit, and measured contact forces, into values, intervals and states."""
     unknowns, poses = problem.unknowns, problem.window.poses
     finished, suspect = fit.finished, bool(verdict.model or verdict.sensor)
     plain = _plain(problem, fit)
@@ -555,7 +555,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     share = foretold(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
     clearances, states = [], []
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
-        # what cannot be foretold contradicts no clearance; a head that bounces is not foretold for long
+        # a moment that cannot be predicted contradicts no clearance; a bouncing head cannot be predicted for long
         tested = share[index] > FORETOLD or unknowns.penetration_of(float(shared[SOFTNESS])) < HARD
         if not tested and finished and not suspect:
             reasons.append(f"{COMPONENTS[index]}: {share[index]:.0%} of it can be foretold, expected {FORETOLD:.0%}")
@@ -598,28 +598,28 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
 
 
 def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactForces, widened: float) -> Estimate:
-    """Put what measured contact forces tell beside the fit; where they contradict it, nothing holds."""
-    from plow_twin.estimate.force_fit import tell
+    """Combine a fit with measured contact forces; no state is kept where they contradict it."""
+    from plow_twin.estimate.force_fit import fit_jointly
 
     if "suspect" in (result.model, result.sensor) or not fit.finished:
         return replace(result, forces_measured=ForcesUsed(unused="the fit of the poses does not hold"))
-    told = tell(problem, fit, forces, widened)
-    result = replace(result, forces_measured=told.used)
-    if told.model or told.sensor:
+    joint = fit_jointly(problem, fit, forces, widened)
+    result = replace(result, forces_measured=joint.used)
+    if joint.model or joint.sensor:
         return replace(
             result,
             horizontal_state=State.WITHDRAWN,
             vertical_state=State.WITHDRAWN,
-            model="suspect" if told.model else "ok",
-            sensor="suspect" if told.sensor else "ok",
-            reasons=(*result.reasons, *told.model, *told.sensor),
+            model="suspect" if joint.model else "ok",
+            sensor="suspect" if joint.sensor else "ok",
+            reasons=(*result.reasons, *joint.model, *joint.sensor),
         )
-    if told.shared is None or told.covariance is None:
+    if joint.shared is None or joint.covariance is None:
         return result
-    covariance = told.covariance
-    covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, told.shared) ** 2
+    covariance = joint.covariance
+    covariance[[GX, GY], [GX, GY]] += _between_optima(problem.unknowns, joint.shared) ** 2
     deviation = np.sqrt(np.diag(covariance))
-    normal = [Interval.normal(value, spread) for value, spread in zip(told.shared, deviation, strict=True)]
+    normal = [Interval.normal(value, spread) for value, spread in zip(joint.shared, deviation, strict=True)]
     known = State.ESTIMATED
     return replace(
         result,
@@ -631,14 +631,14 @@ def _with_forces(result: Estimate, problem: Problem, fit: Fit, forces: ContactFo
 
 
 def _numbers(unknowns: Unknowns, normal: list[Interval]) -> dict[str, Any]:
-    """Return what an estimate tells beside the clearances, by its names, from the intervals of the shared unknowns."""
-    told = {quantity.name: value for quantity, value in zip(QUANTITIES, normal, strict=True)}
-    del told["horizontal"], told["vertical"]
+    """Return the estimate of all but the clearances, by name, from the intervals of the shared unknowns."""
+    values = {quantity.name: value for quantity, value in zip(QUANTITIES, normal, strict=True)}
+    del values["horizontal"], values["vertical"]
     contact = {
         "stiffness": _stiffness(unknowns, normal[SOFTNESS]),
         "damping": _damping(unknowns, normal[DAMPING]),
     }
-    return told | contact
+    return values | contact
 
 
 def _plain(problem: Problem, fit: Fit) -> Array:
@@ -652,7 +652,7 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
     What scatters is one thing for all unknowns that move the head: the ratio is the mean of theirs, since each by
     itself is a chance of some tens of swings. Linked swings have it in their links. The fit has taken its own freedom
     out of the scatter. Residuals beyond the noise are of one piece for long: the deviations grow with their
-    size, not with its root. The step that a fit would still take is no part of what it knows.
+    size, not with its root. The step that a fit would still take is not known.
     """
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
@@ -669,14 +669,14 @@ def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
 
 
 def _between_optima(unknowns: Unknowns, shared: Array) -> float:
-    """Return what a contact that is hard, or not quite, adds to the standard deviation of a clearance, in m."""
+    """Return the addition to the standard deviation of a clearance where the contact is hard, or nearly so, in m."""
     if unknowns.is_hard(shared):
         return HARD_SCATTER
     return FIRM_SCATTER if unknowns.penetration_of(float(shared[SOFTNESS])) < _FIRM else 0.0
 
 
 def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
-    """Return the variance that the swings' scatter gives over that which the noise gives, of what moves the head."""
+    """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""
     scattered = np.diag(sandwich(problem, fit, 1.0 / problem.deviation**2))
     swings, moving = problem.window.swings, list(MOVING)
     freed = swings / max(swings - len(moving), swings / _MOST_FREED)
@@ -686,9 +686,9 @@ def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
 def _groups(
     problem: Problem, fit: Fit, widened: float, states: list[State], shared: Array, added: Array
 ) -> dict[str, tuple[Interval, State]]:
-    """Return the clearance of each group of pads; not observable where the motion does not tell it.
+    """Return the clearance of each group of pads; not observable where the motion does not determine it.
 
-    `added` is the covariance beyond that of the fit alone; `shared` are the unknowns with what differs from the model.
+    `added` is the covariance beyond that of the fit alone; `shared` are unknowns and differences from the model.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
@@ -702,7 +702,7 @@ def _groups(
 
 
 def _correlation(covariance: Array) -> tuple[tuple[float, ...], ...]:
-    """Return the correlation of what changes the motion."""
+    """Return the correlation of the unknowns that change the motion."""
     moving = covariance[np.ix_(MOVING, MOVING)]
     deviation = np.sqrt(np.diag(moving))
     matrix = moving / np.outer(deviation, deviation)
@@ -716,7 +716,7 @@ def _unobserved(unknowns: Unknowns, deviation: Array, index: int, reach: float, 
 
 
 def _stiffness(unknowns: Unknowns, psi: Interval) -> Interval:
-    """Return the stiffness; where the contact is too hard to tell, the interval is open to the hard side."""
+    """Return the stiffness; where the contact is too hard to be resolved, the interval is open to the hard side."""
     soft, hard = unknowns.stiffness_of(psi.p95), unknowns.stiffness_of(psi.p05)
     if unknowns.within(np.full(SIZE, psi.p05))[SOFTNESS] > psi.p05:
         hard = max(hard, unknowns.hardest_believed)
@@ -731,7 +731,7 @@ def _damping(unknowns: Unknowns, value: Interval) -> Interval | None:
 
 
 def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estimate:
-    """Return what is known before anything is measured."""
+    """Return the prior as an estimate."""
     nominal, spread = unknowns.nominal(), unknowns.deviations()
     horizontal, vertical = (Interval.normal(nominal[i], spread[i]).above(0.0) for i in (GX, GY))
     psi = Interval.normal(nominal[SOFTNESS], spread[SOFTNESS])
@@ -761,20 +761,20 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
 
 
 def _is_dead(load: Load, poses: Poses) -> bool:
-    """Tell whether a load that never changes is none: under a constant one the head comes to rest."""
+    """Return whether a load that never changes must be absent: under a constant one the head comes to rest."""
     late = filled(poses)[len(poses.t) // 2 :]
     return not np.ptp(load.wrench, axis=0).any() and bool((late.std(axis=0) > _MOVES * noise_level(late)).any())
 
 
 def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
-    """Tell whether a machine stands: all but the first of its pose is noise, and the load hardly changes throughout."""
+    """Return whether a machine stands: its pose is constant but for noise, and the load hardly changes."""
     weight = scene.head.mass_kg * _STANDARD_GRAVITY
     most = _IDLE_LOAD * weight * np.array([1.0, 1.0, geometry.half_diagonal(scene)])
     return bool((load.wrench.std(axis=0) < most).all()) and _rests(poses)
 
 
 def _rests(poses: Poses) -> bool:
-    """Tell whether all but the first of the pose is noise."""
+    """Return whether all but the first of the pose is noise."""
     q = filled(poses)[len(poses.t) // 4 :]
     return bool((q.std(axis=0) < _RESTS * noise_level(q)).all())
 
@@ -782,7 +782,7 @@ def _rests(poses: Poses) -> bool:
 def _without_fit(
     unknowns: Unknowns, poses: Poses, lost: int, why: str = "no motion of the model comes near the measured one"
 ) -> Estimate:
-    """Return what can be said where there is no fit, and why."""
+    """Return the estimate where there is no fit, with the reason."""
     return replace(
         prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost),
         horizontal_state=State.WITHDRAWN,

@@ -37,13 +37,13 @@ HUBER = 3.0
 JITTER_WEIGHT = 100.0
 #: Its weight where fits are compared.
 _COMPARED_WEIGHT = 5.0
-#: Steps of the solver after which no further iteration begins: what a fit may cost is counted, not timed.
+#: Steps of the solver after which no further iteration begins: the cost of a fit is counted, not timed.
 MOST_WORK = 3_000_000
 #: Displacements of a starting state: m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
 #: Prior standard deviations of a starting state about its guess.
 START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
-#: Standard deviations of the displacements of a starting state that probe what can be foretold.
+#: Standard deviations of the displacements of a starting state that probe the predictability.
 _PROBED_STATE = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
 #: A rate of 0.1 mm/s, or mrad/s, after a second: less of it no solver and no sensor tells.
 _LEAST_DRIFT = 1e-8
@@ -80,7 +80,7 @@ class Point:
     """One set of unknowns with its runs.
 
     shared, states : (11,), (s, 6)
-    swing : (n,) swing of each pose, -1 where it lies in none
+    swing : (n,) swing of each pose, -1 outside of all swings
     residual : (n, 3) measured minus predicted; NaN where nothing was measured
     rate : (n, 3) predicted rates
     contact : (s, 8) time in contact of each pair in s
@@ -131,16 +131,16 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The best point, its covariance and what is left over.
+    """The best point, its covariance and the residuals.
 
     covariance : (11, 11) of the shared unknowns
     factor : the factorised normal equations of all unknowns
     noise : (3,) standard deviation of the measurements
     variance : (n, 3) variance of each measurement as weighted
-    jitter : (n, 3) variance of what cannot be foretold
+    jitter : (n, 3) variance that cannot be predicted
     linear : its Jacobians
-    left : (11 + 6 s,) the step that is still to be taken, linearised; none at an optimum
-    gain_left : what that step would gain of the cost
+    left : (11 + 6 s,) the step still to be taken, linearised; zero at an optimum
+    gain_left : reduction of the cost by that step
     """
 
     point: Point
@@ -157,7 +157,7 @@ class Fit:
 
     @property
     def finished(self) -> bool:
-        """Whether it is in an optimum: what is left over is then what the model does not tell."""
+        """Whether it is in an optimum: the residuals are then those of the model."""
         return self.gain_left < MOST_LEFT
 
     @property
@@ -319,7 +319,7 @@ class Problem:
 
 
 def link_weights(spans: Array, drift: Array) -> Array:
-    """Return the inverse covariance of what white noise of acceleration adds to pose and rate, shape (s, 6, 6)."""
+    """Return the inverse covariance that white noise of acceleration gives to pose and rate, shape (s, 6, 6)."""
     drift = np.maximum(drift, _LEAST_DRIFT)
     weights = np.zeros((len(spans), 6, 6))
     place = np.arange(3)
@@ -335,7 +335,7 @@ def fit(
     """Fit from a starting point; None where the model cannot be run there.
 
     `noise`, shape (3,), is a first guess; a step that gains less than `enough` of the cost is the last one; `seed`
-    draws the displacements that show what cannot be foretold.
+    draws the displacements that probe the predictability.
     """
     point = problem.evaluate(problem.unknowns.within(shared), states)
     if point is None:
@@ -371,7 +371,7 @@ def fit(
 
 
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
-    """Yield for each swing what its measurements and its link to the next swing add to the normal equations."""
+    """Yield for each swing the terms of its measurements and of its link to the next swing in the normal equations."""
     z = np.abs(point.residual) / np.sqrt(variance)
     weight = np.nan_to_num(np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / variance) * np.isfinite(point.residual)
     weighted, residual = linear.rows * weight[:, :, None], np.nan_to_num(point.residual)

@@ -1,7 +1,7 @@
 """Poses and contact forces fitted together: Gauss-Newton steps from the fit of the poses.
 
 Beside the shared unknowns are the delay of the forces and the logarithm of each cell's gain; the state at the start of
-each swing is eliminated. Moments that a small change of what is known makes hard to foretell count less, Huber's
+each swing is eliminated. Moments that a small change of the unknowns makes hard to predict count less, Huber's
 function bounds what one moment can do, and the scatter of the swings' scores widens the intervals (White 1982).
 """
 
@@ -34,10 +34,10 @@ MOST_LEFT_OVER, MOST_BY_LAW = 0.1, 0.02
 #: Mean square of a swing's normalised residuals beyond which it is not fitted to the forces: 0.5 to 0.85 where it is.
 MOST_MISFIT = 1.5
 #: Fewest rows of a cell in a swing, and its mean square force over that of the noise, from which on that is looked at.
-_FEWEST_ROWS, _TOLD = 10, 25.0
-#: Weight of the variance that cannot be foretold.
+_FEWEST_ROWS, _CLEAR = 10, 25.0
+#: Weight of the variance that cannot be predicted.
 _JITTER_WEIGHT = 10.0
-#: Steps, those before which draws show what cannot be foretold, such draws, and the gain of the cost that ends them.
+#: Steps; first steps, with draws that probe the predictability; number of draws; gain of the cost that ends them.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
 #: Steps of the difference quotients to both sides: of the delay in s and of a starting state. With the longer steps of
 #: the poses, to one side, clearances were off by 4 of their deviations.
@@ -48,11 +48,11 @@ _MOST_FREED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What poses and forces tell together.
+class JointFit:
+    """Result of the joint fit of poses and contact forces.
 
     shared, covariance : (11,), (11, 11); None where the forces were not used
-    model, sensor : what they tell against either
+    model, sensor : reasons against the model and against the sensor
     """
 
     used: ForcesUsed
@@ -74,7 +74,7 @@ class _Place:
 
 @dataclass(frozen=True, eq=False)
 class _At:
-    """A place with its runs; `force` (m,) is what the cells should show."""
+    """A place with its runs; `force` (m,) is the expected reading of the cells."""
 
     place: _Place
     point: Point
@@ -108,13 +108,13 @@ class _Block:
         )
 
 
-def not_used(why: str) -> Told:
+def not_used(why: str) -> JointFit:
     """Return that the forces were not used, and why."""
-    return Told(ForcesUsed(unused=why))
+    return JointFit(ForcesUsed(unused=why))
 
 
-def tell(problem: Problem, found: Fit, forces: ContactForces, widened: float) -> Told:
-    """Return what forces tell beside a fit of the poses, whose variance is `widened` times that of its noise."""
+def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: float) -> JointFit:
+    """Fit poses and forces together, from a fit of the poses whose variance is `widened` times that of its noise."""
     if problem.unknowns.scene.contact.restitution is not None:
         return not_used("the law's damping follows from the speed of each touch")
     if len(problem.link):
@@ -128,7 +128,7 @@ def tell(problem: Problem, found: Fit, forces: ContactForces, widened: float) ->
         return replace(not_used("a cell contradicts the motion"), sensor=tuple(against))
     if cells is None:
         return not_used("no cell is where the head touches")
-    return _Joint(problem, found, feeling, cells, widened).told()
+    return _Joint(problem, found, feeling, cells, widened).solve()
 
 
 class _Joint:
@@ -142,8 +142,8 @@ class _Joint:
             [1.0 / problem.deviation**2, [_DELAY**-2], np.full(len(cells.pairs), _GAIN**-2)]
         )
 
-    def told(self) -> Told:
-        """Return what is found from the fit of the poses on."""
+    def solve(self) -> JointFit:
+        """Return the joint fit, starting from the fit of the poses."""
         found, cells = self._found, self._cells
         felt = self._feeling.at(found.shared, found.point.states, cells.delay)
         assert felt is not None  # the cells were looked at there
@@ -158,7 +158,7 @@ class _Joint:
             return not_used("the model cannot be run")
         linear, jacobian = self._linearised(at)
         for index in range(_ROUNDS):
-            if index < _DRAWN_ROUNDS:  # at first only the poses say what is known
+            if index < _DRAWN_ROUNDS:  # at first only the poses limit the draws
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
                 self._jitter = self._unforeseen(at, jacobian, known)
@@ -190,7 +190,7 @@ class _Joint:
         return None if point is None or force is None else _At(place, point, force)
 
     def _away(self, place: _Place) -> Array:
-        """Return how far the border's unknowns are below what is expected of them."""
+        """Return the distance of the border's unknowns from their expected values, expected minus present."""
         late = self._cells.delay - place.delay
         return np.concatenate([self._problem.mean - place.shared, [late], -place.gain])
 
@@ -276,7 +276,7 @@ class _Joint:
         return None
 
     def _unforeseen(self, at: _At, jacobian: Array, blocks: list[_Block]) -> Array:
-        """Return the variance by which forces leave their linearisation within what the poses leave open, (m,)."""
+        """Return the variance of the forces about their linearisation within the uncertainty of the poses, (m,)."""
         rng, place, total = np.random.default_rng(0), at.place, np.zeros(len(at.force))
         root = np.linalg.cholesky(self._step(at, blocks)[1][:SIZE, :SIZE])
         for _ in range(_PROBES):
@@ -291,7 +291,7 @@ class _Joint:
         return total / _PROBES
 
     def _scatter(self, blocks: list[_Block], covariance: Array) -> float:
-        """Return the variance that the swings' scatter gives over that of the noise, of what moves the head."""
+        """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""
         scores = np.stack([block.score for block in blocks])
         scores = scores - scores.mean(axis=0)
         count, unknown, moving = len(blocks), self._border - (SIZE - len(MOVING)), list(MOVING)
@@ -300,7 +300,7 @@ class _Joint:
         ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
         return freed * float(ratio[moving].mean())
 
-    def _summary(self, at: _At, covariance: Array) -> Told:
+    def _summary(self, at: _At, covariance: Array) -> JointFit:
         cells, place = self._cells, at.place
         deviation, left_over = np.sqrt(np.diag(covariance)), self._left_over(at)
         found = {}
@@ -314,18 +314,18 @@ class _Joint:
         if together > MOST_BY_LAW:
             used = replace(used, unused="the law's forces are others")
             why = f"contact forces: {together:.1%} of them are left over, expected at most {MOST_BY_LAW:.0%}"
-            return Told(used, model=(why,))
+            return JointFit(used, model=(why,))
         bad = tuple(
             f"contact forces: {name}: {cell.left_over:.0%} are left over, expected at most {MOST_LEFT_OVER:.0%}"
             for name, cell in found.items()
             if cell.left_over > MOST_LEFT_OVER
         )
         if bad:
-            return Told(replace(used, unused="a cell contradicts the motion"), sensor=bad)
+            return JointFit(replace(used, unused="a cell contradicts the motion"), sensor=bad)
         unfitted = self._unfitted(at)
         if unfitted:
-            return Told(replace(used, unused=f"{unfitted} of {self._problem.window.swings} swings are not fitted"))
-        return Told(used, place.shared, covariance[:SIZE, :SIZE])
+            return JointFit(replace(used, unused=f"{unfitted} of {self._problem.window.swings} swings are not fitted"))
+        return JointFit(used, place.shared, covariance[:SIZE, :SIZE])
 
     def _unfitted(self, at: _At) -> int:
         """Return the number of swings whose forces are not those measured: their states are in another optimum."""
@@ -344,7 +344,7 @@ class _Joint:
             for swing in range(self._problem.window.swings):
                 inside = there & (self._cell == k) & (self._swing == swing)
                 square = float((at.force[inside] ** 2).mean()) if inside.sum() >= _FEWEST_ROWS else 0.0
-                if square > _TOLD * variance:
+                if square > _CLEAR * variance:
                     beyond = max(float((residual[inside] ** 2).mean()) - variance, 0.0)
                     out[-1].append(float(np.sqrt(beyond / square)))
         return out

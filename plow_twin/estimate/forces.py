@@ -2,7 +2,7 @@
 
 Each member has clearances, contact parameters and load gains of its own, drawn from the estimate with their
 correlation, and each follows every sample of the load; the quantiles over the members are the interval. After some
-load periods the members have forgotten where they began, so what they differ by is what is not known.
+load periods the members have forgotten their starts, so their differences are the uncertainty.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ FEWEST = 20
 POINTS: Final = (0.05, 0.5, 0.95)
 #: Least clearance that is drawn, as a share of the one believed.
 _LEAST_SHARE = 0.02
-#: Samples that are advanced in one call: what it returns for all members is to stay in the processor's cache.
+#: Samples advanced in one call: the rows of all members are to stay in the processor's cache.
 _CALL = 10
 
 
@@ -49,7 +49,7 @@ class Forces:
     t : (n,) in s
     force : (3, n, 8) of each pair at these times in N
     peak, impulse : (3, 8) largest force in N and impulse in N s from `start` to the last of them
-    members, left_out : twins behind it, and those that left the model's range
+    members, left_out : number of twins, and of those that left the model's range
     """
 
     start: float

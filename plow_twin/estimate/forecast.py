@@ -76,7 +76,7 @@ class Plan:
     scenarios: tuple[Scenario, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raise LifeError for numbers that are none of a plan."""
+        """Raise LifeError for numbers that no plan can have."""
         numbers = {
             "limit_horizontal_m": self.limit_horizontal_m,
             "limit_vertical_m": self.limit_vertical_m,
@@ -205,7 +205,7 @@ def forecast(
 def _forecast(
     scene: Scene, plan: Plan, deviation_m: tuple[float, float], known: Coefficient | None, multiple: float = 1.0
 ) -> Forecast:
-    """Forecast for a wear coefficient that is a multiple of what is known of it."""
+    """Forecast for a multiple of the known wear coefficient."""
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
         raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
@@ -222,7 +222,7 @@ def _forecast(
         coefficient, load = known.draw(plan.draws, rng), 1.0 + PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
-    # a clearance that is hardly known is none below zero
+    # a clearance that is hardly known is not negative
     now = np.maximum(rng.normal(0.0, 1.0, (plan.draws, 2)) * deviation_m, -_LEAST_SHARE * size)
     most = float(coefficient.max() * load.max()) * travel / wear.pad_area_m2
     # a clearance that is smaller now has further to go: the path must reach that far
@@ -277,7 +277,7 @@ def with_load(scene: Scene, multiple: float) -> Scene:
 
 
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth: Array | None = None) -> Scene:
-    """Return the scene with other clearances: those that were estimated, which hold all the wear there is.
+    """Return the scene with the estimated clearances, which include all wear so far.
 
     `depth`, shape (8,) in m, is by how much the pads are worn, where that is known: the clearances before it follow.
     With running-in they are as worn as the clearances have grown, for they no longer wear as new ones.
@@ -297,7 +297,7 @@ def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth:
 
 
 def with_estimate(scene: Scene, facts: Mapping[str, Any]) -> tuple[Scene, tuple[float, float]]:
-    """Return the scene with what an estimate tells, as its JSON has it, and the clearances' standard deviations in m.
+    """Return the scene with the values of an estimate's JSON, and the standard deviations of the clearances in m.
 
     The contact is the estimated one where a clearance was estimated with it: a softer one bears on other pads.
 

@@ -1,4 +1,4 @@
-"""What gap sensors tell: the clearances directly, whatever the contact is like, and the pose where it is not measured.
+"""Clearances from gap sensors, independent of the contact law, and the pose where it is not measured.
 
 A gap is linear in the head's body coordinates and in the clearances (`model/geometry.py`), so each message with sensors
 at enough pairs gives both by least squares: five of them, or four, one at each wall, beside a measured theta. What is
@@ -22,9 +22,9 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Constant error of a sensor in m (standard deviation) where none is stated: dirt on a worn pad.
+#: Constant error of a sensor in m (standard deviation) unless stated: dirt on a worn pad.
 CONSTANT_ERROR: Final = 1e-4
-#: Fewest messages from which anything is told.
+#: Fewest messages for an answer.
 FEWEST_MESSAGES: Final = 20
 #: Beyond it a number is no gap [m].
 _LARGEST = 1e3
@@ -48,7 +48,7 @@ class GapsError(PlowTwinError):
 class Gaps:
     """Measured gaps: `t` (n,) stamps in s, strictly increasing; `gap` (n, 8) in m, NaN where there is no sensor.
 
-    deviation : stated standard deviation of a sensor in m; 0 where none is
+    deviation : stated standard deviation of a sensor in m; 0: not stated
     """
 
     t: Array
@@ -59,7 +59,7 @@ class Gaps:
     def of(t: ArrayLike, gap: ArrayLike, deviation: float = 0.0) -> tuple[Gaps, int]:
         """Put rows in order of time; return them and how many had to be left out.
 
-        Those are the ones without a finite stamp or any gap, with one beyond 1e3 m, or with a stamp that is there.
+        Left out are rows without a finite stamp or any gap, with a gap beyond 1e3 m, or with a repeated stamp.
 
         Raises
         ------
@@ -79,14 +79,14 @@ class Gaps:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """What gaps tell.
+class GapsFit:
+    """Clearances and poses that follow from measured gaps.
 
     poses : the poses where pose and clearances follow from each message
     clearance, deviation : (2,) horizontal and vertical in m; infinite deviation where it does not follow
-    groups : the clearance between the pads that face each other, of those that have sensors
-    used : messages behind it
-    contradiction : how far sensors are from what they tell together, in their constant errors; 0 where none is spare
+    groups : the clearance between facing pads, where both have sensors
+    used : number of messages
+    contradiction : largest mean residual of a sensor, in constant errors; 0 where no sensor is redundant
     """
 
     poses: Poses
@@ -97,19 +97,21 @@ class Told:
     contradiction: float
 
 
-def tell(scene: Scene, gaps: Gaps, poses: Poses) -> Told | None:
-    """Return what gaps tell; theta is that of `poses` where the sensors alone do not give it.
+def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | None:
+    """Fit clearances and poses to gaps; theta comes from `poses` where the sensors alone do not give it.
 
-    None where fewer than 20 messages have sensors enough.
+    None where fewer than 20 messages have enough sensors.
     """
     error = gaps.deviation or CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
     theta = _theta_at(gaps.t, poses)
-    best: Told | None = None
+    best: GapsFit | None = None
     known = np.isfinite(gaps.gap)
     for pairs in np.unique(known, axis=0):
         own = (known == pairs).all(axis=1)
-        found = _told(rows, gaps.t[own], gaps.gap[own][:, pairs], np.flatnonzero(pairs), theta[own], error, scene)
+        found = _fit_one_set(
+            rows, gaps.t[own], gaps.gap[own][:, pairs], np.flatnonzero(pairs), theta[own], error, scene
+        )
         if found is not None and (best is None or found.used > best.used):
             best = found
     return best
@@ -124,9 +126,9 @@ def _theta_at(t: Array, poses: Poses) -> Array:
     return theta
 
 
-def _told(
+def _fit_one_set(
     rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], theta: Array, error: float, scene: Scene
-) -> Told | None:
+) -> GapsFit | None:
     """Solve the messages of one set of sensors; `gap` (n, k) of `pairs` (k,)."""
     # gap = half the clearances minus how far a corner reaches
     half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
@@ -146,7 +148,7 @@ def _told(
     inverse = np.linalg.pinv(equations)
     left = np.zeros_like(gap)
     for _ in range(_ROUNDS):
-        # theta is small: the equations at 0 serve all rounds, and what they leave over is worked off
+        # theta is small: the equations at 0 serve all rounds, each of which reduces the residual
         c, s = np.cos(unknown[:, 4]), np.sin(unknown[:, 4])
         reach = c[:, None] * rows[0, pairs] + s[:, None] * rows[1, pairs] + rows[4, pairs]
         left = gap - (unknown[:, :4] @ fixed.T - reach)
@@ -166,7 +168,7 @@ def _told(
         if np.isin(pair, pairs).all()
     }
     off = np.abs(left.mean(axis=0)).max() / error if len(pairs) > equations.shape[1] else 0.0
-    return Told(poses, clearance, np.hypot(spread, noise), groups, len(t), float(off))
+    return GapsFit(poses, clearance, np.hypot(spread, noise), groups, len(t), float(off))
 
 
 def _displacement(unknown: Array, scene: Scene) -> tuple[Array, Array]:

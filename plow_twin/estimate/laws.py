@@ -1,6 +1,6 @@
 """Which of two laws of a hard contact a motion is like, by its likelihood under each.
 
-What drawn motions of a law are like is a smooth function of what they were drawn with, a polynomial of few terms, and
+The features of drawn motions of a law are a smooth function of their unknowns, a polynomial of few terms, and
 normal noise; of a measured motion the likelihood under each law follows, and from it the odds of the two (synthetic
 likelihood: Wood, Nature 466 (2010) 1102; the integral over the parameters after Laplace).
 """
@@ -21,7 +21,7 @@ _OWN = 0.4
 _RIDGE, _LEAST = 1e-2, 1e-9
 #: Parameters that act to the third power, and those whose effect changes with them.
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Farthest from the middle of what was drawn, in its standard deviations.
+#: Farthest from the middle of the draws, in their standard deviations.
 _FARTHEST = 3.5
 #: Steps to the likeliest parameters (Levenberg, Marquardt), damping of the first, gain that ends them, and distance of
 #: the points of a difference quotient.
@@ -32,7 +32,7 @@ _LEAST_FREE = 0.2
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """Motions of one law: what they are like (n, m), and what they were drawn with (n, 7).
+    """Motions of one law: their features (n, m), and the unknowns that they were drawn with (n, 7).
 
     The latter are the logarithms of penetration and damping, three gains of the load, and by how much the two
     clearances differ from the reach.

@@ -145,7 +145,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
     """
     if scene.wear is None:
         raise LifeError("wear: got none, expected its parameters")
-    # as worn without running-in: what is left of the pads' own coefficient is the same for all of them
+    # as worn without running-in: the rest of the pads' own coefficient is the same for all of them
     steady = without_running_in(scene.wear, np.array(scene.wear.initial_depth_m, dtype=np.float64))
     depth = with_running_in(scene.wear, steady)
     smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
@@ -180,7 +180,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
 
 
 def _finer(columns: list[Array]) -> list[Array]:
-    """Return columns with rows between each two, on straight lines: between rows running-in is none."""
+    """Return columns with rows between each two, on straight lines: running-in between rows is neglected."""
     at = np.arange(len(columns[0]), dtype=np.float64)
     more = np.linspace(0.0, at[-1], _FINER * (len(at) - 1) + 1)
     before = np.minimum(more.astype(int), max(len(at) - 2, 0))

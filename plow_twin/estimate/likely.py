@@ -29,7 +29,7 @@ _CURVED = tuple(combinations_with_replacement(range(4), 2))
 _LEAST_FREE = 0.2
 #: Parts of the draws, each told by the others.
 _PARTS = 10
-#: Steps of Gauss and Newton, the longest one and the farthest from the middle, in deviations of what was drawn.
+#: Gauss-Newton steps, the longest one, and the farthest from the middle, in deviations of the draws.
 _STEPS, _LONGEST, _FARTHEST = 5, 1.5, 5.0
 #: Deviation of the delay that is left in s, and that of a parameter that is not known before, in that of the draws.
 _LATE_S, _FREE = 4e-3, 100.0
@@ -72,7 +72,7 @@ def _told(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
     error = (motions.like - terms @ surface) / np.sqrt(free)[:, None]
     whiten = np.linalg.inv(_root(error.T @ error / len(error))).T
     seen, late, surface = asked.like @ whiten, asked.late @ whiten, surface @ whiten
-    # what is known before: the gains and, the last one, the delay
+    # priors: of the gains and, last, of the delay
     mean = np.concatenate([np.zeros(4), (1.0 - middle[4:]) / scale[4:], np.zeros(1)])
     weight = np.concatenate([np.full(4, _FREE), gain / scale[4:], np.full(1, _LATE_S)]) ** -2.0
     point = np.zeros((len(seen), len(mean)))

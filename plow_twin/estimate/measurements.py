@@ -22,7 +22,7 @@ UNSTATED: Deviation = (0.0, 0.0, 0.0)
 _FINER = 8
 #: Fewest measured poses from which anything is estimated.
 FEWEST_POSES = 20
-#: Beyond it a number is none of a head's pose, in m or rad, or of a load, in N or N m.
+#: Largest number that can be a head's pose, in m or rad, and a load, in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
 #: Stated deviation of x, y [m], theta [rad] beyond which a component was not measured: a large one often says that.
 USELESS: Deviation = (0.05, 0.05, 0.2)
@@ -41,7 +41,7 @@ LONGEST_GAP_S, LONGEST_GAP = 0.5, 20.0
 
 
 class EstimateError(PlowTwinError):
-    """The data cannot be used; says what was got and what is expected."""
+    """The data cannot be used; the text names the value got and the value expected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Poses:
         Raises
         ------
         EstimateError
-            For arrays of the wrong shape, or a deviation that is none.
+            For arrays of the wrong shape, or an invalid deviation.
         """
         _check_deviation("poses", deviation)
         times, rows = np.asarray(t, dtype=np.float64), np.array(q, dtype=np.float64)
@@ -84,7 +84,7 @@ class Poses:
         return Poses(times[index], rows[index], deviation), len(times) - len(index)
 
     def interval(self) -> float:
-        """Return the distance in s of poses, were those that lack a component merged into whole ones."""
+        """Return the distance in s of whole poses, partial ones counted as merged."""
         measured = int(np.isfinite(self.q).sum())
         return float(np.median(np.diff(self.t))) * self.q.size / max(measured, 1)
 
@@ -116,7 +116,7 @@ class Poses:
         return Poses(self.t, np.where(spikes, np.nan, self.q), self.deviation), count
 
     def fresh(self) -> Poses:
-        """Leave out repetitions where a sensor is slower than what sends it: they are late, and their noise is one.
+        """Leave out repetitions of a sensor that is slower than its sender: they are late and share their noise.
 
         A value that stays for longer is that of a sensor that has stopped, and kept.
         """
@@ -153,12 +153,12 @@ class Load:
     def of(t: ArrayLike, wrench: ArrayLike, deviation: Deviation = UNSTATED) -> tuple[Load, int]:
         """Put samples in order of time; return them and how many had to be left out.
 
-        That is those that are not finite, beyond 1e15, or have a stamp that is there already.
+        Left out are samples that are not finite, beyond 1e15, or have a repeated stamp.
 
         Raises
         ------
         EstimateError
-            For arrays of the wrong shape, without two samples that can be used, or for a deviation that is none.
+            For arrays of the wrong shape, without two usable samples, or for an invalid deviation.
         """
         _check_deviation("load", deviation)
         times, rows = np.asarray(t, dtype=np.float64), np.asarray(wrench, dtype=np.float64)
@@ -199,11 +199,11 @@ class Load:
         return shares
 
     def period(self) -> float:
-        """Return the period in s of the strongest oscillation, or a tenth of the span where there is none."""
+        """Return the period in s of the strongest oscillation, or a tenth of the span without one."""
         return self.oscillation() or float(self.t[-1] - self.t[0]) / 10.0
 
     def oscillation(self) -> float | None:
-        """Return the period in s of the strongest oscillation, None where there is none."""
+        """Return the period in s of the strongest oscillation, None without one."""
         span = float(self.t[-1] - self.t[0])
         count = int(min(max(64, 4 * len(self.t)), 8192))
         grid = np.linspace(self.t[0], self.t[-1], count)
@@ -237,13 +237,13 @@ class Load:
     def significance(self, share: float) -> Array:
         """Return for each sample the share of the range from which on `thinned` leaves it out, shape (n,).
 
-        Infinite for the ends; 0 for those that are left out with `share` too.
+        Infinite for the ends; 0 for samples that `share` leaves out too.
         """
         scale = np.ptp(self.wrench, axis=0)
         rows = self.wrench / np.where(scale > 0.0, scale, 1.0)
         out = np.zeros(len(rows))
         out[[0, -1]] = np.inf
-        # all lines of one generation at once; what is within a line that is left out is left out
+        # all lines of one generation at once; lines within one that is left out are left out
         left, right, least = np.array([0]), np.array([len(rows) - 1]), np.array([np.inf])
         while len(left):
             inner = right - left > 1
@@ -305,7 +305,7 @@ class Load:
 
 
 def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
-    """Return the deviations that poses bring, shape (n, 3), NaN for one that brings none."""
+    """Return the deviations stated with poses, shape (n, 3), NaN where not stated."""
     return np.array([one or (math.nan,) * 3 for one in brought], dtype=np.float64).reshape(-1, 3)
 
 
@@ -317,7 +317,7 @@ def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]
     stated : tuple of 3 float
         Least deviation of each component.
     q, own : ndarray, shape (n, 3)
-        Poses and the deviations that they bring, NaN where none.
+        Poses and their stated deviations, NaN where not stated.
 
     Returns
     -------

@@ -38,7 +38,7 @@ assert list(_MADE_OF) == list(GROUPS)
 def by_group(problem: Problem, found: Fit, widened: float) -> dict[str, tuple[Interval, float]]:
     """Return the clearance of each group with its standard deviation in m.
 
-    `widened` is what the deviations of the fit are multiplied by for what scatters beyond the noise.
+    `widened` multiplies the deviations of the fit for scatter beyond the noise.
     """
     step, covariance = _joint_step(problem, found)
     out = {}

@@ -38,7 +38,7 @@ KINDS: Final = {
 
 
 def is_stated(scene: Scene, path: str) -> bool:
-    """Tell whether the scene states how well it knows a number."""
+    """Return whether the scene states how well it knows a number."""
     provenance = scene.marks.get(path)
     return provenance is not None and provenance.deviation is not None
 

@@ -126,7 +126,7 @@ class Units:
                 return time**2
             return length if name.startswith(("frame.", "turn_", "lever_")) else 1.0
 
-        told = (f"all in units of {length:g} m, {self.mass:g} kg, {time:g} s: the machine is not of the paper's size",)
+        scale = (f"all in units of {length:g} m, {self.mass:g} kg, {time:g} s: the machine is not of the paper's size",)
         return replace(
             found,
             t_start=found.t_start * time,
@@ -141,7 +141,7 @@ class Units:
             forces_measured=None
             if found.forces_measured is None
             else found.forces_measured.in_units(self.force, self.time),
-            reasons=found.reasons + told if found.reasons else (),
+            reasons=found.reasons + scale if found.reasons else (),
         )
 
     def _damping(self, contact: Contact) -> float:

@@ -184,7 +184,7 @@ class Unknowns:
         return deviations
 
     def is_hard(self, vector: Array) -> bool:
-        """Tell whether the contact is so hard that its bounces cannot be foretold for long."""
+        """Return whether the contact is so hard that its bounces cannot be foretold for long."""
         return bool(vector[SOFTNESS] < math.log(_HARD + _RESOLVED))
 
     def softness_of(self, stiffness: float) -> float:

@@ -193,7 +193,7 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
 
 
 def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Tell whether the sensor's scales are other ones; what a wrong model leaves over is told by other tests."""
+    """Return whether the sensor's scales are other ones; what a wrong model leaves over is told by other tests."""
     if not fit.finished:
         return
     scales = scales_of(problem, fit)

@@ -1,1 +1,1 @@
-"""The live twin without a transport: session, recording, wear, alarms, health; and what feeds it without ROS."""
+"""The live twin without a transport: session, recording, wear, alarms, health; and its inputs without ROS."""

@@ -123,7 +123,7 @@ def call(path: Path, service: str, text: str = "") -> tuple[bool, str]:
 
 
 def _answers(path: Path) -> bool:
-    """Tell whether a process holds a socket open."""
+    """Return whether a process holds a socket open."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
         try:
             client.connect(str(path))

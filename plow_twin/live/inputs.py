@@ -53,7 +53,7 @@ class Inputs:
         self._front, self._source = front, source
         #: judges the samples of the load; those that go no further are counted there
         self.intake = Intake(on_unused=self._sample_unused, **intake)
-        #: what is not used, for the journal
+        #: messages that are not used, for the journal
         self.unused = UnusedMessages(journaled)
         #: topic and sender of the message that is being taken in, where it is not one of the source
         self.arriving = ("", b"")
@@ -72,7 +72,7 @@ class Inputs:
         self.wait_s = 0.0
         self._heard_ns: dict[str, int] = {}
         self._other_heard_ns: dict[str, int] = {}
-        #: messages that were sent and could not be read, as far as the transport tells
+        #: messages that were sent and could not be read, as far as the transport knows
         self.lost = 0
         self.travel, self.head_pose, self.gaps = (Intake(on_unused=self._unused) for _ in OPTIONAL)
         self._gap_limits: Limits | None = None
@@ -86,7 +86,7 @@ class Inputs:
         self.publishers = dict.fromkeys(TOPICS, 0)
 
     def set_limits(self, travel: Limits, pose: Limits, gap: Limits) -> None:
-        """Set what is used of speeds along the face [m/s], of poses (x, y [m], theta [rad]) and of gaps [m]."""
+        """Set the limits of speeds along the face [m/s], of poses (x, y [m], theta [rad]) and of gaps [m]."""
         self.travel.limits, self.head_pose.limits, self._gap_limits = travel, pose, gap
 
     def other_senders(self) -> list[str]:
@@ -148,7 +148,7 @@ class Inputs:
         self.unused.note(topic, sender, "not_followed", stamp_ns, values)
 
     def _follows(self, topic: str, stamp_ns: int, values: Sequence[float]) -> bool:
-        """Tell whether the sender of the message on an optional input is the one followed; counted, when it is not."""
+        """Return whether the message on an optional input is of the sender followed; others are counted."""
         sender = self.arriving[1]
         followed = self.optional[topic].hear(sender, time.monotonic_ns())
         if not followed:
@@ -169,7 +169,7 @@ class Inputs:
         if not self._follows("head_pose", stamp_ns, (*pose, *deviation)):
             return False
         missing = [math.isnan(value) for value in pose]
-        # what was not measured breaks no limit
+        # a component that was not measured breaks no limit
         judged = pose if all(missing) else _filled(pose, self._newest_pose)
         verdict = self._judged("head_pose", self.head_pose, stamp_ns, (*judged, *deviation), self._poses)
         if verdict.used and verdict is not Verdict.WORKED_IN:
@@ -192,10 +192,10 @@ class Inputs:
         return verdict.used
 
     def _is_implausible(self, stamp_ns: int, gaps: Mapping[int, float]) -> bool:
-        """Tell whether a gap is larger than it can be, or has changed faster since the newest one of its pair."""
+        """Return whether a gap is larger than it can be, or has changed faster since the newest one of its pair."""
         limits = self._gap_limits
         if limits is None or not all(map(math.isfinite, gaps.values())):
-            return False  # what is no number has a reason of its own
+            return False  # a value that is no number has a reason of its own
         for pair, gap in gaps.items():
             before_ns, before = self._newest_gaps.get(pair, (stamp_ns, gap))
             passed_s = (stamp_ns - before_ns) * 1e-9

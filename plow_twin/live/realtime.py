@@ -8,13 +8,13 @@ from typing import Final
 
 from plow_twin.live.parameters import Settings
 
-#: `mlockall`: what is mapped now, and what will be.
+#: `mlockall`: present and future pages.
 _MCL_CURRENT: Final = 1
 _MCL_FUTURE: Final = 2
 
 
 def apply_realtime(settings: Settings) -> list[str]:
-    """Ask the system for what the settings say; return in words what it refused."""
+    """Ask the system for the settings; return in words those that it refused."""
     refused = []
     if settings.priority:
         try:

@@ -116,7 +116,7 @@ class Recording:
         return self._recorder.snapshot_wanted
 
     def renew(self, session: Session) -> bool:
-        """Journal a snapshot when entries were lost and there is room again; tell whether that was so."""
+        """Journal a snapshot when entries were lost and there is room again; return whether it did."""
         wanted = self._recorder.snapshot_wanted
         if wanted:
             self._recorder.journal(session.renew())
@@ -127,5 +127,5 @@ class Recording:
         return self._recorder.mark()
 
     def close(self) -> LossReport:
-        """Write what is queued and close the file."""
+        """Write the queue and close the file."""
         return self._recorder.close()

@@ -94,7 +94,7 @@ class Runtime:
         self._early: list[Arrival] = []
         self._seen: tuple[Any, ...] = ()
         self.wear_keeper: WearKeeper | None = None
-        #: what the wear's identity is
+        #: identity of the scene, by which wear is kept
         self.identity = scene_identity(self.scene)
         kept = kept_wear.get(self.identity)
         depth = kept.depth_m if kept else None
@@ -102,7 +102,7 @@ class Runtime:
         if misplaced:
             raise ParameterError(misplaced)
         self.alarms = alarms_of(asdict(settings))
-        # refuses, here and not while samples come, what the settings would change
+        # a change of the model that cannot be made is refused here, not while samples come
         changed_twin(prepared.twin, prepared.scene, model_changes(settings))
         with ExitStack() as made:
             if settings.wear_state_path:
@@ -234,7 +234,7 @@ class Runtime:
 
     @property
     def missed_periods(self) -> int:
-        """Periods left out between two reports from which on there is a warning; 0: none."""
+        """Periods left out between two reports from which on there is a warning; 0: no warning."""
         return self.settings.missed_periods
 
     def time_text(self, stamp_ns: int) -> str:
@@ -291,7 +291,7 @@ class Runtime:
         return lost
 
     def periodic(self) -> list[tuple[float, Callable[[], float | None]]]:
-        """Return what the front is to call while the twin is active, each with its rate [Hz] on a steady clock.
+        """Return the calls that the front makes while the twin is active, each with its rate [Hz] on a steady clock.
 
         What is returned is as of `Timer`.
         """
@@ -334,7 +334,7 @@ class Runtime:
             self.driver.parameter(name, value)
 
     def _set_limits(self, settings: Settings) -> None:
-        """Set what of the inputs besides the load is plausible."""
+        """Set the limits of the inputs besides the load."""
         pose = pose_limits(self.scene, settings.limit_pose, settings.limit_pose_rate)
         travel = value_limits(settings.limit_travel, settings.limit_travel_rate)
         scene = changed_scene(self.scene, model_changes(settings))
@@ -345,7 +345,7 @@ class Runtime:
         )
 
     def step(self, arrived: list[Arrival]) -> Iterator[Outgoing]:
-        """Take samples in order of arrival; yield what is to be sent, each message before more is computed."""
+        """Use samples in order of arrival; yield the messages, each before more is computed."""
         if self._start_due:
             self.start()
         if self._start_due:
@@ -415,7 +415,7 @@ class Runtime:
         return Estimation(self.settings, self.scene)
 
     def _journal(self) -> Callable[[Entry], object]:
-        """Return who is told of each entry: the recording, the estimate, both or nobody."""
+        """Return the receiver of each entry: the recording, the estimate, both or nobody."""
         recording, estimation = self.recording, self.estimation
         if estimation is None:
             return recording.journal if recording else _ignore
@@ -474,7 +474,7 @@ class Runtime:
             self._send(self.step([]))
 
     def _journal_unused(self) -> None:
-        """Put what was not used into the journal, once there is one."""
+        """Journal the unused messages, once there is a journal."""
         if not self._start_due:
             for entry in self.inputs.unused.taken(self._front.sender_name):
                 self.driver.session.emit(entry)
@@ -526,7 +526,7 @@ def policy(settings: Settings) -> Policy:
 
 
 def limits(settings: Settings, scene: Scene) -> Limits:
-    """Return what a measured load can be at most."""
+    """Return the limits of a measured load."""
     return excitation_limits(
         scene, settings.limit_force, settings.limit_moment, settings.limit_force_rate, settings.limit_moment_rate
     )

@@ -39,7 +39,7 @@ class Prepared:
 class Preparation:
     """A twin being made ready in a thread of its own.
 
-    `warm_up` compiles, in the same thread, what else is needed.
+    `warm_up` compiles all else that is needed, in the same thread.
     """
 
     def __init__(self, settings: Settings, warm_up: Callable[[], None] = lambda: None) -> None:
@@ -72,7 +72,7 @@ class Preparation:
 
 
 def key(settings: Settings) -> tuple[object, ...]:
-    """Return what a prepared twin depends on; a scene file that has been written to is another one."""
+    """Return the settings that a prepared twin depends on; a scene file that has been written to counts as another."""
     try:
         found = os.stat(scene_path(settings.scene))
     except (OSError, PlowTwinError):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Timer:
-    """Call `do` each `period_s`; what is missed is left out, and the phase is kept.
+    """Call `do` each `period_s`; missed calls are left out, and the phase is kept.
 
     `do` may return for how long there is nothing to do [s]: it is not called before.
     """

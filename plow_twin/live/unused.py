@@ -8,7 +8,7 @@ from typing import Final
 
 from plow_twin.stream.journal import Unused
 
-#: Messages told in full by one entry of the journal; of those beyond it, until the entry is written, only the count.
+#: Messages that one entry of the journal holds in full; of further ones, until it is written, only the count.
 _MOST: Final = 500
 
 
@@ -50,7 +50,7 @@ class UnusedMessages:
             self._pending.setdefault((topic, sender, "lost"), _Pending()).count += count
 
     def taken(self, name_of: Callable[[str, bytes], str]) -> list[Unused]:
-        """Return the entries of what has been collected, and forget it; `name_of` names a sender of an input."""
+        """Return the entries collected, and forget them; `name_of` names a sender of an input."""
         pending, self._pending = self._pending, {}
         return [
             Unused(topic, name_of(topic, sender), reason, found.count, tuple(found.stamps_ns), tuple(found.values))

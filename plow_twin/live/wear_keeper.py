@@ -66,14 +66,14 @@ class WearKeeper:
         self._claim: int | None = claim_folder(folder)
         self._identity = scene_identity(scene)
         self._saved: tuple[float, ...] | None = None
-        self._own: tuple[bytes, ...] = ()  # what the file may hold: what was read, or written the last time
+        self._own: tuple[bytes, ...] = ()  # possible contents of the file: as read, or as written last
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="wear")
         self._writing: Future[None] | None = None
         #: why it could not be saved the last time; empty: it could
         self.error = ""
 
     def load(self, kept: KeptWear | None = None) -> tuple[float, ...] | None:
-        """Return the depths [m] to go on with, or None when there are none.
+        """Return the depths [m] to go on with, or None without any.
 
         Those of the file, unless it is the one that the `kept` ones could not replace.
 
@@ -136,7 +136,7 @@ class WearKeeper:
             self._saved, self.error = values, ""
 
     def _is_claimed(self) -> bool:
-        """Tell whether the folder of that name is the one that this twin has claimed."""
+        """Return whether the folder of that name is the one that this twin has claimed."""
         try:
             return self._claim is not None and os.path.samestat(os.fstat(self._claim), self.folder.stat())
         except FileNotFoundError:

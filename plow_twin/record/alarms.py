@@ -125,7 +125,7 @@ class AlarmCheck:
         published: Published,
         poses: Sequence[tuple[int, int, Pose]] = (),
     ) -> None:
-        """Take in what was published after entries, each with its number and step, and the poses between them."""
+        """Judge publications after entries, each with its number and step, and the poses between them."""
         if not self.possible:
             return
         if not self._alarms.follows_poses:

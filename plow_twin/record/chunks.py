@@ -19,7 +19,7 @@ from numba.core import types
 from plow_twin.errors import ForeignRecordingError, RecordingError
 from plow_twin.record.compression import RECORD_LIMIT, decompress
 from plow_twin.record.template import Bytes, Indexes, compiled
-from plow_twin.record.words import fetch, word
+from plow_twin.record.words import word
 
 try:  # twenty times as fast as the standard library's
     from isal.isal_zlib import crc32 as crc32
@@ -46,8 +46,6 @@ _CHUNK_HEAD: Final = struct.Struct("<QQQII")
 MESSAGE_HEAD: Final = 31
 _MESSAGE_FIELDS: Final = MESSAGE_HEAD - _HEAD_SIZE
 _COLUMNS: Final = 6
-#: Messages ahead whose heads are prefetched: a multiple of the three of a publication.
-_FETCHED: Final = 12
 #: Chunks below that size [B] are scanned together.
 _SMALL: Final = 2**18
 #: The same where the large chunks between them are not opened.
@@ -450,10 +448,6 @@ def scan(content: Bytes, table: Indexes, others: Indexes) -> tuple[int, int, boo
             table[0, count], table[1, count] = head & 0xFFFF, head >> 16 & 0xFFFFFFFF
             table[2, count], table[3, count] = word(content, start + 6), word(content, start + 14)
             table[4, count], table[5, count] = start + _MESSAGE_FIELDS, length - _MESSAGE_FIELDS
-            if count >= _FETCHED:  # messages repeat their lengths: the head of a later one
-                head_at = 2 * place - (table[4, count - _FETCHED] - MESSAGE_HEAD)
-                fetch(content, head_at)
-                fetch(content, head_at + MESSAGE_HEAD - 1)
             count += 1
         elif opcode in (_SCHEMA, _CHANNEL):
             if other < others.size:

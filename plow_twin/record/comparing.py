@@ -11,13 +11,11 @@ from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.record.chunks import Messages
 from plow_twin.record.outputs import REPLAYED
 from plow_twin.record.template import STAMP_AT, Indexes, Templates, compiled, stamp_word
-from plow_twin.record.words import eight_differ, fetch, word, word_at
+from plow_twin.record.words import eight_differ, word, word_at
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import Cadence
 
 _KINDS = len(REPLAYED)
-#: Messages ahead that are fetched, a cache line [B] after the other.
-_FETCHED, _LINE = 4, 64
 _IS_SLOW = np.array([topic.cadence is Cadence.SLOW for topic in REPLAYED])
 
 
@@ -50,7 +48,7 @@ class Sent:
         self.publication[self.taken] = np.arange(len(self.taken))
 
     def expect(self, published: Published, templates: Templates, kinds: NDArray[np.bool_]) -> None:
-        """Take what is published after the advances `taken`; only `kinds` of its messages are compared."""
+        """Set the publications after the advances `taken`; only `kinds` of their messages are compared."""
         rows, slow = published
         slow_of = np.full(len(rows), -1)
         slow_of[slow["row"]] = np.arange(len(slow))
@@ -72,7 +70,7 @@ class Sent:
 
 @compiled
 def find_advances(sequence, kind, done, first, after, counts, numbers):  # type: ignore[no-untyped-def]
-    """Fill what `Sent` holds; `numbers` receives the number of the first message after each advance."""
+    """Fill the arrays of `Sent`; `numbers` receives the number of the first message after each advance."""
     for n in range(sequence.size):
         advance = done[sequence[n] - first] - 1
         after[n] = advance
@@ -119,7 +117,7 @@ def compare(  # type: ignore[no-untyped-def]
     kinds, after : ndarray of int64, shape (n,)
         As in `Sent`.
     publication, slow : ndarray of int64
-        Publication by advance, and by publication the row of its slow part, below 0 where there should be none.
+        Publication by advance, and by publication the row of its slow part, below 0 without one.
     compared : ndarray of bool
         By kind.
     pieces, piece_ends
@@ -127,7 +125,7 @@ def compare(  # type: ignore[no-untyped-def]
     data, fixed, ends
         As in `Templates`.
     different : ndarray of bool, shape (n,)
-        Receives what was found, of which the number is returned.
+        Receives the result for each message; the number of True is returned.
     """
     count = 0
     for n in range(starts.size):
@@ -136,9 +134,6 @@ def compare(  # type: ignore[no-untyped-def]
         if not different[n]:
             continue
         count += 1
-        if n + _FETCHED < starts.size:
-            for line in range(0, lengths[n + _FETCHED], _LINE):
-                fetch(buffer, starts[n + _FETCHED] + line)
         row, first, size = publication[after[n]], ends[k], ends[k + 1] - ends[k]
         place = slow[row] if _IS_SLOW[k] else row
         if place < 0 or lengths[n] != size or start < 0 or start + size > buffer.size:

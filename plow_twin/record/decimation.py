@@ -28,7 +28,7 @@ class Decimation:
         self._peak = np.zeros(PAIR_COUNT)
 
     def take(self, published: Published) -> Published | None:
-        """Return what to record now of a publication of one row, or None."""
+        """Return the publication to record after one of one row, or None."""
         if self._outputs == "all":
             return published
         if self._outputs == "none":

@@ -148,7 +148,7 @@ class ByteFile(Protocol):
         """Wait for the disk."""
 
     def is_linked(self) -> bool:
-        """Tell whether the path still leads to this file."""
+        """Return whether the path still leads to this file."""
 
     def close(self) -> None:
         """Close it."""
@@ -322,7 +322,7 @@ class McapFile:
         self._file.sync()
 
     def is_linked(self) -> bool:
-        """Tell whether the path still leads to this file."""
+        """Return whether the path still leads to this file."""
         return self._file.is_linked()
 
     def close(self) -> None:
@@ -399,7 +399,7 @@ class UnbufferedFile:
         os.fdatasync(self._descriptor)
 
     def is_linked(self) -> bool:
-        """Tell whether the path still leads to this file."""
+        """Return whether the path still leads to this file."""
         try:
             return os.path.samestat(os.fstat(self._descriptor), os.stat(self._path))
         except FileNotFoundError:

@@ -35,7 +35,7 @@ def _by_pair(*quantities: str) -> tuple[str, ...]:
     return tuple(f"{pair}/{quantity}" for quantity in quantities for pair in PAIR_NAMES)
 
 
-#: Columns of each table. The first two hold what the twin took, the others what it sent.
+#: Columns of each table. The first two hold inputs of the twin, the others its outputs.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "excitation": ("fx", "fy", "m"),
     "head_pose": _POSE,
@@ -101,7 +101,7 @@ class Recording:
         return Table(self, name, COLUMNS[name])
 
     def losses(self) -> dict[str, int]:
-        """Return the counts of what the recording lacks, by topic; the whole of it is read."""
+        """Return the counts of missing messages by topic; the whole recording is read."""
         reader = RunReader(self.path)
         for _ in reader.batches(outputs=False):
             pass

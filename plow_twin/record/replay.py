@@ -1,4 +1,4 @@
-"""Run a recording again: the model advances on the journal alone, and what was recorded is compared with what it does.
+"""Run a recording again: the model advances on the journal alone, and recorded messages are compared with its own.
 
 Nothing is copied from the recorded messages. The state is taken from a recorded snapshot only where the journal begins
 or where something was lost; any other snapshot is compared.
@@ -230,12 +230,12 @@ class _Replay:
             self._note(Divergence(*difference))
 
     def _messages(self, sent: SentMessages, begin: int, end: int) -> None:
-        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # what is written is formed anew
+        chosen = (sent.kind[begin:end] >= 0) == (self.sink is None)  # messages to be written are formed anew
         for index in (begin + np.flatnonzero(chosen)).tolist():
             self.output(sent.record(index))
 
     def _run(self, entries: Entries, sent: SentMessages, begin: int, end: int) -> bool:
-        """Apply a run of samples and digests at once and compare what was sent; False: nothing was done."""
+        """Apply a run of samples and digests at once and compare the messages sent; False: nothing was done."""
         done: Indexes = np.cumsum(entries.sample, dtype=np.int64)
         digests = entries.digest_at
         stamps, wrench = entries.samples()
@@ -352,7 +352,7 @@ class _Replay:
         return differences
 
     def _difference(self, record: OutputRecord, published: Published) -> tuple[str, str, str] | None:
-        """Return what differs between a recorded message and that of a publication, computed as the node does."""
+        """Return the difference between a recorded message and that of a publication, computed as the node does."""
         name = self.topics[record.topic]
         computed = publication_messages(published, self.header.frame_id, self.header.child_frame_id).get(name)
         if computed is None:
@@ -414,7 +414,7 @@ class _Replay:
             self.first_ns = entry.stamp_ns if self.first_ns is None else self.first_ns
         try:
             self.session.apply(entry)
-        except ValueError:  # refused by the live session as well; if not, the next comparison tells
+        except ValueError:  # refused by the live session as well; if not, the next comparison fails
             self.report.refused += 1
 
     def _snapshot(self, snapshot: Snapshot) -> None:

@@ -98,7 +98,7 @@ def _sources(topic: Topic) -> NDArray[np.int64]:
 
 
 def _integers(topic: Topic) -> NDArray[np.bool_]:
-    """Tell of the numbers of a message whether they are integers in its record."""
+    """Return which numbers of a message are integers in its record."""
     fields: Any = topic.record_type.fields
     return np.concatenate([np.full(count, fields[name][0].base.kind == "i") for name, count in topic.parts])
 

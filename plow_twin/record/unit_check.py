@@ -109,7 +109,7 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
 
 
 def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
-    """Tell whether the mapping states how each of the numbers is to be read."""
+    """Return whether the mapping states how each of the numbers is to be read."""
     role = roles[doubt.role]
     return set(doubt.names) <= {*role.factor, *role.scale, *role.limits}
 

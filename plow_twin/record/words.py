@@ -51,23 +51,6 @@ def _bits(typingctx: Any, number: Any) -> Any:
     return types.int64(types.float64), codegen
 
 
-def _fetch(typingctx: Any, data: Any, place: Any) -> Any:
-    """Prefetch the cache line of byte `place` of a contiguous array, which may be outside of it."""
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer, flag = ir.IntType(8).as_pointer(), ir.IntType(32)
-        kind = ir.FunctionType(ir.VoidType(), [pointer, flag, flag, flag])
-        prefetch: Any = cgutils.get_or_insert_function(  # type: ignore[no-untyped-call]
-            builder.module, kind, "llvm.prefetch.p0"
-        )
-        here = builder.bitcast(_place(context, builder, signature, arguments), pointer)
-        # for reading, into all caches, data
-        builder.call(prefetch, [here, flag(0), flag(3), flag(1)])
-        return context.get_dummy_value()
-
-    return types.void(data, place), codegen
-
-
 def _eight_differ(typingctx: Any, data: Any, place: Any, address: Any) -> Any:
     """Return 0 if the 64 bytes from byte `place` of a contiguous array on equal those at an address."""
 
@@ -97,6 +80,5 @@ def _word_at(typingctx: Any, address: Any) -> Any:
 word = cast("Callable[[Any, Any], Any]", intrinsic(_word))
 set_word = cast("Callable[[Any, Any, Any], None]", intrinsic(_set_word))
 bits = cast("Callable[[float], int]", intrinsic(_bits))
-fetch = cast("Callable[[Any, Any], None]", intrinsic(_fetch))
 eight_differ = cast("Callable[[Any, Any, int], int]", intrinsic(_eight_differ))
 word_at = cast("Callable[[int], int]", intrinsic(_word_at))

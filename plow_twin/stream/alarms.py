@@ -1,4 +1,4 @@
-"""Alarms on what is published: two levels, hysteresis, minimum duration, latched until acknowledged.
+"""Alarms on publications: two levels, hysteresis, minimum duration, latched until acknowledged.
 
 They follow from the publications and the acknowledgements alone, so that a replay gives the same ones.
 """
@@ -111,7 +111,7 @@ class Alarm:
         return True
 
     def stays(self, values: NDArray[np.float64]) -> bool:
-        """Tell whether none of these values can change a level."""
+        """Return whether none of these values can change a level."""
         if self.level or self.lowest == math.inf:  # without a threshold there is no level
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
@@ -128,7 +128,7 @@ class _Model:
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
         """Take in where the model is; return stamps and residuals [m] of the poses that have waited for it."""
         place = bisect_left(self._stamps_ns, stamp_ns)
-        # late samples have been worked in: what came after them is computed again
+        # late samples have been worked in: the motion after them is computed again
         del self._stamps_ns[place:], self._q[place:]
         self._stamps_ns.append(stamp_ns)
         self._q.append((x, y))
@@ -179,7 +179,7 @@ class Alarms:
         self.raised: list[str] = []
 
     def take(self, published: Published) -> Iterator[int]:
-        """Take in what is published; yield the number of each row that has changed a level, right after it.
+        """Judge publications; yield the number of each row that has changed a level, right after it.
 
         What had no sample says nothing of the machine.
         """
@@ -227,7 +227,7 @@ class Alarms:
         return self._model is not None
 
     def _take_quiet(self, published: Published) -> bool:
-        """Take in many rows at once where none can change a level; else tell so, and take in nothing."""
+        """Judge many rows at once and return True; False, and nothing is judged, where a row may change a level."""
         rows, slow = published
         growth = self.alarms.get("clearance_rate")
         if self._model is not None or rows["held"].any() or (growth is not None and growth.lowest < math.inf):
@@ -244,7 +244,7 @@ class Alarms:
                 for found in zip(stamps_ns, earlier, strict=False):
                     self._growth(*found)
             rate = self._growth(stamps_ns[-1], clearance)
-        # of what changes nothing the newest is remembered
+        # without a change of level the newest values are remembered
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
             if name in self.alarms:

@@ -75,14 +75,14 @@ class Policy:
 
 
 class Driver:
-    """Feed a session from live events and return what is to be published.
+    """Feed a session from live events and return the publications.
 
     Times are passed in: `now_ns` on a steady clock, stamps on the samples' own.
 
     Parameters
     ----------
     session, intake, policy
-        What is driven, what judges the samples, what rules over silence and failures.
+        The session to drive, the judge of the samples, and the rules for silence and failures.
     every_sample : bool
         Publish after each advance; else only `due` publishes.
     """
@@ -112,7 +112,7 @@ class Driver:
         #: model time that has been counted [ns]
         self._counted_ns: int | None = None
         self._zeroed = False
-        #: what the stamps of the scene's own loads lie behind the clock [ns]: time spent inactive
+        #: delay of the stamps of the scene's own loads behind the clock [ns]: time spent inactive
         self._behind_ns = 0
         self._resumed = False
 
@@ -122,7 +122,7 @@ class Driver:
         return self._newest_ns
 
     def samples(self, arrived: Iterable[Arrival], now_ns: int) -> Iterator[Published]:
-        """Judge samples in order of arrival, advance to those that are used, and yield what is to be published.
+        """Judge samples in order of arrival, advance to those that are used, and yield the publications.
 
         The caller publishes it before it asks for more, so that a recording holds publications in order. A sample whose
         stamp jumps waits for the next one.
@@ -173,7 +173,7 @@ class Driver:
         insort(run, Sample(stamp_ns, wrench), key=_stamp)
 
     def due(self) -> Published:
-        """Return what is to be published of all since the last publication."""
+        """Return the publication of all advances since the last one."""
         return self.session.outputs.take()
 
     def silence(self, now_ns: int) -> Published:
@@ -261,7 +261,7 @@ class Driver:
         self.session.apply(Mark(stamp_ns, text))
 
     def snapshot(self) -> Snapshot:
-        """Journal and return the exact state; what is older than that can no longer be worked in."""
+        """Journal and return the exact state; older samples can no longer be worked in."""
         snapshot = self.session.renew()
         self.session.emit(snapshot)
         return snapshot
@@ -304,7 +304,7 @@ class Driver:
         self.clock.restart()
 
     def unsteady(self, now_ns: int) -> bool:
-        """Tell whether stamps jumped again and again lately: resets were refused, or many stamps were stray."""
+        """Return whether stamps jumped again and again lately: resets were refused, or many stamps were stray."""
         refused = self._unsteady_ns is not None and now_ns - self._unsteady_ns < _RESET_WINDOW_NS
         return refused or self._steps.unsteady(now_ns)
 
@@ -345,7 +345,7 @@ class Driver:
         return len(self._resets_ns) < _MOST_RESETS
 
     def _restart_model(self, stamp_ns: int, reason: str, now_ns: int | None) -> None:
-        """Reset the model; what was asked for, returns and failures (`now_ns` None) do not count against the limit."""
+        """Reset the model; requests, returns and failures (`now_ns` None) do not count against the limit."""
         if now_ns is not None:
             self._resets_ns.append(now_ns)
         self.failed.end()
@@ -358,7 +358,7 @@ class Driver:
         self.state = StreamState.WAITING
 
     def _use(self, run: list[Sample], now_ns: int) -> Iterator[Published]:
-        """Advance to samples, which are taken out of the list, and yield what is to be published."""
+        """Advance to samples, which are taken out of the list, and yield the publications."""
         samples = run.copy()
         run.clear()
         for part in self.session.parts(samples, each=self.every_sample):
@@ -370,7 +370,7 @@ class Driver:
             self._newest_ns = self.session.stamp_ns
 
     def _apply(self, samples: Sequence[Sample], now_ns: int) -> Published:
-        """Advance to samples that are applied at once, and return what is to be published."""
+        """Advance to samples that are applied at once, and return the publication."""
         applied = self.session.apply_samples(samples, each=self.every_sample)
         self.rolled_back += applied.late
         self._advanced(now_ns)

@@ -20,7 +20,7 @@ class Failures:
         self._emit = emit
         #: failed advances, and stretches of them
         self.count = self.stretches = 0
-        #: why the newest one failed; empty: none has
+        #: why the newest one failed; empty without a failure
         self.reason = ""
         #: stamps of the first and the last advance of the newest stretch [ns]
         self.since_ns = self.until_ns = 0
@@ -53,7 +53,7 @@ class Failures:
         self._in_a_row = 0
 
     def wants_restart(self, limit: int) -> bool:
-        """Tell whether the model should begin anew, after `limit` failed advances in a row; 0: never.
+        """Return whether the model should begin anew, after `limit` failed advances in a row; 0: never.
 
         Where it failed again at once after a restart, the next one waits twice as long as the stretch before it: the
         number of restarts grows as the logarithm of the time, and at most half of the time in which the model could

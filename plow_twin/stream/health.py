@@ -29,7 +29,7 @@ class DurationHistogram:
         return sum(self._counts)
 
     def add(self, duration_s: float) -> None:
-        """Count one duration [s]; outside the range it falls into the end bin, a negative one counts as none."""
+        """Count one duration [s]; outside the range it falls into the end bin, a negative one is ignored."""
         if not duration_s >= 0.0:
             return
         if duration_s > self.largest_s:
@@ -38,7 +38,7 @@ class DurationHistogram:
         self._counts[index if index < _BINS else -1] += 1
 
     def quantile(self, share: float) -> float:
-        """Return the duration [s] that the given share of all does not exceed; NaN when there is none."""
+        """Return the duration [s] that the given share of all does not exceed; NaN without one."""
         return self._quantile(np.array(self._counts), share)
 
     def recent(self, share: float) -> float:
@@ -73,7 +73,7 @@ class Periods:
         self._recent: list[float] = []
 
     def begin(self) -> None:
-        """Begin anew: the next turn follows none."""
+        """Begin anew: the next turn has no predecessor."""
         self._before_s = math.nan
 
     def turn(self, now_s: float) -> None:

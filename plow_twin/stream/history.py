@@ -1,7 +1,7 @@
 """What a session remembers of its last seconds, so that a late sample can be worked in: snapshots and all since.
 
 What can be worked in follows from the journal alone, however many samples are advanced at once: a call of many has one
-snapshot, and notes where calls of single samples have theirs, by which all tell what is too old.
+snapshot, and notes where calls of single samples have theirs, so that all agree on what is too old.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class History:
     Parameters
     ----------
     span_ns
-        Time remembered before the newest sample [ns]; 0: none.
+        Time remembered before the newest sample [ns]; 0: nothing is remembered.
     """
 
     def __init__(self, span_ns: int) -> None:
@@ -51,7 +51,7 @@ class History:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp of the oldest snapshot [ns]: what is newer can be worked in; None without one."""
+        """Stamp of the oldest snapshot [ns]: newer samples can be worked in; None without one."""
         return self._kept_ns[0] if self._kept_ns else None
 
     @property
@@ -67,7 +67,7 @@ class History:
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Tell whether there is a sample of that stamp."""
+        """Return whether there is a sample of that stamp."""
         self._make_samples()
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
@@ -96,7 +96,7 @@ class History:
         self._keep(stamps_ns[begins])
 
     def _keep(self, stamps_ns: NDArray[np.int64]) -> None:
-        """Note rising stamps of snapshots behind all others, and forget what is older than the time remembered."""
+        """Note rising stamps of snapshots behind all others, and forget all that is older than the time remembered."""
         if not len(stamps_ns):
             return
         newest_ns, before_ns = int(stamps_ns[-1]), self._newest_kept_ns
@@ -113,7 +113,7 @@ class History:
         self._forget_old()
 
     def _forget_old(self) -> None:
-        """Forget what is not needed to go back to the oldest stamp."""
+        """Forget snapshots and samples not needed to go back to the oldest stamp."""
         oldest_ns, old = self._kept_ns[0], 0
         while old + 1 < len(self._snapshots) and self._snapshots[old + 1][0] <= oldest_ns:
             old += 1
@@ -156,7 +156,7 @@ class History:
             self._keep(np.array([stamp_ns]))
 
     def rewind(self, stamp_ns: int) -> tuple[bytes, list[Sample], list[Travel]]:
-        """Forget all from the newest snapshot before `stamp_ns` on; return it, and what came after it."""
+        """Forget all from the newest snapshot before `stamp_ns` on; return it, and the samples and speeds after it."""
         self._make_samples()
         while self._snapshots[-1][0] >= stamp_ns:
             self._snapshots.pop()
@@ -171,7 +171,7 @@ class History:
 
 
 class RecentStamps:
-    """The stamps of a stream that only has to be in order: what is late by less than `span_s` can still be used."""
+    """Stamps of a stream whose values need only be sorted: a value late by less than `span_s` can still be used."""
 
     def __init__(self, span_s: float) -> None:
         self._span_ns = round(span_s * 1e9)
@@ -183,7 +183,7 @@ class RecentStamps:
         return self._stamps_ns[-1] - self._span_ns if self._stamps_ns else None
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Tell whether that stamp has been there."""
+        """Return whether that stamp has been there."""
         index = bisect_left(self._stamps_ns, stamp_ns)
         return self._stamps_ns[index : index + 1] == [stamp_ns]
 

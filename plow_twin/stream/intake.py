@@ -15,15 +15,15 @@ from plow_twin.stream.limits import Limits
 NS_PER_S = 1_000_000_000
 
 
-class Remembers(Protocol):
-    """What a late sample can be worked into."""
+class KnownStamps(Protocol):
+    """Stamps of the past into which a late sample can be worked."""
 
     @property
     def oldest_ns(self) -> int | None:
         """Stamp behind which all can be worked in [ns], None: nothing can."""
 
     def __contains__(self, stamp_ns: int) -> bool:
-        """Tell whether there is a sample of that stamp."""
+        """Return whether there is a sample of that stamp."""
 
 
 class Verdict(Enum):
@@ -109,7 +109,7 @@ class Intake:
         self._newest_values: Sequence[float] = ()
         #: newest stamp before the last jump [ns]
         self._before_jump_ns: int | None = None
-        #: whether the last sample judged jumped back to where the stamps were before a jump: what was between was wrong
+        #: whether the last sample judged jumped back to the stamps before a jump: those between were wrong
         self.returned = False
         #: samples missing up to the last jump; since then: first stamp, samples used
         self._missing_before = 0
@@ -139,7 +139,7 @@ class Intake:
         stamp_ns: int,
         values: Sequence[float],
         reached_ns: int | None = None,
-        history: Remembers | None = None,
+        history: KnownStamps | None = None,
         may_reset: bool = True,
     ) -> Verdict:
         """Return the verdict on one sample and count it.
@@ -168,7 +168,7 @@ class Intake:
             return verdict
         if self._newest_ns is None or verdict.resets:
             self._missing_before, self._first_ns, self._since_first = self.missing, stamp_ns, 0
-            # what was between is no line to go back to
+            # the stamps between are not to be gone back to
             self._before_jump_ns = None if self.returned else self._newest_ns
         self._since_first += 1
         if self._newest_ns is None or verdict.resets or stamp_ns > self._newest_ns:
@@ -176,19 +176,19 @@ class Intake:
         return verdict
 
     def jumps(self, stamp_ns: int, reached_ns: int | None = None) -> bool:
-        """Tell whether a stamp is a step of the sender's clock away from those before, as `judge` would find."""
+        """Return whether a stamp is a step of the sender's clock away from those before, as `judge` would find."""
         newest_ns = self._newest_ns if self._newest_ns is not None else reached_ns
         if newest_ns is None or stamp_ns <= 0:
             return False
         return not self.near(stamp_ns, newest_ns, reached_ns)
 
     def near(self, stamp_ns: int, newest_ns: int, reached_ns: int | None = None) -> bool:
-        """Tell whether a stamp may come after the newest one and the time reached without a step of the clock."""
+        """Return whether a stamp may come after the newest one and the time reached without a step of the clock."""
         ahead_ns = stamp_ns - (newest_ns if reached_ns is None else max(newest_ns, reached_ns))
         return ahead_ns <= self.jump_forward_s * NS_PER_S and newest_ns - stamp_ns <= self.jump_back_s * NS_PER_S
 
     def goes_on(self, stamp_ns: int, values: Sequence[float], reached_ns: int) -> bool:
-        """Tell whether a sample is surely accepted, as most are; False: `jumps` and `judge` have to find out."""
+        """Return whether a sample is surely accepted, as most are; False: `jumps` and `judge` have to find out."""
         newest_ns = self._newest_ns
         if newest_ns is None or self.limits is None:
             return False
@@ -205,7 +205,7 @@ class Intake:
         self._newest_ns, self._newest_values = stamp_ns, values
 
     def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
-        """Count a sample that was dropped before it could be judged; what could not be read has no values."""
+        """Count a sample that was dropped before it could be judged; an unreadable one has no values."""
         if verdict.used:
             raise ValueError(f"verdict: got {verdict.value}, expected a reason to drop")
         self.counts[verdict] += 1
@@ -217,7 +217,7 @@ class Intake:
         self._newest_ns = None
 
     def _judge(
-        self, stamp_ns: int, values: Sequence[float], reached_ns: int | None, history: Remembers | None
+        self, stamp_ns: int, values: Sequence[float], reached_ns: int | None, history: KnownStamps | None
     ) -> Verdict:
         if not all(map(math.isfinite, values)):
             return Verdict.NON_FINITE

@@ -123,7 +123,7 @@ class Parameter:
 class Pose:
     """The head was measured at `pose` (x, y [m], theta [rad]) at `stamp_ns`: kept for the estimate, moves nothing.
 
-    `deviation` holds the three standard deviations that came with it; empty: none came.
+    `deviation` holds the three standard deviations that came with it; empty without them.
     """
 
     stamp_ns: int
@@ -155,7 +155,7 @@ class Unused:
 
     `reason` is that of the counters `dropped_<reason>`, or `not_followed`, or `lost`: sent and never arrived (a `count`
     below 0: so many of them came after all). `stamps_ns` and `values` have an item for each message in order of
-    arrival, the first ones only where there were too many at once; what could not be read has no values and stamp 0.
+    arrival, the first ones only where there were too many at once; an unreadable message has no values and stamp 0.
     A value need not be finite.
     """
 

@@ -26,18 +26,18 @@ class Limits:
     fastest: tuple[float, ...]
 
     def exceeded(self, values: Sequence[float]) -> bool:
-        """Tell whether a value is larger than it can be."""
+        """Return whether a value is larger than it can be."""
         return any(map(gt, map(abs, values), self.largest))
 
     def keep(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
-        """Tell whether values are finite and nothing is exceeded, neither by them nor by their change."""
+        """Return whether values are finite and nothing is exceeded, neither by them nor by their change."""
         for old, value, largest, fastest in zip(before, values, self.largest, self.fastest, strict=True):
             if not (abs(value) <= largest and abs(value - old) <= fastest * duration_s):
                 return False
         return True
 
     def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
-        """Tell whether a value has changed faster than it can."""
+        """Return whether a value has changed faster than it can."""
         most = [fastest * duration_s for fastest in self.fastest]
         return any(map(gt, map(abs, map(sub, values, before)), most))
 

@@ -1,4 +1,4 @@
-"""What is published of the motion: rows that tell of all that happened, nothing lost between two of them.
+"""Publications of the motion: each row sums up all that happened since the row before.
 
 A publication is a function of the journal alone, so that a replay forms the same publications bit for bit.
 """
@@ -44,7 +44,7 @@ SLOW: Final = np.dtype(
         ("wear_rate", "f8", (PAIR_COUNT,)),
     ]
 )
-#: Which of some rows are published: the only one, or none.
+#: Numbers of the rows to publish: the only one, or no row.
 THE_ONE: Final = np.zeros(1, np.int64)
 NONE: Final = np.zeros(0, np.int64)
 _NO_ROWS: Final = np.zeros(0, ROW)
@@ -83,12 +83,12 @@ class Published(NamedTuple):
         return len(self.rows) > 0 and int(self.rows["followed"][0]) == WITH_INTERVALS
 
     def at(self, index: int) -> Published:
-        """Return what is published with one row."""
+        """Return one row and its slow part."""
         slow = self.slow[self.slow["row"] == index]
         return Published(self.rows[index : index + 1], _numbered_from(slow, index))
 
     def of(self, index: NDArray[np.int64]) -> Published:
-        """Return what is published with some of the rows, whose rising numbers are given."""
+        """Return some of the rows, whose rising numbers are given, and their slow parts."""
         slow = self.slow[np.isin(self.slow["row"], index)]
         slow["row"] = np.searchsorted(index, slow["row"])
         return Published(self.rows[index], slow)
@@ -116,7 +116,7 @@ def _numbered_from(slow: Rows, first: int) -> Rows:
 
 
 class Stock:
-    """New rows, each used once: what is published stays as it is for whoever keeps it."""
+    """New rows, each used once, so that a publication never changes for those who keep it."""
 
     def __init__(self) -> None:
         self._rows, self._used = _NO_ROWS, 0
@@ -222,7 +222,7 @@ class Outputs:
         return Published(chosen, self._slow(chosen))
 
     def take(self) -> Published:
-        """Publish all advances since the publication before; nothing when there was none."""
+        """Publish all advances since the publication before; nothing without an advance."""
         if not self._waits:
             return NOTHING
         rows, self._waits = self._stock.take(1), 0
@@ -232,7 +232,7 @@ class Outputs:
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
         """Note that all from `stamp_ns` on is computed again; return from when on it is since the last publication.
 
-        That is later than `oldest_ns`: what was computed again before it stays as it is.
+        That is later than `oldest_ns`: earlier corrections stay as they are.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -266,7 +266,7 @@ class Outputs:
         return makes
 
     def restart(self) -> None:
-        """Forget what has not been published; the touches go on counting."""
+        """Forget all that has not been published; the count of touches goes on."""
         self._clear()
         self._window["corrected"] = 0
         self._slow_ns = self._before = None
@@ -316,7 +316,7 @@ class Outputs:
         return slow
 
     def _clearance(self, wear_depth: Array) -> Array:
-        """Return what `CLEARANCE_NAMES` name, shape (..., 30) [m], from (..., 8)."""
+        """Return the clearances of `CLEARANCE_NAMES`, shape (..., 30) [m], from wear depths (..., 8)."""
         best, points = clearances(self._scene, wear_depth), prior_points(self._scene, wear_depth)
         low, high = (best if depth is wear_depth else clearances(self._scene, depth) for depth in points)
         count = len(_CLEARANCES)
@@ -333,7 +333,7 @@ class Outputs:
         return np.stack((middle, low, high), axis=1)[:2].ravel()
 
     def state(self) -> bytes:
-        """Return what the numbers of the next publication depend on beside the next advance, exactly."""
+        """Return all that determines the numbers of the next publication beside the next advance, exactly."""
         slow_ns, window = -1 if self._slow_ns is None else self._slow_ns, self._window
         numbers = (window["makes"], window["impulse"], window["peak"], self._slow_wear_depth, np.array([slow_ns]))
         return b"".join(part.tobytes() for part in numbers)
@@ -356,7 +356,7 @@ class Outputs:
 
 
 def warm_up() -> None:
-    """Compile what a publication needs, or load it from the cache on disk."""
+    """Compile the functions of a publication, or load them from the cache on disk."""
     _publish()
     rows = np.zeros(1, ROW)
     publish_window(rows.copy(), rows)

@@ -1,6 +1,6 @@
 """Which of several senders of one input is followed, and how many of its samples never arrived.
 
-A sender numbers what it sends from 1 on, as the middleware does for each publisher: a gap in the numbers is loss,
+A sender numbers its messages from 1 on, as the middleware does for each publisher: a gap in the numbers is loss,
 wherever it happened (on the way, or in a queue that overran), whatever the rate, and bursts change nothing.
 """
 
@@ -32,11 +32,11 @@ class Senders:
         self._other: bytes | None = None
 
     def start(self, present: Collection[bytes]) -> None:
-        """Take note of the senders that were there before: what they sent until now is no loss."""
+        """Take note of the senders that were there before: their messages until now are no loss."""
         self._before = frozenset(present)
 
     def start_late(self, sender: bytes) -> None:
-        """Take note that what a sender sent before the first sample heard may be no loss."""
+        """Take note that messages of a sender before the first sample heard may be no loss."""
         self._before |= {sender}
 
     def hear(self, sender: bytes, number: int) -> bool:
@@ -71,7 +71,7 @@ class Senders:
             self._other = None
 
     def switch(self) -> bool:
-        """Follow the other sender heard last; False when there is none."""
+        """Follow the other sender heard last; False without one."""
         if self._other is None:
             return False
         other, self._other = self._other, self.followed

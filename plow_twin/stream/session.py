@@ -465,7 +465,7 @@ class Session:
         self._set_speed(travel)
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Tell whether the model has passed a stamp; without a sample there it has passed its own time too."""
+        """Return whether the model has passed a stamp; without a sample there it has passed its own time too."""
         if self.stamp_ns is None or stamp_ns > self.stamp_ns:
             return False
         return stamp_ns < self.stamp_ns or (self.held and self.history.oldest_ns is not None)
@@ -553,7 +553,7 @@ class Session:
                 self.twin.set_travel_speed(0.0)
 
     def _resume_wear(self) -> bool:
-        """Let the load wear again; tell whether it did not."""
+        """Let the load wear again; return whether it did not."""
         held, self.held = self.held, False
         if held and self._wears:
             self.twin.set_travel_speed(self._speed)

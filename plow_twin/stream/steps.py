@@ -1,4 +1,4 @@
-"""Steps of a sender's clock, told from single wrong stamps: a sample whose stamp jumps waits for the next one."""
+"""Steps of a sender's clock apart from single wrong stamps: a sample whose stamp jumps waits for the next one."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Steps:
         """Take in a sample; return those that can be judged now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
-        if jumped is None or stamp_ns <= 0:  # an unstamped one tells nothing
+        if jumped is None or stamp_ns <= 0:  # an unstamped sample decides nothing
             if not jumps:
                 return (arrival,)
             self._jumped = arrival
@@ -75,7 +75,7 @@ class Steps:
             self._intake.refuse(Verdict.STRAY, *jumped[:2])
 
     def unsteady(self, now_ns: int) -> bool:
-        """Tell whether many stamps were stray lately."""
+        """Return whether many stamps were stray lately."""
         strays_ns = self._strays_ns
         if not strays_ns:
             return False

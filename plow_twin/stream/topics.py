@@ -34,7 +34,7 @@ class Cadence(Enum):
     MARKED = "marked publications"
     #: with each estimate
     ESTIMATE = "each estimate"
-    #: when what it tells has changed
+    #: when its content has changed
     CHANGE = "on change"
 
 
@@ -53,7 +53,7 @@ class Topic:
     cumulative : bool
         Whether its message depends on the publication before: a replay cannot compare it after a lost message.
     latched : bool
-        Whether a late reader gets what was sent before (`transient_local`).
+        Whether a late reader gets earlier messages (`transient_local`).
     depth : int
         How many messages the publisher keeps.
     names : tuple of str

@@ -46,18 +46,18 @@ def completed(client: Client, futures: Iterable[Future[Any]]) -> Iterator[Future
     from distributed import as_completed
 
     waiting: set[Any] = set(futures)
-    manned = time.monotonic()
+    workers_seen = time.monotonic()
     while waiting:
         try:
             for future in as_completed(  # type: ignore[no-untyped-call]
                 list(waiting), loop=client.loop, timeout=_LOOK_S
             ):
                 waiting.remove(future)
-                manned = time.monotonic()
+                workers_seen = time.monotonic()
                 yield future
         except TimeoutError:
             now = time.monotonic()
-            manned = now if client.scheduler_info()["workers"] else manned
-            if now - manned > WORKER_TIMEOUT_S:
+            workers_seen = now if client.scheduler_info()["workers"] else workers_seen
+            if now - workers_seen > WORKER_TIMEOUT_S:
                 got = f"got no worker for {WORKER_TIMEOUT_S:g} s, expected at least one"
                 raise StudyError(f"dask: {got}; stored chunks stay, the same call computes the rest") from None

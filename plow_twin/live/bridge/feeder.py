@@ -196,8 +196,8 @@ class Feeder:
         elif name == "travel":
             self._runtime.take_travel(found[0], found[1]["speed"])
         elif name == "gaps":
-            told = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
-            self._runtime.take_gaps(found[0], told)
+            gaps = {PAIR_NAMES.index(pair): gap for pair, gap in found[1].items() if not math.isnan(gap)}
+            self._runtime.take_gaps(found[0], gaps)
         else:
             x, y, theta = (found[1].get(name, math.nan) for name in ROLES["head_pose"])
             self._runtime.take_pose(found[0], (x, y, theta))

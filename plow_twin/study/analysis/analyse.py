@@ -86,7 +86,7 @@ class Prediction:
         self.clearance.add(slow["stamp_ns"], slow["clearance"])
 
     def is_inside(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Tell of each measured value whether it lies in the time of the load."""
+        """Return for each measured value whether it lies in the time of the load."""
         stamps = signal.series()[0]
         if not self.spans:
             return np.ones(len(stamps), np.bool_)
@@ -111,7 +111,7 @@ class Prediction:
         return self.resets if self._longer() is self.present else self._longest_number
 
     def is_of_longest(self, signal: ThinnedSignal) -> NDArray[np.bool_]:
-        """Tell of each measured value whether it belongs to the longest stretch.
+        """Return for each measured value whether it belongs to the longest stretch.
 
         That is the one whose stamps hold it; of several, as after a step of the clock back, the one in which it came.
         """

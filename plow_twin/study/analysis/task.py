@@ -168,7 +168,7 @@ class Task:
 
 
 def _is_ours(file: Path) -> bool:
-    """Tell whether a file belongs to a run that an analysis has made."""
+    """Return whether a file belongs to a run that an analysis has made."""
     if file.name in ("metadata.yaml", "metadata.yaml.partial"):
         return True
     if not re.fullmatch(r"run_\d+\.mcap", file.name):

@@ -63,7 +63,7 @@ class Drops:
         return self.bounces[index][min(bounce, len(self.bounces[index]) - 1)]
 
     def inside(self, index: int, bounce: int = 2) -> NDArray[np.bool_]:
-        """Tell which measured x, z, theta lie in their 90 % bands, shape (rows, 3), up to a bounce."""
+        """Return which measured x, z, theta lie in their 90 % bands, shape (rows, 3), up to a bounce."""
         rows = self.until(index, bounce) + 1
         points = bands(self.pose[index, : self.flight_rows[index]], rows)
         found: NDArray[np.bool_] = (self.pose[index, :rows] >= points[:, 0]) & (self.pose[index, :rows] <= points[:, 2])

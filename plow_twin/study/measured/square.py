@@ -200,7 +200,7 @@ def fit_flight(first_flight: ArrayLike, block: NDArray[np.void] = SQUARE, scatte
 
 
 def _leaves_flight(rows: Array) -> bool:
-    """Tell whether the last row comes after an impact: the block turns otherwise, or rises again."""
+    """Return whether the last row comes after an impact: the block turns otherwise, or rises again."""
     t = np.arange(-3.0, 1.0)
     turn = float(np.polyval(np.polyfit(t[:3], rows[-4:-1, 2], 1), t[3]))
     return bool(

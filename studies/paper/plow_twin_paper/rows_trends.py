@@ -35,13 +35,13 @@ _RISES_THEN_FALLS: Final = (
 
 
 def rises(values: Array) -> bool:
-    """Tell whether a curve rises; a step down below `TREND_SLACK` of its largest value does not count."""
+    """Return whether a curve rises; a step down below `TREND_SLACK` of its largest value does not count."""
     slack = TREND_SLACK * float(values.max())
     return bool((np.diff(values) > -slack).all() and values[-1] - values[0] > slack)
 
 
 def rises_then_falls(values: Array) -> bool:
-    """Tell whether a curve rises to a value inside its range and falls from there on, with the same slack."""
+    """Return whether a curve rises to a value inside its range and falls from there on, with the same slack."""
     slack, top = TREND_SLACK * float(values.max()), int(values.argmax())
     if not 0 < top < len(values) - 1:
         return False

@@ -48,7 +48,7 @@ def letters_of_pairs(scene: Scene) -> list[str]:
 
 
 def of_sense(sense: Sense) -> NDArray[np.bool_]:
-    """Tell of each pair whether it belongs to a sense, shape (8,)."""
+    """Return for each pair whether it belongs to a sense, shape (8,)."""
     return STOPS_COUNTER_CLOCKWISE if sense == "ccw" else ~STOPS_COUNTER_CLOCKWISE
 
 
