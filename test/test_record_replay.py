@@ -75,7 +75,11 @@ def test_the_same_build_gives_the_same_bits(frame_every: int, tmp_path: Path) ->
     assert (report.exit_code, report.first_divergence, report.divergences) == (0, None, 0)
     assert report.status is FileStatus.COMPLETE and not report.loss and not report.build_differences
     sent = Counter(topic.lstrip("/") for topic, _ in run.outputs)
-    assert report.compared == sent and set(sent) == set(PUBLICATION_TOPICS) - set(FOLLOWED_TOPICS) and not report.not_compared
+    assert (
+        report.compared == sent
+        and set(sent) == set(PUBLICATION_TOPICS) - set(FOLLOWED_TOPICS)
+        and not report.not_compared
+    )
     assert report.digests_compared == sum(isinstance(entry, Digest) for entry in run.entries) >= COUNT // 100
     assert report.entries == len(run.entries)
     assert (report.samples, report.steps) == (COUNT, COUNT + 1)

@@ -32,7 +32,7 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.session import Session
 
-#: Topics of what is published, by base name.
+#: Published topics, by base name.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
 #: What a number of a forecast is called in SI.
 _SI: Final = {"hours": "seconds", "km": "metres"}
@@ -41,7 +41,7 @@ RATE_HZ: Final = 10.0
 
 
 class Estimation:
-    """The estimate of one live twin: what goes into it, and what becomes of what comes out."""
+    """The estimate of one live twin: its inputs, and the use of its results."""
 
     def __init__(self, settings: Settings, scene: Scene) -> None:
         self._frame_id, self._follows = settings.frame_id, settings.follows != "off"
@@ -51,7 +51,7 @@ class Estimation:
         self._worker = Worker(scene, windows, asked)
         told = {ESTIMATE: True, WINDOW_FORCES: bool(asked.members), FORECAST: asked.plan is not None}
         self._topics = [topic for topic, wanted in told.items() if wanted]
-        #: when other pads were set, until that has been told [ns]
+        #: when other pads were set, until an empty message has been sent [ns]
         self._set_ns: int | None = None
         #: where the clearances come from, and whether model and sensor can be trusted, as of the newest estimate
         self.states = {"horizontal": State.PRIOR, "vertical": State.PRIOR}
@@ -61,7 +61,7 @@ class Estimation:
         self.count = self.skipped = 0
         self.wall_s = 0.0
         self.end_ns: int | None = None
-        #: the newest forecast, or why there is none
+        #: the newest forecast, or the reason why there is no forecast
         self.forecast: dict[str, Any] | None = None
         self.forecast_error = "nothing has been estimated yet"
         #: the newest one, for a journal that is begun anew
@@ -73,7 +73,7 @@ class Estimation:
         return self._worker.error
 
     def take(self, entry: Entry) -> None:
-        """Take in what the session has accepted."""
+        """Hand an entry that the session has accepted to the estimate."""
         match entry:
             case Sample(stamp_ns, wrench):
                 self._worker.take_load(stamp_ns, wrench)
@@ -100,7 +100,7 @@ class Estimation:
                     self._forget()
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
-        """Hand an estimate that has come to the session; return its messages by topic, none if none has come.
+        """Hand an estimate that has come to the session; return its messages by topic; empty without an estimate.
 
         Once other pads have been set, empty messages take the place of the latched ones.
         """
@@ -127,7 +127,7 @@ class Estimation:
         return messages
 
     def _forget(self) -> None:
-        """Let the clearances be what the model says again."""
+        """Let the clearances be those of the model again."""
         self.entry = None
         self.states = dict.fromkeys(self.states, State.PRIOR)
 
@@ -140,7 +140,7 @@ def entry_of(found: Found, session: Session, before: Estimated | None) -> Estima
     """Return the journal's entry of an estimate.
 
     A clearance that cannot be observed stays as it was estimated before, and its interval widens as the wear's prior
-    does; one that is withdrawn is what the model says.
+    does; one that is withdrawn is that of the model.
     """
     model = session.outputs.modelled(session.wear_depth)
     shift = np.array(before.shift) if before is not None else np.zeros(6)
@@ -170,7 +170,7 @@ def message_of(found: Found, frame_id: str) -> plain.JointState:
 
 
 def forces_message(found: Found, frame_id: str) -> plain.JointState:
-    """Return the message of the forces of a window's end, as `contact_peaks` has them; empty where there are none."""
+    """Return the message of the forces of a window's end, as `contact_peaks` has them; empty without forces."""
     names: list[str] = []
     peaks: list[float] = []
     impulses: list[float] = []
@@ -186,7 +186,7 @@ def forces_message(found: Found, frame_id: str) -> plain.JointState:
 def forecast_message(found: Found, frame_id: str) -> plain.JointState:
     """Return the message of a forecast: seconds, metres, passes and shifts to the limit.
 
-    What is not reached within the horizon is left out.
+    Limits that are not reached within the horizon are left out.
     """
     told = found.also["forecast"] or {}
     names: list[str] = []
@@ -205,7 +205,7 @@ def forecast_message(found: Found, frame_id: str) -> plain.JointState:
 
 
 def asked_of(settings: Settings) -> Asked:
-    """Return what the parameters want beside the estimate."""
+    """Return the answers beside the estimate that the parameters ask for."""
     horizontal, vertical = settings.forecast_limits
     plan = None
     if horizontal or vertical:
@@ -220,7 +220,7 @@ def scenarios_of(settings: Settings) -> tuple[Scenario, ...]:
 
 
 def problems(settings: Settings, scene: Scene) -> list[Problem]:
-    """Return what contradicts itself, or the scene, in the parameters of the estimate."""
+    """Return contradictions among the parameters of the estimate, and between them and the scene."""
     found = []
     if settings.excitation_source == "scene":
         found.append(Problem("estimate", True, "false where excitation_source is scene: no load comes"))

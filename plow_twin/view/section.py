@@ -88,7 +88,7 @@ class Section:
         return np.roll(_placed(corners, (x, y, theta)), -round(theta / (0.5 * math.pi)), axis=0)
 
     def head_strips(self, pose: Iterable[float]) -> Array:
-        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2), or block, (1, 5, 2)."""
+        """Outlines of the head at a pose x, y [m], theta [rad]: cavity and body, shape (2, 5, 2); block: (1, 5, 2)."""
         if self.is_block:
             return _placed(0.5 * self.frame * _SQUARE[None], pose)
         sides = np.stack((self.cavity, self.cavity + 2.0 * BODY_MARGIN_MM))
