@@ -16,6 +16,8 @@ INSTALLED := $(VENV)/.installed
 SPEED ?= real
 OUT ?= out/demo
 PYTEST_ARGS ?=
+# an option of pytest 9: older ones, as of a distribution, would not start with it in pyproject.toml
+HANGING := -o faulthandler_exit_on_timeout=true
 # three processes for two cores, each with whole files in the order of test/conftest.py: some of them wait for nodes and
 # viewers; one that a test has ended is not replaced, for the next one would begin with that test again
 PARALLEL ?= -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
@@ -31,7 +33,7 @@ demo: $(INSTALLED)
 	"$(VENV)/bin/plow-twin" demo --speed $(SPEED) --out "$(OUT)"
 
 test: $(INSTALLED)
-	"$(VENV)/bin/python" -m pytest -m "not stress" $(PARALLEL) $(PYTEST_ARGS)
+	"$(VENV)/bin/python" -m pytest -m "not stress" $(HANGING) $(PARALLEL) $(PYTEST_ARGS)
 
 # other examples each time; a failure is had again by the seed that is printed: make stress SEED=...
 stress: $(INSTALLED)

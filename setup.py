@@ -1,10 +1,13 @@
 """Build of the ament_python package; pip, colcon and rosdep read the same metadata from here and package.xml."""
 
 from glob import glob
+from pathlib import Path
 
 from setuptools import find_packages, setup
 
 NAME = "plow_twin"
+# colcon runs a link to this file in another folder
+README = Path(__file__).resolve().parent / "README.md"
 
 # ROS 2 Jazzy as wheels; where a ROS 2 is sourced the extra is not needed
 ROS_WHEELS = '; platform_system == "Linux" and platform_machine == "x86_64"'
@@ -25,7 +28,7 @@ EXTRAS = {
     "bench": ["matplotlib>=3.8", "scikit-sundae>=1.0", "mujoco>=3.2", "exudyn>=1.9", "heyoka>=7", "filterpy>=2.0"],
     "docs": ["mkdocs>=1.6,<2", "mkdocstrings[python]>=0.26"],
     "test": [
-        "pytest>=9",
+        "pytest>=7.4",
         "pytest-cov",
         "pytest-timeout",
         "pytest-xdist>=3.8",
@@ -50,12 +53,25 @@ EXTRAS["dev"] = [
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Digital twin of a coal plough head: contact-impact motion in its guide, live on ROS 2",
-    long_description="See the README of the repository.",
+    long_description=README.read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
     author="plow_twin maintainers",
     author_email="maintainers@users.noreply.github.com",
     license="Apache-2.0",
+    license_files=["LICENSE"],
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Manufacturing",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3.11",
+        "Programming Language :: Python :: 3.12",
+        "Topic :: Scientific/Engineering :: Physics",
+        "Typing :: Typed",
+    ],
+    keywords=["digital twin", "contact", "impact", "clearance", "wear", "coal plough", "longwall", "ROS 2"],
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={NAME: ["py.typed", "study/templates/*.j2", "dashboard/page/*"]},
     data_files=[
@@ -63,6 +79,8 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
+        # executables under the names of ROS; in a bin folder these would be too general
+        (f"lib/{NAME}", sorted(glob("scripts/*"))),
     ],
     python_requires=">=3.11",
     install_requires=[
@@ -81,8 +99,8 @@ setup(
     entry_points={
         "console_scripts": [
             "plow-twin = plow_twin.cli:main",
-            "twin = plow_twin.ros.main:main",
-            "excitation_publisher = plow_twin.demo.excitation_publisher:main",
+            "plow-twin-node = plow_twin.ros.main:main",
+            "plow-twin-publisher = plow_twin.demo.excitation_publisher:main",
         ]
     },
 )

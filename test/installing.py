@@ -14,11 +14,14 @@ SOURCES = (
     "config",
     "launch",
     "resource",
+    "scripts",
     "setup.py",
     "setup.cfg",
     "package.xml",
     "pyproject.toml",
     "LICENSE",
+    "README.md",
+    "MANIFEST.in",
 )
 
 

@@ -813,6 +813,12 @@ def test_a_wrong_call_says_what_was_expected(
     assert said in " ".join(capfd.readouterr().err.split())
 
 
+def test_an_older_paho_is_named_with_the_version_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "paho.mqtt.enums", None)  # as in 1.6
+    with pytest.raises(BridgeError, match=r"paho-mqtt: got 2\..*, expected 2.0 or newer"):
+        Mqtt(Access("mqtt://localhost"))
+
+
 def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
     used: list[Any] = []
     inputs = Inputs(cast(Any, None), "excitation", 10, 2.0, journaled=False)

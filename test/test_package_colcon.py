@@ -25,7 +25,13 @@ def test_colcon_build_gives_the_layout_of_ros2_run(options: list[str], tmp_path:
 
     prefix = tmp_path / "install" / "plow_twin"
     programs = prefix / "lib" / "plow_twin"
-    assert {path.name for path in programs.iterdir()} == {"plow-twin", "twin", "excitation_publisher"}
+    assert {path.name for path in programs.iterdir()} == {
+        "plow-twin",
+        "plow-twin-node",
+        "plow-twin-publisher",
+        "twin",
+        "excitation_publisher",
+    }
     assert not (prefix / "bin").exists()
     assert (prefix / "share" / "ament_index" / "resource_index" / "packages" / "plow_twin").is_file()
     assert (prefix / "share" / "plow_twin" / "package.xml").is_file()

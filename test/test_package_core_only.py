@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import mcap_bytes
@@ -73,7 +74,13 @@ def test_model_and_twin_need_numpy_scipy_and_numba_alone(environment: Path, tmp_
 def test_pip_install_brings_the_command_and_the_presets(environment: Path, wheel: Path, tmp_path: Path) -> None:
     install(environment, str(wheel))
     programs, prefix = environment.parent, environment.parent.parent
-    assert {"plow-twin", "twin", "excitation_publisher"} <= {path.name for path in programs.iterdir()}
+    found = {path.name for path in programs.iterdir()}
+    assert {"plow-twin", "plow-twin-node", "plow-twin-publisher"} <= found and not {
+        "twin",
+        "excitation_publisher",
+    } & found
+    for name in ("twin", "excitation_publisher"):  # where `ros2 run` looks
+        assert os.access(prefix / "lib" / "plow_twin" / name, os.X_OK)
     share = prefix / "share"
     assert (share / "ament_index" / "resource_index" / "packages" / "plow_twin").is_file()
     assert {path.stem for path in (share / "plow_twin" / "config").glob("*.yaml")} >= set(PRESETS)

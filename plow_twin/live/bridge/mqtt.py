@@ -6,6 +6,7 @@ import ssl
 import threading
 import time
 from collections import deque
+from importlib.metadata import version
 from typing import Any, Final
 
 from plow_twin.live.bridge.access import Access, host_and_port, is_loopback
@@ -87,7 +88,14 @@ class Mqtt:
 
     def _make_client(self, tls: bool) -> Any:
         from paho.mqtt.client import Client, MQTTv311
-        from paho.mqtt.enums import CallbackAPIVersion
+
+        try:
+            from paho.mqtt.enums import CallbackAPIVersion
+        except ModuleNotFoundError as error:
+            found = version("paho-mqtt")
+            raise BridgeError(
+                f"paho-mqtt: got {found}, expected 2.0 or newer: pip install 'plow_twin[mqtt]'"
+            ) from error
 
         access = self._access
         client = Client(CallbackAPIVersion.VERSION2, access.client_id, clean_session=False, protocol=MQTTv311)
