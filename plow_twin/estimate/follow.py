@@ -65,6 +65,7 @@ _KNOWN_HZ: Final = 10.0
 #: Poses that wait for the model to reach their stamps: those of a stopped load do not pile up.
 _MOST_DUE: Final = 1000
 _NO_MARKS: Final = np.zeros(0, np.int64)
+_UNMOVED: Final = np.zeros(6)
 #: Nothing is stated of either.
 _NO_LOAD: Final = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
 _NO_POSES: Final = Poses(np.zeros(0), np.zeros((0, 3)))
@@ -184,6 +185,7 @@ class Follower:
     @property
     def wear_depth(self) -> Array:
         """Wear depth of each pad of the median twin [m], shape (8,)."""
+        self._ensemble.settle()
         worn: Array = self._ensemble.worn[0].copy()
         return worn
 
@@ -288,6 +290,8 @@ class Follower:
 
     def _moved(self, worn: Array) -> Array:
         """Return by how much pads that are worn by `worn` (..., 8) widen the clearances and their points, (..., 6)."""
+        if self.scene.wear is None:
+            return _UNMOVED
         return np.repeat(_moved(self.scene, worn), 3, axis=-1)
 
     def _tell_clearance(self) -> None:
@@ -407,7 +411,7 @@ class Follower:
         """Draw from what is known now; the members begin where those before them stand."""
         before = self._ensemble
         self.drawn += 1
-        self._draw(text, self.time, before.worn[0])
+        self._draw(text, self.time, self.wear_depth)
         self._ensemble.stand_like(before, self._wrench)
 
     def follow_parameters(self) -> None:
@@ -517,13 +521,17 @@ class Ensemble:
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
         self._pressed = _PRESSED * scene.head.mass_kg * _STANDARD_GRAVITY
         self.good = np.ones(members, dtype=bool)
-        self._peak, self._impulse = np.zeros((members, PAIR_COUNT)), np.zeros((members, PAIR_COUNT))
+        #: force, and peak and impulse since the span's begin
+        self._told = np.zeros((members, 3, PAIR_COUNT))
+        self._peak, self._impulse = self._told[:, 1], self._told[:, 2]
         #: squares of each member's normalised innovations
         self.square = np.zeros(members)
         #: times and poses (m, 3) of the newest seconds, oldest first; present rates (m, 3), wear and penetration (m, 8)
         self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
         self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
         self._depth = self._penetration(self._path[-1][1])
+        #: the newest rows of all members, while nobody has asked for what they hold
+        self._newest: Rows | None = None
 
     @property
     def moved(self) -> bool:
@@ -542,19 +550,25 @@ class Ensemble:
         batch = self.twins.advance_samples(t, wrench * self._gain[:, None, :])
         rows[:] = batch.rows[0]
         rows["followed"] = FOLLOWED
-        failed = np.any(batch.status != 0, axis=0).tolist()
+        failed = batch.status.any()
         for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), wanted.tolist(), ends.tolist(), strict=True)):
-            if failed[place]:
+            if failed:
                 self.good &= batch.status[:, place] == 0
             np.maximum(self._peak, batch.peak[:, place], out=self._peak)
             self._impulse += batch.impulse[:, place]
             if is_wanted:
-                self._tell(batch.force[:, place], rows[place : place + 1])
+                self._told[:, 0] = batch.force[:, place]
+                self._tell(rows[place : place + 1])
             if is_end:
                 self.begin_span()
             self._remember(now, batch.q[:, place].copy())
-        self._v, self.worn = batch.v[:, -1].copy(), batch.wear_depth[:, -1].copy()
-        self._depth = batch.penetration[:, -1].copy()
+        self._newest = batch.rows[:, -1]
+
+    def settle(self) -> None:
+        """Take rates, wear and penetration out of the newest rows: few samples are asked for them."""
+        rows, self._newest = self._newest, None
+        if rows is not None:
+            self._v, self.worn, self._depth = rows["v"].copy(), rows["wear_depth"].copy(), rows["penetration"].copy()
 
     def _remember(self, now: float, q: Array) -> None:
         path = self._path
@@ -564,11 +578,10 @@ class Ensemble:
         while path[1][0] <= now - LATEST_S:
             path.popleft()
 
-    def _tell(self, force: Array, row: Rows) -> None:
+    def _tell(self, row: Rows) -> None:
         """Write the intervals of forces, peaks and impulses."""
-        names = ("force", "peak", "impulse")
-        _, low, high = self._points(np.stack([force, self._peak, self._impulse], axis=1))
-        for index, name in enumerate(names):
+        _, low, high = self._points(self._told)
+        for index, name in enumerate(("force", "peak", "impulse")):
             row[f"{name}_low"], row[f"{name}_high"] = low[index], high[index]
         row["followed"] = WITH_INTERVALS
 
@@ -578,7 +591,8 @@ class Ensemble:
         batch = self.twins.advance(t)
         self.twins.restore(before)
         row[:] = batch.rows[0]
-        self._tell(batch.force[:, 0], row)
+        self._told[:, 0] = batch.force[:, 0]
+        self._tell(row)
 
     def begin_span(self) -> None:
         """Let peaks and impulses begin here."""
@@ -626,7 +640,8 @@ class Ensemble:
         share = np.divide(self._room(), there, out=np.ones_like(there), where=there > 0.0)
         self.twins.set_wrench(wrench * self._gain)
         self._path = deque((t, q[from_] * share) for t, q in before._path)
-        self._peak, self._impulse = before._peak[from_], before._impulse[from_]
+        before.settle()
+        self._told[:] = before._told[from_]
         self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
 
     def stand_about(self, q: Array, v: Array) -> None:
@@ -653,6 +668,7 @@ class Ensemble:
 
     def take_pose(self, t: float, q: Array, noise: Array) -> bool:
         """Move the members toward a pose measured at `t`, by their covariance with it; False for one too late."""
+        self.settle()
         there = np.flatnonzero(np.isfinite(q))
         times = [time for time, _ in self._path]
         if t <= times[0] or not len(there):
@@ -702,6 +718,7 @@ class Ensemble:
 
     def state(self) -> tuple[list[bytes], Any]:
         """Return all that changes, as bytes and as JSON."""
+        self.settle()
         times, path = np.array([time for time, _ in self._path]), np.stack([q for _, q in self._path])
         arrays = (self.good, self.square, self._peak, self._impulse, self._v, self.worn, self._depth, times, path)
         return [self.twins.snapshot(), *(one.tobytes() for one in arrays)], self._rng.bit_generator.state
@@ -712,7 +729,8 @@ class Ensemble:
         self.good = np.frombuffer(blobs[1], np.bool_).copy()
         count = len(self.good)
         self.square, *wide, times, path = (np.frombuffer(blob).copy() for blob in blobs[2:])
-        self._peak, self._impulse, self._v, self.worn, self._depth = (one.reshape(count, -1) for one in wide)
+        self._peak[:], self._impulse[:], self._v, self.worn, self._depth = (one.reshape(count, -1) for one in wide)
+        self._newest = None
         self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
         self._rng.bit_generator.state = random
 
