@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,8 +22,13 @@ from plow_twin import Twin, Wear, simulate
 from plow_twin.estimate.follow import Follower, follower
 from plow_twin.estimate.followed import follow
 from plow_twin.estimate.result import Estimate, Interval, State
+from plow_twin.live import diagnostics, parameters
+from plow_twin.live.estimation import problems
+from plow_twin.live.runtime import Runtime
+from plow_twin.live.solver_start import Preparation
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.model.scene import Scene
+from plow_twin.record.messages import Message
 from plow_twin.record.replay import replay
 from plow_twin.ros.messages import set_stamp
 from plow_twin.run.batch import TwinBatch
@@ -43,6 +49,7 @@ from plow_twin.stream.journal import (
 )
 from plow_twin.stream.outputs import CLEARANCE_NAMES, NONE, Published
 from plow_twin.stream.session import Session
+from plow_twin.stream.topics import TOPICS
 
 sys.path.insert(0, str(ROOT / "benchmark"))
 from estimate_truths import GROUPS, Truth, draw
@@ -381,3 +388,88 @@ def test_a_real_node_publishes_the_forces_of_its_machine(tmp_path: Path) -> None
 
 def _seconds(message: JointState) -> float:
     return message.header.stamp.sec - T0 // 10**9 + 1e-9 * message.header.stamp.nanosec
+
+
+class Front:
+    """Where a runtime's messages go: they are kept."""
+
+    name, follows_samples, sends_motion = "/plow_twin", False, True
+    topics = {topic.name: f"/{topic.name}" for topic in TOPICS}  # noqa: RUF012
+
+    def __init__(self) -> None:
+        self.sent: Counter[str] = Counter()
+
+    def send(self, topic: str, message: memoryview | Message) -> None:
+        self.sent[topic] += 1
+
+    def now_ns(self) -> int:
+        return T0
+
+    def say_error(self, text: str) -> None:
+        pytest.fail(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_: ""
+
+
+@pytest.mark.parametrize("mode", ["on_sample", "fixed_rate"])
+def test_a_runtime_says_what_follows_and_goes_on_by_the_parameters_where_samples_wait(
+    truth: Truth, tmp_path: Path, mode: str
+) -> None:
+    scene = tmp_path / "believed.yaml"
+    scene.write_text(dump_scene(truth.nominal), encoding="utf-8")
+    values = {"scene": str(scene), "estimate": True, "follow_members": MEMBERS, "excitation_timeout": 3600.0}
+    given = parameters.settings(values | {"publish_mode": mode, "record_path": str(tmp_path / "run")})
+    front = Front()
+    prepared = Preparation(given).result(lambda: False)
+    runtime = Runtime(front, given, prepared)
+    runtime.start()
+    runtime.activate()
+
+    def play(begin: float, end: float) -> None:
+        for entry in _in_turn(truth, begin, end):
+            if isinstance(entry, Pose):
+                runtime.take_pose(entry.stamp_ns, (entry.pose[0], entry.pose[1], entry.pose[2]))
+                continue
+            assert isinstance(entry, Sample)
+            for topic, message in runtime.step([(entry.stamp_ns, entry.wrench)]):
+                front.send(topic, message)
+            if mode == "fixed_rate" and entry.stamp_ns // 50_000_000 % 2:
+                runtime.publish_due()
+
+    def figures() -> dict[str, str]:
+        return diagnostics.Health().parts("active", "", runtime, 0)["follow"][2]
+
+    play(0.0, 1.0)
+    assert runtime.follower is not None and int(figures()["poses_used"]) > 50
+    runtime.driver.session.apply(_known(truth))
+    play(1.0, 1.5)
+    late = _samples(truth, 1.45, 1.47)[1]
+    for topic, message in runtime.step([(late.stamp_ns + 1_000_000, late.wrench)]):
+        front.send(topic, message)
+    assert runtime.driver.rolled_back == 1
+    assert (figures()["follow"], figures()["source"]) == ("full", "estimate")
+    assert diagnostics.summary("active", "", runtime)[2]["follow"] == "estimate"
+    sent = front.sent.copy()
+    assert sent["force_intervals"] == sent["peak_intervals"] == sent["contact_forces"] > 40
+    look = next(do for rate, do in runtime.periodic() if rate == 1.0)
+    for waits in (True, True, False, True, True, True, True, True):
+        runtime.inputs.waited(1, 1.0 if waits else 0.0)
+        assert not runtime.reduced
+        look()
+    level, message, _ = diagnostics.summary("active", "", runtime)
+    assert runtime.reduced and level == diagnostics.WARN and "did not keep up" in message
+    play(1.5, 2.0)
+    assert front.sent["force_intervals"] == sent["force_intervals"]
+    assert front.sent["contact_forces"] > sent["contact_forces"]
+    assert (figures()["follow"], figures()["members"], figures()["reduced"]) == ("parameters", "1", "1")
+    assert runtime.close() == []
+    report = replay(tmp_path / "run")
+    assert (report.exit_code, report.first_divergence) == (0, None)
+    assert report.compared["force_intervals"] == sent["force_intervals"]
+
+
+def test_nothing_follows_in_bounded_time(truth: Truth) -> None:
+    values = {"estimate": True, "max_evaluations": 1000}
+    assert [one.key for one in problems(parameters.settings(values), truth.nominal)] == ["max_evaluations"]
+    assert not problems(parameters.settings(values | {"follow": "off"}), truth.nominal)
