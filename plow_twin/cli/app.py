@@ -26,6 +26,7 @@ from plow_twin.cli.info import info
 from plow_twin.cli.live import live
 from plow_twin.cli.record import record
 from plow_twin.cli.replay import replay
+from plow_twin.cli.setup import setup
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
 from plow_twin.cli.view import view
@@ -83,6 +84,7 @@ def commands(laws: tuple[str, ...]) -> None:
 for _verb in (
     simulate,
     demo,
+    setup,
     live,
     call,
     dashboard,

@@ -1,0 +1,100 @@
+"""`plow-twin setup`: a mapping and a stub of a scene for a CSV file of one's own."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from plow_twin.cli.console import DONE, output_console, quiet_option, say_error, table, unit_option
+
+if TYPE_CHECKING:
+    from plow_twin.record.column_guess import Guess
+
+
+@click.command(
+    short_help="Guess the columns of a CSV file; write a mapping and a stub of a scene.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong usage, or a column that cannot be told.",
+)
+@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option("--scene", help="Scene file or preset of the machine; without it a stub is written.")
+@click.option("--column", "given", multiple=True, metavar="NAME=COLUMN", help="A column: fx=Load_1, t=Zeit.")
+@unit_option
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path(), help="Folder for the files.")
+@quiet_option
+def setup(file: Path, scene: str | None, given: tuple[str, ...], units: dict[str, str], out: Path, quiet: bool) -> int:
+    """Guess separator, time, columns and units of FILE; ask in a terminal what cannot be told; write map and scene."""
+    from plow_twin.record.column_guess import guess_columns
+    from plow_twin.scene_file import load_scene
+
+    columns = dict(text.partition("=")[::2] for text in given)
+    for text in given:
+        if "=" not in text:
+            raise click.BadParameter(f"got {text!r}, expected NAME=COLUMN", param_hint="--column")
+    nominal = load_scene(scene or "paper")
+    guess = guess_columns(file, nominal, columns, units)
+    while guess.open:
+        name, choices = next(iter(guess.open.items()))
+        if quiet or not sys.stdin.isatty():
+            raise click.UsageError(
+                f"{file}: {', '.join(guess.open)} cannot be told from the columns {', '.join(guess.names)}; "
+                + "state " + " ".join(f"--column {one}=COLUMN" for one in guess.open)
+            )  # fmt: skip
+        columns[name] = click.prompt(f"Column of {name}", type=click.Choice(choices or guess.names))
+        guess = guess_columns(file, nominal, columns, units)
+    written = _write(guess, scene, out)
+    if not quiet:
+        _show(guess)
+        for path in written:
+            click.echo(path)
+        where = scene or str(out / "scene.yaml")
+        click.echo(f"next: plow-twin live {file} --map {out / 'map.yaml'} --scene {where} --record runs/first")
+    return DONE
+
+
+def _write(guess: Guess, scene: str | None, out: Path) -> list[Path]:
+    """Write mapping, stub and picture; return their paths."""
+    from plow_twin.scene_file import dump_scene, load_scene
+
+    out.mkdir(parents=True, exist_ok=True)
+    files = {"map.yaml": guess.mapping_text()}
+    if scene is None:
+        files["scene.yaml"] = _STUB + dump_scene(load_scene("paper"))
+    for name in files:
+        if (out / name).exists():
+            raise click.UsageError(f"{out / name}: is there already, expected another folder: --out")
+    for name, text in files.items():
+        (out / name).write_text(text, encoding="utf-8")
+    try:
+        from plow_twin.view.own_file import draw_own_file
+
+        picture = [draw_own_file(guess, out / "setup.png")]
+    except ModuleNotFoundError:
+        say_error("plow-twin: no picture: pip install 'plow_twin[study]'")
+        picture = []
+    return [*(out / name for name in files), *picture]
+
+
+_STUB = """\
+# A stub: every number is of the preset `paper`, a reconstruction, and not of your machine. Replace mass, frame,
+# clearance, contact and loads (tutorial, step 1); `plow-twin info scene.yaml` shows all with what follows from them.
+"""
+
+
+def _show(guess: Guess) -> None:
+    import numpy as np
+
+    names = {",": "comma", ";": "semicolon", "\t": "tab"}
+    comma = ", decimal commas" if guess.decimal_comma else ""
+    spacing = float(np.nanmedian(np.diff(guess.stamps_s))) if len(guess.stamps_s) > 1 else float("nan")
+    rate = f", a row each {spacing:.4g} s"
+    click.echo(f"{guess.path}: separated by {names[guess.delimiter]}{comma}{rate}")
+    shown = table("Columns", "number", "column", "unit", "largest [SI]", "found")
+    unit = guess.time_unit or "date"
+    shown.add_row("t", guess.time, unit, "", guess.because["t"])
+    for (role, name), column in guess.columns.items():
+        largest = float(np.nanmax(np.abs(guess.values[role, name]), initial=0.0))
+        shown.add_row(name, column, guess.units.get(name, "SI"), f"{largest:.4g}", guess.because[name])
+    output_console().print(shown)

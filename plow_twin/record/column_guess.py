@@ -1,0 +1,232 @@
+"""Which columns of an unknown CSV file are the load, the pose and the time, and in which units: by names and sizes."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.errors import RecordingError
+from plow_twin.model.scene import Scene
+from plow_twin.record.map_file import QUANTITIES, ROLES, UNITS
+from plow_twin.record.sources import columns_of
+from plow_twin.record.times import NUMBER, STAMP_UNITS, time_ns
+from plow_twin.record.unit_check import CHECKED, unit_doubts
+from plow_twin.scene_file.csv_rows import csv_rows, delimiter_of, open_csv
+
+Array = NDArray[np.float64]
+
+#: Names of columns, without spaces and signs, by role and number.
+_NAMES: Final = {
+    ("excitation", "fx"): r"fx|(force|load|kraft|last)x|x(force|load|kraft)|fhor(izontal)?|horizontalforce",
+    ("excitation", "fy"): r"fy|(force|load|kraft|last)y|y(force|load|kraft)|fver(tical)?|verticalforce",
+    ("excitation", "m"): r"mz?|moment[xyz]?|torque[xyz]?|drehmoment|mtheta",
+    ("head_pose", "x"): r"x|(pos|position|weg|displacement)x|x(pos|position|weg)",
+    ("head_pose", "y"): r"y|(pos|position|weg|displacement)y|y(pos|position|weg)",
+    ("head_pose", "theta"): r"theta|angle|winkel|phi|rot(ation)?|tilt",
+    ("travel", "speed"): r"speed|v|velocity|geschwindigkeit|ploughspeed",
+}
+_TIME: Final = r"t|time|timestamp|stamp|zeit|zeitstempel|date|datetime|datum"
+_UNIT: Final = re.compile(
+    r"(.+?)\s*(?:[\[(]\s*([^\])]+?)\s*[\])]|[ _](kN ?m|N ?m|kN|N|mm|cm|m|mrad|rad|deg|ms|us|ns|s))"
+)
+#: Times beyond these [unit of the file] count from 1970: the year 2001 in s, ms, us and ns.
+_DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
+#: Numbers that a load needs.
+_NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
+
+
+@dataclass
+class Guess:
+    """What a file holds.
+
+    `columns` by role and number; `units` of those that are not SI, by number; `time` is the column of the time and
+    `time_unit` its unit, empty for dates in words. `because` says how each was found. `open` are those that cannot be
+    told: number or `t`, and the columns or units to choose from.
+    """
+
+    path: Path
+    delimiter: str
+    decimal_comma: bool
+    names: tuple[str, ...]
+    columns: dict[tuple[str, str], str] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    time: str = ""
+    time_unit: str = ""
+    because: dict[str, str] = field(default_factory=dict)
+    open: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    stamps_s: Array = field(default_factory=lambda: np.zeros(0))
+    #: numbers in SI, by role and number
+    values: dict[tuple[str, str], Array] = field(default_factory=dict)
+
+    def mapping(self) -> dict[str, Any]:
+        """Return the content of a mapping file."""
+        found: dict[str, Any] = {}
+        for (role, name), column in self.columns.items():
+            entry = found.setdefault(role, {"topic": self.path.stem, "fields": {}})
+            entry["fields"][name] = column
+            if name in self.units:
+                entry.setdefault("unit", {})[name] = self.units[name]
+        for entry in found.values():
+            entry["stamp"] = self.time
+            if self.time_unit:
+                entry["stamp_unit"] = self.time_unit
+        return found
+
+    def mapping_text(self) -> str:
+        """Return the content of a mapping file as YAML."""
+        import yaml
+
+        text: str = yaml.safe_dump(self.mapping(), sort_keys=False, allow_unicode=True)
+        return text
+
+
+def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
+    """Guess what the columns of a CSV file are, from its first 20,000 rows.
+
+    Parameters
+    ----------
+    path
+        The file.
+    scene
+        Its loads and sizes say which magnitudes are plausible.
+    columns, units
+        Columns and units that are known, by number (fx, ..., t).
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, has no header or no rows, or lacks a column that is named.
+    """
+    guess, rows = _read(path)
+    for name, column in columns.items():
+        if column not in guess.names:
+            raise RecordingError(f"column of {name}: got {column!r}, expected one of {', '.join(guess.names)}")
+    known = {key[1]: key for key in _NAMES}
+    unknown = [name for name in (*columns, *units) if name not in known and name != "t"]
+    if unknown:
+        raise RecordingError(f"column or unit of {unknown[0]}: expected one of t, {', '.join(known)}")
+    numbers = {
+        name: np.array([_number(row[index]) for row in rows])
+        for index, name in enumerate(guess.names)
+    }  # fmt: skip
+    _find_time(guess, rows, numbers, columns.get("t", ""), units.get("t", ""))
+    for key, pattern in _NAMES.items():
+        if key[1] in columns:
+            guess.columns[key], guess.because[key[1]] = columns[key[1]], "as stated"
+            continue
+        alike = [name for name in guess.names if name != guess.time and re.fullmatch(pattern, _plain(name))]
+        if len(alike) == 1:
+            guess.columns[key], guess.because[key[1]] = alike[0], "by its name"
+        elif alike:
+            guess.open[key[1]] = tuple(alike)
+    left = [name for name in guess.names if name not in guess.columns.values() and name != guess.time]
+    for _, name in _NEEDED:
+        if ("excitation", name) not in guess.columns:
+            guess.open.setdefault(name, tuple(name for name in left if np.isfinite(numbers[name]).any()))
+    guess.open = {name: choices for name, choices in guess.open.items() if name == "t" or known[name] in _NEEDED}
+    _find_units(guess, numbers, scene, units)
+    return guess
+
+
+def _read(path: Path) -> tuple[Guess, list[list[str]]]:
+    try:
+        with open_csv(path) as stream:
+            rows = [cells for _, cells in islice(csv_rows(stream, "#"), CHECKED + 1)]
+        with open_csv(path) as stream:
+            first = [line for line in islice(stream, 100) if line.strip() and not line.startswith("#")]
+    except (OSError, csv.Error) as error:
+        raise RecordingError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    if len(rows) < 2 or all(NUMBER.fullmatch(cell.strip()) for cell in rows[0] if cell.strip()):
+        raise RecordingError(f"{path}: got no header row or no rows, expected names of columns and numbers under them")
+    names = columns_of(path, tuple(name.strip() for name in rows[0])).names
+    delimiter = delimiter_of(first[0])
+    comma = delimiter != "," and any("," in line for line in first[1:])
+    return Guess(path, delimiter, comma, names), [row for row in rows[1:] if len(row) == len(names)]
+
+
+def _find_time(
+    guess: Guess, rows: Sequence[Sequence[str]], numbers: Mapping[str, Array], given: str, unit: str
+) -> None:
+    """Find the column of the time: by its name, or the one that rises; and its unit, where the numbers tell it."""
+    alike = [name for name in guess.names if re.fullmatch(_TIME, _plain(name))]
+    rising = [name for name, found in numbers.items() if len(found) > 2 and (np.diff(found) > 0.0).all()]
+    choices = [given] if given else alike or rising
+    if len(choices) != 1:
+        guess.open["t"] = tuple(choices or guess.names)
+        return
+    guess.time = choices[0]
+    guess.because["t"] = "as stated" if given else "by its name" if alike else "it alone rises"
+    found = numbers[guess.time]
+    if not np.isfinite(found).any():
+        index = guess.names.index(guess.time)
+        stamps = [time_ns(row[index]) for row in rows]
+        guess.stamps_s = np.array([np.nan if stamp is None else stamp * 1e-9 for stamp in stamps])
+        return
+    header = _unit_of(guess.time)
+    newest = float(np.nanmax(np.abs(found)))
+    dates = next((name for name, least in _DATES if newest > least), "")
+    guess.time_unit = unit or (header if header in STAMP_UNITS else "") or dates or "s"
+    guess.stamps_s = found * STAMP_UNITS[guess.time_unit] * 1e-9 if guess.time_unit in STAMP_UNITS else found
+    if not (unit or header in STAMP_UNITS or dates):
+        guess.because["t"] += "; its unit by the rate of the samples"
+
+
+def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given: Mapping[str, str]) -> None:
+    """Find the units: those stated, those in the names, those that the magnitudes tell."""
+    for key, column in guess.columns.items():
+        unit = given.get(key[1]) or _unit_of(column)
+        known = UNITS[QUANTITIES[key]]
+        if given.get(key[1]) and unit not in known:
+            raise RecordingError(f"unit of {key[1]}: got {unit!r}, expected one of {', '.join(known)}")
+        if unit in known:
+            guess.units[key[1]] = unit
+            guess.because[key[1]] += f", {unit} as stated" if key[1] in given else f", {unit} in its name"
+        guess.values[key] = numbers[column] * known.get(unit or "", 1.0)
+    stated = set(guess.units)
+    for doubt in unit_doubts(guess.values, guess.stamps_s[np.isfinite(guess.stamps_s)], scene):
+        for name in set(doubt.names) - stated:
+            if name == "t":
+                if "its unit by" in guess.because.get("t", ""):
+                    guess.time_unit, guess.stamps_s = doubt.likely, guess.stamps_s * 1e-3
+                continue
+            guess.units[name] = doubt.likely
+            guess.because[name] += f", {doubt.likely} by its size"
+            guess.values[doubt.role, name] *= UNITS[QUANTITIES[doubt.role, name]][doubt.likely]
+    # forces are in one unit
+    both = [name for name in ("fx", "fy") if ("excitation", name) in guess.columns]
+    for name in both:
+        other = next((guess.units[one] for one in both if one in guess.units), "")
+        if other and name not in guess.units:
+            guess.units[name] = other
+            guess.because[name] += f", {other} as the other force"
+            guess.values["excitation", name] *= UNITS["force"][other]
+    # a moment has no size of its own to go by: it is in the unit of its forces
+    if guess.units.get("fx") == "kN" and "m" not in guess.units and ("excitation", "m") in guess.columns:
+        guess.units["m"] = "kN m"
+        guess.because["m"] += ", kN m as the forces are in kN"
+        guess.values["excitation", "m"] *= 1e3
+
+
+def _number(cell: str) -> float:
+    cell = cell.strip()
+    return float(cell) if NUMBER.fullmatch(cell) else np.nan
+
+
+def _unit_of(name: str) -> str:
+    found = _UNIT.fullmatch(name)
+    unit = (found[2] or found[3]) if found else ""
+    return {"Nm": "N m", "kNm": "kN m", "°": "deg", "µm": "um", "sec": "s"}.get(unit, unit)
+
+
+def _plain(name: str) -> str:
+    """Return a name in small letters without its unit, spaces and signs."""
+    found = _UNIT.fullmatch(name)
+    return re.sub(r"[^a-z0-9]", "", (found[1] if found else name).lower())

@@ -1,0 +1,40 @@
+"""The first seconds of a file of one's own as it will be read: its load, pose and speed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from plow_twin.record.column_guess import Guess
+
+_SHOWN_S: Final = 10.0
+
+
+def draw_own_file(guess: Guess, path: Path) -> Path:
+    """Draw the first ten seconds into a PNG; return its path."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = [
+        ("load [kN, kN m]", 1e-3, [("excitation", name) for name in ("fx", "fy", "m")]),
+        ("position [mm], angle [mrad]", 1e3, [("head_pose", name) for name in ("x", "y", "theta")]),
+        ("speed [m/s]", 1.0, [("travel", "speed")]),
+    ]
+    rows = [row for row in shown if any(key in guess.values for key in row[2])]
+    figure = Figure(figsize=(11, 2.8 * len(rows) + 0.6), layout="constrained")
+    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    times = guess.stamps_s - np.nanmin(guess.stamps_s)
+    first = times <= _SHOWN_S
+    for axis, (label, factor, keys) in zip(axes, rows, strict=True):
+        for key in keys:
+            if key in guess.values:
+                axis.plot(times[first], factor * guess.values[key][first], ".-", ms=2, lw=0.8, label=key[1])
+        axis.set_ylabel(label)
+        axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=8)
+    axes[-1].set_xlabel("time since the first row [s]")
+    figure.suptitle(f"{guess.path.name}, its first ten seconds as they are read")
+    with path.open("wb") as stream:
+        FigureCanvasAgg(figure).print_png(stream)  # type: ignore[no-untyped-call]
+    return path

@@ -1,0 +1,87 @@
+"""Own files: separator, time, columns and units are guessed, or asked for by the option that states them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from plow_twin.cli.app import run as cli
+from plow_twin.errors import RecordingError
+from plow_twin.record.column_guess import guess_columns
+from plow_twin.scene_file import load_scene
+
+PAPER = load_scene("paper")
+
+
+def _file(path: Path, header: str, *, step: float, size: float = 1e3, comma: bool = False) -> Path:
+    """Write a file of a time, the paper's load in units of `size` N, and a pose in mm."""
+    lines = [header]
+    for index in range(600):
+        phase = math.sin(2e-3 * index)
+        numbers = (index * step, 32e3 / size * phase, -11e3 / size * phase, -45e3 / size * phase, 5.0 * phase)
+        line = ";".join(f"{number:.5f}" for number in numbers)
+        lines.append(line.replace(".", ",") if comma else line)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = _file(tmp_path / "own.csv", "Zeit;Kraft_x [kN];Kraft y;Drehmoment;Weg_x_mm", step=1.0, comma=True)
+    out = tmp_path / "out"
+    assert cli(["setup", str(file), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "semicolon, decimal commas, a row each 0.001 s" in said and "plow-twin live" in said
+    assert (out / "setup.png").stat().st_size > 10_000
+    run = ["live", str(file), "--map", str(out / "map.yaml"), "--scene", str(out / "scene.yaml"), "--json"]
+    assert cli(run) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["input"]["samples_used"], facts["state"]["model_time_s"]) == ("600", "0.599")
+    # nothing that is there already is written over
+    assert cli(["setup", str(file), "--out", str(out)]) == 2 and "is there already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("header", "step", "size", "units"),
+    [
+        ("t;fx;fy;m;x", 1e-3, 1.0, {"x": "mm", "t": "s"}),
+        ("t;fx;fy;m;x", 1.0, 1e3, {"fx": "kN", "fy": "kN", "m": "kN m", "x": "mm", "t": "ms"}),
+        (
+            "timestamp;F_x(kN);F_y(kN);Mz (kN m);pos_x [mm]",
+            1e-3,
+            1e3,
+            {"fx": "kN", "fy": "kN", "m": "kN m", "x": "mm", "t": "s"},
+        ),
+    ],
+)
+def test_units_are_those_of_the_names_or_of_the_sizes(
+    tmp_path: Path, header: str, step: float, size: float, units: dict[str, str]
+) -> None:
+    guess = guess_columns(_file(tmp_path / "own.csv", header, step=step, size=size), PAPER, {}, {})
+    assert guess.units | {"t": guess.time_unit} == units and not guess.open
+    largest = {name: float(abs(found).max()) for (_, name), found in guess.values.items()}
+    phase = math.sin(2e-3 * 599)
+    assert largest == pytest.approx(
+        {"fx": 32e3 * phase, "fy": 11e3 * phase, "m": 45e3 * phase, "x": 5e-3 * phase}, rel=1e-3
+    )
+    assert guess.stamps_s[-1] == pytest.approx(0.599)
+
+
+def test_what_cannot_be_told_is_asked_for_by_the_option_that_states_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
+    assert cli(["setup", str(file), "--out", str(tmp_path / "out")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "fx, fy, m cannot be told from the columns t, a, b, c, d" in said and "--column fx=COLUMN" in said
+    assert not (tmp_path / "out").exists()
+    stated = {"fx": "a", "fy": "b", "m": "c"}
+    guess = guess_columns(file, PAPER, stated, {"m": "kN m"})
+    assert {name: column for (_, name), column in guess.columns.items()} == stated and guess.units == {"m": "kN m"}
+    for columns, units, wrong in (({"fx": "z"}, {}, "got 'z'"), ({"fz": "a"}, {}, "fz"), ({}, {"fx": "lbf"}, "lbf")):
+        with pytest.raises(RecordingError, match=wrong):
+            guess_columns(file, PAPER, stated | columns, units)
