@@ -172,7 +172,7 @@ function showAlarms() {
 }
 
 function showPads(peak, largest, wear) {
-  const {facts, motion} = state, limits = facts.thresholds.force ?? [0, 0], intervals = values("force_intervals");
+  const {facts, motion} = state, limits = facts.thresholds.force ?? [0, 0], intervals = values("window_forces");
   const scale = Math.max(...largest, ...limits, 1);
   const body = by("pads").tBodies[0];
   body.replaceChildren();
