@@ -506,6 +506,19 @@ def test_files_with_dates_are_waited_for_and_followed_from_one_to_the_next(
         assert json.loads(capsys.readouterr().out)["input"]["samples_used"] == str(count)
 
 
+def test_the_share_read_of_files_that_end_rises_to_all(tmp_path: Path) -> None:
+    for day in (1, 2):
+        _csv(tmp_path / f"load_{day}.csv", 9000)
+    for source in (tmp_path / "load_1.csv", tmp_path / "load_*.csv"):
+        files = Files([source], follow=False)
+        files.start([source.stem])
+        shares = [files.share]
+        while files.poll(0.0):
+            shares.append(files.share)
+        files.close()
+        assert shares == sorted(shares) and shares[0] == 0.0 and shares[-1] == 1.0 and len({*shares}) > 2
+
+
 def test_nothing_of_a_followed_file_is_lost_unseen_when_it_is_cut_or_another_takes_its_place(tmp_path: Path) -> None:
     path = tmp_path / "load.csv"
     path.write_text("t,fx,fy,m\n1,10,0,0\n2,20,0,0\n3,3")

@@ -98,6 +98,19 @@ class _RateColumn(ProgressColumn):
 @contextmanager
 def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
     """Show a progress bar on standard error while the work reports the share done."""
+    with progress_bar(title, quiet) as update, _interruption() as interrupted:
+
+        def on_progress(share: float) -> None:
+            if interrupted():
+                raise KeyboardInterrupt
+            update(share)
+
+        yield on_progress
+
+
+@contextmanager
+def progress_bar(title: str, quiet: bool) -> Iterator[OnProgress]:
+    """Show a progress bar on standard error; signals are left alone."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(bar_width=30),
@@ -109,15 +122,7 @@ def progress(title: str, quiet: bool) -> Iterator[OnProgress]:
     console = error_console()
     with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task(title, total=1.0)
-
-        with _interruption() as interrupted:
-
-            def on_progress(share: float) -> None:
-                if interrupted():
-                    raise KeyboardInterrupt
-                bar.update(task, completed=share)
-
-            yield on_progress
+        yield lambda share: bar.update(task, completed=share)
 
 
 @contextmanager

@@ -16,10 +16,12 @@ from plow_twin.cli.console import (
     DONE,
     DONE_WITH_LOSS,
     POSITIVE,
+    OnProgress,
     busy,
     error_console,
     json_option,
     output_console,
+    progress_bar,
     quiet_option,
     say_error,
     show_facts,
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
     from plow_twin.live.parameters import Settings
     from plow_twin.live.stop import StopSignals
 
+#: Time between two looks of the progress bar [s].
+_PROGRESS_S = 0.2
 #: Counters of input that was not used.
 _LOST = re.compile(r"dropped_.*|.*_dropped|.*_lost")
 _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
@@ -119,6 +123,8 @@ def _live(
             if control is not None:
                 _answer_on(control, front)
             screen = opened.enter_context(_screen(front, access, source)) if access is not None else None
+            if bridge.ends:
+                _show_progress(front, bridge, opened.enter_context(progress_bar("reading", quiet or lines)))
             stop.interrupt = False
             lost = front.run(lambda: stop.stopped, seconds or float("inf"))
             if screen is not None and bridge.finished and not stop.stopped:
@@ -156,6 +162,15 @@ def _screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
     screen = open_screen(front, access, source)
     say_where(screen, access)
     return screen
+
+
+def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> None:
+    """Show how much of a source that ends has been read."""
+    from plow_twin.live.bridge.files import Files
+    from plow_twin.live.timer import Timer
+
+    if isinstance(bridge, Files):
+        front.timers.append(Timer(_PROGRESS_S, lambda: update(bridge.share)))
 
 
 def _control(path: Path | None) -> AbstractContextManager[Control | None]:

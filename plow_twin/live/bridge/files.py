@@ -213,6 +213,8 @@ class Files:
             if not tail.path.parent.is_dir():
                 raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
+        #: bytes of the files that are read once, and of them those read
+        self._size = self._done = 0
 
     def topics(self) -> dict[str, TopicType]:
         """Return columns by topic, by the first line of each file; a followed one is waited for."""
@@ -229,7 +231,11 @@ class Files:
         """Begin to read the files of these topics."""
         self._tails = [tail for tail in self._tails if tail.topic in topics]
         if self.ends:
-            streams = [_all(tail) for tail in self._tails]
+            files = [
+                file for tail in self._tails for file in (tail.files() if isinstance(tail, _Dated) else [tail.path])
+            ]
+            self._size = sum(file.stat().st_size for file in files)
+            streams = [self._all(tail) for tail in self._tails]
             self._merged = streams[0] if len(streams) == 1 else merged(streams, lambda row: _sent_ns(row, stamp_ns))
 
     def poll(self, timeout_s: float) -> list[Arrived]:
@@ -246,6 +252,25 @@ class Files:
                 return found
             time.sleep(min(_LOOK_S, left_s))
 
+    @property
+    def share(self) -> float:
+        """Share of the files that has been read, 0..1; 0 where they are followed."""
+        return self._done / self._size if self._size else 0.0
+
+    def _all(self, tail: _Tail | _Dated) -> Iterator[Arrived]:
+        """Yield all messages of a file that is read once, or of the files of a pattern one after the other."""
+        if isinstance(tail, _Dated):
+            for file in tail.files():
+                with closing(_Tail(file, tail.topic)) as part:
+                    yield from self._all(part)
+            return
+        while True:
+            data = tail._block()
+            self._done += len(data)
+            yield from messages(tail.topic, tail.lines.add(data) if data else tail.lines.end(), tail.rows)
+            if not data:
+                return
+
     def close(self) -> None:
         """Close the files."""
         for tail in self._tails:
@@ -255,20 +280,6 @@ class Files:
 def is_pattern(path: Path) -> bool:
     """Return whether a path stands for all files with such a name."""
     return any(sign in path.name for sign in "*?[") and not path.exists()
-
-
-def _all(tail: _Tail | _Dated) -> Iterator[Arrived]:
-    """Yield all messages of a file that is read once, or of the files of a pattern one after the other."""
-    if isinstance(tail, _Dated):
-        for file in tail.files():
-            with closing(_Tail(file, tail.topic)) as part:
-                yield from _all(part)
-        return
-    while True:
-        data = tail._block()
-        yield from messages(tail.topic, tail.lines.add(data) if data else tail.lines.end(), tail.rows)
-        if not data:
-            return
 
 
 def _sent_ns(row: Arrived, stamp_ns: StampOf[Arrived] | None) -> int | None:
