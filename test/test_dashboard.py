@@ -36,7 +36,7 @@ from plow_twin.record.reader import RunReader
 from plow_twin.record.recording import read_recording
 from plow_twin.record.replay import replay
 from plow_twin.scene_file import dump_scene, load_scene
-from plow_twin.solve.state import ROW
+from plow_twin.solve.state import ROW, WITH_INTERVALS
 from plow_twin.stream.journal import Digest, Mark, Parameter
 from plow_twin.stream.outputs import NOTHING, Published
 
@@ -85,6 +85,22 @@ def test_the_hour_is_bounded_has_each_second_once_and_begins_anew_where_stamps_s
     assert history.since(6 * SPAN_S) == [] and len(history.since(6 * SPAN_S - 4)) == 2
     assert history.add({**motion, "t": 50.0, "peak": [1.0] * 8}, 10**6)
     assert [row[0] for row in history.since(0)] == [50]
+    for points in ([1.0] * 8 + [4.0] * 8, [2.0] * 8 + [3.0] * 8):
+        history.add({**motion, "t": 50.5, "peak": [1.0] * 8, "points": points}, 10**6 + 1)
+    assert history.since(0)[0][22:] == [2.0] * 8 + [4.0] * 8
+
+
+def test_the_intervals_of_a_twin_that_follows_are_shown_with_its_peaks() -> None:
+    link, theirs = pair()
+    feed = Feed(link, FACTS)
+    for low, high in ((5.0, 20.0), (7.0, 15.0)):
+        published = _published(1.0, 10.0)
+        published.rows["followed"], published.rows["peak_low"], published.rows["peak_high"] = WITH_INTERVALS, low, high
+        feed.publication(published)
+    feed.turn()
+    with theirs:
+        assert json.loads(theirs.recv(1 << 16))["motion"]["points"] == [7.0] * 8 + [20.0] * 8
+    link.close()
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -26,10 +28,11 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_processes import ROOT, bench, value
+from ros_processes import ROOT, WAIT_S, Process, bench, value
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from websockets.sync.client import connect
 
 from plow_twin.live.diagnostics import KEYS, STATUS_KEYS
 from plow_twin.model.loads import compile_loads
@@ -277,11 +280,36 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(t
         probe.until(lambda: logged in running.twin.output(), "the alarm in the log")
         assert value(alarms[0], "force_level") == "warn"
         send(T0 + 600 * MS, (0.0, 0.0, 0.0))
-        answer = probe.call(Trigger, f"{running.namespace}/plow_twin/acknowledge_alarms", Trigger.Request())
-        assert answer.success
-        probe.until(lambda: len(alarms) > 1, "what is left")
-        answer = probe.call(Trigger, f"{running.namespace}/plow_twin/mark", Trigger.Request())
-        assert answer.success and str(tmp_path / "run_2") in answer.message
+        # the operator's screen beside the node shows it, and calls its services
+        options = ["dashboard", "--ros", "--namespace", running.namespace, "--listen", "127.0.0.1:0"]
+        screen = Process("plow_twin", options, tmp_path / "screen.log")
+        try:
+            probe.until(lambda: "screen: " in screen.output(), "the screen")
+            address = screen.output().partition("screen: http")[2].split()[0]
+            with connect(f"ws{address}data", max_size=None, close_timeout=0.1) as page:
+                seen: dict[str, Any] = {"events": []}
+
+                def told(reached: Callable[[], bool]) -> None:
+                    while not reached():
+                        message = json.loads(page.recv(timeout=WAIT_S))
+                        seen.update(message.get("parts", {}))
+                        seen["events"] += message.get("events", [])
+                        seen["motion"] = message.get("motion") or seen.get("motion")
+
+                told(lambda: {"alarms", "input"} <= seen.keys())
+                assert seen["alarms"][2]["force_latched"] == "warn" and seen["input"][2]["samples_used"] == "601"
+                page.send(json.dumps({"do": "acknowledge"}))
+                told(lambda: len(seen["events"]) == 1)
+                probe.until(lambda: len(alarms) > 1, "what is left")
+                page.send(json.dumps({"do": "mark", "text": "by the screen"}))
+                told(lambda: len(seen["events"]) == 2)
+                send(T0 + 601 * MS, (0.0, 0.0, 0.0))
+                told(lambda: seen["motion"] is not None)
+            assert all(event["done"] for event in seen["events"]), seen["events"]
+            assert str(tmp_path / "run_2") in seen["events"][1]["text"]
+            assert screen.stop() == 0
+        finally:
+            screen.close()
         probe.until_figure("recorder", "marks", "2")
         there = {
             topic.name: probe.node.get_publishers_info_by_topic(f"{running.namespace}/{topic.name}") for topic in TOPICS
@@ -304,7 +332,8 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_writes_what_was_before_it(t
     # the first one, which holds the beginning, tells the alarm again; what led to the second one's is not in it
     assert (before.compared["alarms"], after.compared["alarms"]) == (1, 0) and after.not_compared["alarms"] > 0
     kinds = [type(record.entry).__name__ for record in RunReader(tmp_path / "run_2") if hasattr(record, "entry")]
-    assert (kinds.count("Parameter"), kinds.count("Mark")) == (1, 1)  # the acknowledgement and the mark
+    # the acknowledgement, the text of the mark, and the mark
+    assert (kinds.count("Parameter"), kinds.count("Mark")) == (2, 1)
 
 
 def test_a_publisher_that_comes_after_the_followed_one_has_gone_is_followed(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -87,6 +89,7 @@ def dashboard(
     access = access_of(options)
     with interruptible() as stopped:
         if run is None:
+            os.environ.setdefault("AMENT_PREFIX_PATH", sys.prefix)  # ROS from wheels
             from plow_twin.dashboard.node import show_node
 
             show_node(namespace, name, scene, access, wait, stopped, lambda screen: say_where(screen, access))

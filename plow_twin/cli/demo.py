@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from plow_twin.cli.console import POSITIVE, quiet_option
+from plow_twin.cli.dashboard import access_of, access_options, dashboard_option
 
 
 @click.command(
@@ -28,9 +30,16 @@ from plow_twin.cli.console import POSITIVE, quiet_option
     show_default=True,
     help="Folder of the recording and the view.",
 )
+@dashboard_option
+@access_options
 @quiet_option
-def demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
+def demo(speed: str, seconds: float, out: Path, quiet: bool, dashboard: bool, **options: Any) -> int:
     """Run the twin on the paper's load: a publisher process and a node with its recorder."""
     from plow_twin.demo.demo import run_demo
 
-    return run_demo(speed, seconds, out, quiet)
+    if not dashboard:
+        return run_demo(speed, seconds, out, quiet)
+    access_of(options)
+    token = options["token_file"]
+    shown = ["--listen", options["listen"], *(("--token-file", str(token)) if token is not None else ())]
+    return run_demo(speed, seconds, out, quiet, shown)

@@ -14,6 +14,8 @@ _CLEARANCES: Final = tuple(f"{name}{point}" for name in ("horizontal", "vertical
 class History:
     """The seconds, each a list: time [s], eight peaks, six extremes of the load, six clearances, whether it was held.
 
+    Where intervals are known, the 5 % and 95 % points of the eight peaks follow.
+
     Each has the number of the update that changed it last, so that a page gets what it lacks.
     """
 
@@ -36,6 +38,7 @@ class History:
             *motion["load_high"],
             *(clearance.get(name) for name in _CLEARANCES),
             int(motion["was_held"]),
+            *motion.get("points", ()),
         ]
         if self._seconds and self._seconds[-1][0] == second:
             row = _joined(self._seconds.pop(), row)
@@ -65,7 +68,8 @@ def _joined(before: list[Any], now: list[Any]) -> list[Any]:
     clearances = [
         later if later is not None else earlier for earlier, later in zip(before[15:21], now[15:21], strict=True)
     ]
-    return [now[0], *largest, *lowest, *highest, *clearances, before[21] | now[21]]
+    points = [_extreme(max, *pair) for pair in zip(before[22:], now[22:], strict=False)] or before[22:] or now[22:]
+    return [now[0], *largest, *lowest, *highest, *clearances, before[21] | now[21], *points]
 
 
 def _extreme(choose: Any, first: float | None, second: float | None) -> float | None:

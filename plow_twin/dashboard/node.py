@@ -106,6 +106,7 @@ class NodeWatch:
         best_effort = partial(QoSProfile, reliability=ReliabilityPolicy.BEST_EFFORT)
         self._subscribe(JointState, "contact_forces", best_effort(depth=_NEWEST), self._forces)
         self._subscribe(JointState, "contact_peaks", best_effort(depth=_ALL), self._peaks)
+        self._subscribe(JointState, "peak_intervals", best_effort(depth=_ALL), self._points)
         self._subscribe(Odometry, "head_state", best_effort(depth=_NEWEST), self._pose)
         self._subscribe(JointState, "clearance", best_effort(depth=_NEWEST), self._clearance)
         self._subscribe(JointState, "quality", OUTPUTS["quality"], self._quality)
@@ -154,6 +155,11 @@ class NodeWatch:
     def _peaks(self, message: plain.JointState) -> None:
         if len(message.effort) == PAIR_COUNT:
             self._motion.add_peaks(message.effort[None])
+
+    def _points(self, message: plain.JointState) -> None:
+        if len(message.effort) == 3 * PAIR_COUNT:
+            _, low, high = message.effort.reshape(3, 1, PAIR_COUNT)
+            self._motion.add_points(low, high)
 
     def _pose(self, message: plain.Odometry) -> None:
         self._motion.pose = pose_of(np.array([*message.position[:2], *message.orientation[2:]]))

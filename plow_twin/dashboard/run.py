@@ -89,6 +89,9 @@ class RunFeed:
             motion.add_load(loads.numbers)
         if "contact_peaks" in newest:
             motion.add_peaks(rows["contact_peaks"].numbers[:, 2 * PAIR_COUNT :])
+        if "peak_intervals" in newest:
+            _, _, _, _, low, high = np.split(rows["peak_intervals"].numbers, 6, axis=1)
+            motion.add_points(low, high)
         if "contact_forces" in newest:
             motion.penetration, _, motion.force = newest["contact_forces"].reshape(3, PAIR_COUNT)
         if "head_state" in newest:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -68,7 +68,7 @@ class Watch:
         return float(self.text(part, key) or 0.0)
 
 
-def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
+def run_demo(speed: str, seconds: float, out: Path, quiet: bool, screen: list[str] | None = None) -> int:
     """Run the twin on the paper's load and print a summary.
 
     Parameters
@@ -92,7 +92,7 @@ def run_demo(speed: str, seconds: float, out: Path, quiet: bool) -> int:
     _set_environment(folder)
     console = Console(stderr=True)
     try:
-        watch, sent = _run(speed, seconds, folder, console, quiet)
+        watch, sent = _run(speed, seconds, folder, console, quiet, screen)
         summary = summarise(folder / "run")
         beside = compare_forces(folder / "run", 1e-3 * _SENSOR_MM) if summary.estimate is not None else None
         view = _view(folder)
@@ -128,8 +128,10 @@ def _worn_scene(folder: Path) -> Path:
     return path
 
 
-def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool) -> tuple[Watch, int]:
-    """Run both processes to their end; return the node's last figures and the number of samples sent."""
+def _run(
+    speed: str, seconds: float, folder: Path, console: Console, quiet: bool, screen: list[str] | None
+) -> tuple[Watch, int]:
+    """Run the processes to their end; return the node's last figures and the number of samples sent."""
     node = [
         *("plow_twin.ros.main", "--ros-args", "-p", f"scene:={_worn_scene(folder)}"),
         *("-p", f"record_path:={(folder / 'run').resolve()}", "-p", f"expected_rate:={_RATE_HZ}"),
@@ -151,9 +153,17 @@ def _run(speed: str, seconds: float, folder: Path, console: Console, quiet: bool
         ]
         node += ["-p", "qos_overrides./head_pose.subscription.reliability:=reliable"]
         publisher += ["--sensor", repr(_SENSOR_MM)]
-    with _progress(console, quiet) as bar, _watching() as (watch, spin), _process(node, folder / "node.log") as twin:
+    with ExitStack() as opened:
+        bar = opened.enter_context(_progress(console, quiet))
+        watch, spin = opened.enter_context(_watching())
+        twin = opened.enter_context(_process(node, folder / "node.log"))
         task = bar.add_task("compiling the solver", total=None)
         _until(lambda: watch.text("state", "lifecycle") == "active", spin, twin, _START_TIMEOUT_S)
+        if screen is not None:
+            command = ["plow_twin", "dashboard", "--ros", *screen]
+            shown = opened.enter_context(_process(command, folder / "screen.log"))
+            _until(lambda: "screen: " in shown.output(), spin, shown, _START_TIMEOUT_S)
+            console.print(shown.output(), highlight=False, markup=False)
         bar.update(task, description="running", total=seconds, completed=0.0)
         with _process([*publisher, "--rate", repr(_RATE_HZ)], folder / "publisher.log") as source:
             _follow(source, twin, watch, spin, bar, task)

@@ -102,7 +102,8 @@ function extremes() {
   const largest = Array.from({length: 8}, (_, pad) => Math.max(0, ...shown.map((row) => row[1 + pad] ?? 0)));
   const now = state.seconds.filter((row) => row[0] >= end - 1);
   const peak = Array.from({length: 8}, (_, pad) => Math.max(0, ...now.map((row) => row[1 + pad] ?? 0)));
-  return {largest, peak};
+  const points = now.some((row) => row.length > 22) ? Array.from({length: 16}, (_, at) => Math.max(0, ...now.map((row) => row[22 + at] ?? 0))) : null;
+  return {largest, peak, points};
 }
 
 function age() {
@@ -121,11 +122,11 @@ function show() {
   showInputs();
   if (!motion) return;
   by("stamp").textContent = clock(motion.t);
-  const {largest, peak} = extremes();
+  const {largest, peak, points} = extremes();
   const wear = facts.pads.map((pad) => motion.clearance?.[`pad_${pad.name}`] ?? 0);
   section.draw(motion, peak, wear, Math.max(...largest));
   by("section-note").textContent = `Seen from the front; gaps drawn ${section.factor.toFixed(0)} times as wide. Outer stripe and number: peak force of the last second [kN]; inner stripe: wear.`;
-  showPads(peak, largest, wear);
+  showPads(peak, largest, wear, points);
   showClearance();
   const [fx, fy, m] = motion.load;
   by("load").textContent = facts.loads ? `Fx ${kilo(fx)} kN, Fy ${kilo(fy)} kN, M ${kilo(m)} kN m${motion.held ? " (held: no sample comes)" : ""}` : "the scene's own loads";
@@ -164,15 +165,15 @@ function showAlarms() {
     const place = raised("place");
     return [
       [name.replaceAll("_", " "), CLASSES[worst]], [`${fixed(value * factor, digits)} ${unit}`, "n"],
-      [place.includes("_") ? padName(place) : place, ""],
+      [place.replaceAll("_", " "), ""],
       [raised("threshold") === "" ? thresholds.join(" / ") : fixed(raised("threshold") * factor, digits), "n"],
       [raised("stamp_ns") === "" ? "" : clock(Number(raised("stamp_ns")) * 1e-9), ""], [text, CLASSES[worst]],
     ];
   }));
 }
 
-function showPads(peak, largest, wear) {
-  const {facts, motion} = state, limits = facts.thresholds.force ?? [0, 0], intervals = values("window_forces");
+function showPads(peak, largest, wear, points) {
+  const {facts, motion} = state, limits = facts.thresholds.force ?? [0, 0], window = values("window_forces");
   const scale = Math.max(...largest, ...limits, 1);
   const body = by("pads").tBodies[0];
   body.replaceChildren();
@@ -193,7 +194,7 @@ function showPads(peak, largest, wear) {
     put("rect", {x: 0, y: 1, width: 98 * peak[index] / scale, height: 8, fill: forceColor(peak[index], limits, Math.max(...largest))});
     line(largest[index], "largest");
     limits.forEach((limit, at) => { if (limit > 0) line(limit, "limit", at ? "#c8001e" : "#e69f00"); });
-    const [low, high] = ["p05", "p95"].map((point) => Number(intervals[`${pad.name}/${point}`]));
+    const [low, high] = points ? [points[index], points[8 + index]] : ["p05", "p95"].map((point) => Number(window[`${pad.name}/${point}`]));
     if (high > 0) put("line", {class: "interval", x1: 98 * low / scale, x2: Math.min(100, 98 * high / scale), y1: 5, y2: 5, "vector-effect": "non-scaling-stroke"});
     row.insertCell().append(bar);
     const over = limits[1] > 0 && peak[index] >= limits[1] ? "error" : limits[0] > 0 && peak[index] >= limits[0] ? "warn" : "";
@@ -206,7 +207,8 @@ function showPads(peak, largest, wear) {
   });
   const set = limits.some((limit) => limit > 0);
   by("pads-note").textContent = `Black: largest of the span shown. ${set ? "Amber and red: thresholds of warning and error." : "No threshold is set (parameter alarm_force)."}` +
-    (Object.keys(intervals).length ? " Thin line: 5 % to 95 % of the peak over the machines that the measurements allow." : "");
+    (points ? " Thin line: 5 % to 95 % of the peak over the machines that the measurements allow." :
+      Object.keys(window).length ? " Thin line: the same of the last window that was estimated, 5 % to 95 % over the machines that it allows." : "");
 }
 
 function showClearance() {
@@ -251,6 +253,7 @@ function showInputs() {
     output.recent_latency_p99_ms ? `latency (99 %) ${output.recent_latency_p99_ms} ms` : "",
     Number(input.messages_lost ?? 0) ? `messages lost: ${input.messages_lost}` : "",
     values("state").solver_failures > 0 ? `failed advances: ${values("state").solver_failures}` : "",
+    status.follow && status.follow !== "off" ? `the twin follows, numbers of the ${status.follow}` : "",
     status.recorder && status.recorder !== "off" ? `recorder: ${status.recorder}` : "not recorded",
     LEVELS[part("input")[0]] !== "OK" ? part("input")[1] : "",
   ];
