@@ -79,7 +79,8 @@ class Link:
     ) -> None:
         self._access, self._host, self._nodes = access, host, list(nodes)
         self._sampling_ms, self._take, self._counts = sampling_ms, take, counts
-        self._client = Client(access.url, timeout=_ANSWER_S)
+        # a server that answers late is not gone
+        self._client = Client(access.url, timeout=_ANSWER_S, watchdog_intervall=3.0 * _KEEPALIVE_S)
         if access.user:
             self._client.set_user(access.user)
             self._client.set_password(access.password)
