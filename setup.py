@@ -21,6 +21,7 @@ EXTRAS = {
     "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18", "lz4>=4.3", "zstandard>=0.22", "isal>=1.6"],
     "mqtt": ["paho-mqtt>=2.0"],
     "opcua": ["asyncua>=2.1"],
+    "metrics": ["prometheus-client>=0.19"],
     "dashboard": ["starlette>=0.31", "uvicorn>=0.27", "websockets>=13"],
     "view": ["rerun-sdk>=0.41", "matplotlib>=3.8"],
     "study": ["matplotlib>=3.8", "pyarrow>=14", "jinja2>=3.1", "rainflow>=3.2"],

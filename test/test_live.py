@@ -18,6 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import urlsplit
+from urllib.request import urlopen
 
 import numpy as np
 import paho.mqtt.client as paho
@@ -824,6 +825,18 @@ def test_a_wrong_call_says_what_was_expected(
     (tmp_path / "junk.csv").write_bytes(b"\x1b[31m" + bytes(range(256)) * 100)
     assert run_cli(["live", *arguments, "--quiet"]) == code
     assert said in " ".join(capfd.readouterr().err.split())
+
+
+def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None:
+    path, port = _csv(tmp_path / "load.csv", 100), _free_port()
+    with _live(str(path), "--follow", "--metrics", str(port), "--set", "excitation_timeout=3600") as live:
+        live.until_count("samples_used", 100)
+        with urlopen(f"http://127.0.0.1:{port}/metrics", timeout=30.0) as page:
+            found = dict(line.split() for line in page.read().decode().splitlines() if not line.startswith("#"))
+        assert (found["plow_twin_input_samples_used"], found["plow_twin_state_level"]) == ("100.0", "0.0")
+        assert "plow_twin_state_scene" not in found  # a text
+        assert run_cli(["live", str(path), "--metrics", str(port), "--quiet"]) == 1  # the port is taken
+        assert live.stop() == 0
 
 
 def test_an_older_paho_is_named_with_the_version_wanted(monkeypatch: pytest.MonkeyPatch) -> None:

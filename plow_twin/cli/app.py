@@ -49,6 +49,7 @@ EXTRA_OF_MODULE: Final = {
     "rosbags": "record",
     "paho": "mqtt",
     "asyncua": "opcua",
+    "prometheus_client": "metrics",
     "starlette": "dashboard",
     "uvicorn": "dashboard",
     "websockets": "dashboard",

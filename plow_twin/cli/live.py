@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from plow_twin.live.bridge.access import Access
     from plow_twin.live.bridge.source import Bridge
     from plow_twin.live.control import Control
-    from plow_twin.live.front import BridgeFront
+    from plow_twin.live.front import BridgeFront, Say
     from plow_twin.live.parameters import Settings
+    from plow_twin.live.part import Part
     from plow_twin.live.stop import StopSignals
 
 #: Time between two looks of the progress bar [s].
@@ -75,6 +76,7 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option(
     "--control", type=click.Path(path_type=Path), help="Socket to open, for plow-twin call SOCKET acknowledge_alarms."
 )
+@click.option("--metrics", type=click.IntRange(1, 65535), help="Port of a page for Prometheus, on this machine.")
 @dashboard_option
 @access_options
 @json_option
@@ -119,7 +121,8 @@ def _live(
             say_error(f"plow-twin: {text}")
 
         with _control(options["control"]) as control, ExitStack() as opened:
-            front = BridgeFront(bridge, options["mapping"], settings, prepared, report.say, on_error, options["units"])
+            say = _also_metrics(report.say, options["metrics"], opened)
+            front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error, options["units"])
             if control is not None:
                 _answer_on(control, front)
             screen = opened.enter_context(_screen(front, access, source)) if access is not None else None
@@ -143,6 +146,21 @@ def _live(
         show_facts(output_console(), {"input": {key: facts["input"][key] for key in _shown(facts["input"])}})
     unused = any(int(facts["input"][key]) for key in facts["input"] if _LOST.fullmatch(key))
     return leave(DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE)
+
+
+def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
+    """Return what a twin says to: `say`, and the page of metrics where there is one."""
+    if port is None:
+        return say
+    from plow_twin.live.metrics import Metrics
+
+    metrics = opened.enter_context(Metrics(port))
+
+    def both(name: str, part: Part) -> None:
+        metrics.take(name, part)
+        say(name, part)
+
+    return both
 
 
 def _answer_on(control: Control, front: BridgeFront) -> None:

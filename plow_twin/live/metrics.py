@@ -1,0 +1,84 @@
+"""The diagnostics of a live twin as metrics for Prometheus."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Final, Self
+
+from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client.core import GaugeMetricFamily
+
+from plow_twin.errors import PlowTwinError
+from plow_twin.live.part import Part
+
+if TYPE_CHECKING:
+    from prometheus_client.metrics_core import Metric
+
+#: What a name of a metric cannot hold.
+_OTHER: Final = re.compile(r"[^a-zA-Z0-9_]")
+
+
+class MetricsError(PlowTwinError):
+    """The port cannot be used."""
+
+
+class Metrics:
+    """A page of metrics on the loopback address, for Prometheus to read; a context that closes it.
+
+    Each number of each part is a gauge `plow_twin_<part>_<key>`, as of the newest report; texts are left out.
+
+    Parameters
+    ----------
+    port
+        Port of the page, `http://127.0.0.1:PORT/metrics`.
+
+    Raises
+    ------
+    MetricsError
+        The port cannot be used.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._parts: Mapping[str, Part] = {}
+        registry = CollectorRegistry()
+        registry.register(self)
+        try:
+            self._server, self._thread = start_http_server(port, "127.0.0.1", registry)
+        except (OSError, OverflowError) as error:
+            raise MetricsError(f"port {port} for metrics cannot be used: {error}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+    def take(self, name: str, part: Part) -> None:
+        """Take in a part of the diagnostics; cheap, for nothing is computed until the page is read."""
+        self._parts = {**self._parts, name: part}
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield the gauges."""
+        for name, (level, _, values) in self._parts.items():
+            yield _gauge(f"{name}_level", "0 OK, 1 warning, 2 error", float(level))
+            for key, text in values.items():
+                number = _number(text)
+                if number is not None:
+                    yield _gauge(f"{name}_{key}", f"{key} of the part {name} of the diagnostics", number)
+
+
+def _gauge(name: str, meaning: str, value: float) -> GaugeMetricFamily:
+    return GaugeMetricFamily(f"plow_twin_{_OTHER.sub('_', name)}", meaning, value)
+
+
+def _number(text: str) -> float | None:
+    """Return a finite number, or None."""
+    try:
+        found = float(text)
+    except ValueError:
+        return None
+    return found if math.isfinite(found) else None
