@@ -12,6 +12,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -257,3 +258,14 @@ def test_the_command_that_gets_sigint_writes_the_rows_computed_so_far(tmp_path: 
     assert 0.0 < found["t_end"] < 1e7 and found["solver"]["steps"] > 0
     with np.load(out) as file:
         assert len(file["t"]) >= 1 and np.isfinite(file["q"]).all()
+
+
+def test_a_notebook_shows_the_contacts_of_a_motion_as_a_table() -> None:
+    found = simulate(preset("paper"), 2.0)
+    shown = found._repr_html_()
+    root = ElementTree.fromstring(shown)
+    rows = [[cell.text or "" for cell in row] for row in root.iter("tr")]
+    assert rows[0][:2] == ["pair", "largest force [kN]"] and [row[0] for row in rows[1:]] == list(found.statistics)
+    largest = {row[0]: float(row[1]) for row in rows[1:]}
+    assert largest == pytest.approx({pair: 1e-3 * of["max"] for pair, of in found.statistics.items()}, rel=1e-3)
+    assert max(largest.values()) > 50.0 and "2 s of motion" in shown

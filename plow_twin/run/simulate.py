@@ -85,6 +85,21 @@ class Result:
     sensitivity: Sensitivity | None = None
     frame: Array | None = None
 
+    def _repr_html_(self) -> str:
+        """Return the statistics of the contacts as a table, which notebooks show."""
+        duration = float(self.t[-1]) if len(self.t) else 0.0
+        title = f"{duration:g} s of motion, {len(self.t)} rows, {len(self.events)} changes of contact"
+        heads = ("pair", "largest force [kN]", "mean in contact [kN]", "impulse [kN s]", "in contact [s]", "makes")
+        keys = ("max", "mean_in_contact", "impulse", "time_in_contact", "makes")
+        factors = (1e-3, 1e-3, 1e-3, 1.0, 1.0)
+        rows = [
+            [pair, *(f"{factor * found[key]:.4g}" for key, factor in zip(keys, factors, strict=True))]
+            for pair, found in self.statistics.items()
+        ]
+        head = "".join(f"<th>{text}</th>" for text in heads)
+        body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+        return f"<table><caption>{title}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
 
 def simulate(
     scene: Scene,
