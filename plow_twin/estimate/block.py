@@ -26,7 +26,7 @@ from plow_twin.estimate.similar import PAPER_LENGTH
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, GX, GY, QUANTITIES
 from plow_twin.model import geometry
-from plow_twin.model.scene import Scene
+from plow_twin.model.scene import Gravity, Scene
 from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
@@ -44,7 +44,7 @@ _KINK: Final = 5.0
 #: Least and most rows of a flight that are fitted: one more than a parabola has numbers, and few enough for one.
 _FLIGHT_ROWS: Final = (4, 9)
 #: Standard deviation of an unknown acceleration in flight (drag, errors of the load), as a share of gravity on earth.
-_UNKNOWN_SHARE, _STANDARD_GRAVITY = 0.1, 9.81
+_UNKNOWN_SHARE = 0.1
 #: Flights meet at most so far outside of the rows between which they end, in rows.
 _BEYOND: Final = 0.25
 #: Degrees of freedom of the Student-t likelihood: robust against two impacts taken for one.
@@ -235,7 +235,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> list[Impact
     t, q = poses.t, _of_mass(scene, poses.q)
     inertia = np.asarray(inertias(scene))
     free = _free_acceleration(scene, load, t) / inertia
-    unknown = _UNKNOWN_SHARE * _STANDARD_GRAVITY * np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
+    unknown = _UNKNOWN_SHARE * Gravity().acceleration_m_s2 * np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
     ends = _kinks(t, q, free, level, unknown)
     found = []
     for index, (first, last) in enumerate(ends):

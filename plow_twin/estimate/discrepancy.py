@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from plow_twin.estimate.fit import HUBER, START_SPREAD, WALLS, Fit, Problem
+from plow_twin.estimate.fit import HUBER, START_SPREAD, WALLS, Fit, Problem, freed
 from plow_twin.estimate.priors import deviation_of
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
@@ -74,8 +74,6 @@ _BENT = 0.3
 #: exponent 1.5, or 15 % of a third harmonic, were up to 9 deviations off (`exponent`, `shape` of the benchmark, seeds 1
 #: and 2).
 _BENT_BY_EXPONENT, _UNEXPLAINED = 0.1, 1e-4
-#: Most that the freedom of the fit adds to the scatter of few swings.
-_MOST_FREED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,9 +345,8 @@ class _Linearised:
         held = np.diag(self._precision[:SIZE])
         inverse = np.linalg.inv(np.sum([normal[:SIZE, :SIZE] for normal, _ in self._blocks], axis=0) + held)
         meat = scores.T @ scores * count / max(count - 1, 1) + held
-        freed = count / max(count - len(moving), count / _MOST_FREED)
         ratio = np.diag(inverse @ meat @ inverse) / np.diag(inverse)
-        return freed * float(ratio[moving].mean())
+        return freed(count, len(moving)) * float(ratio[moving].mean())
 
     def surprise(self, mean: Array, often: Array) -> float:
         """Return the mean square of the differences in deviations of their prior, at least 1; above, not linear."""

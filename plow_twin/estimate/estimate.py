@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from plow_twin.estimate.block import estimate_block
 from plow_twin.estimate.bouncing import FITTED, SURE, Bounced, bias_of_hard, bounces, compare
 from plow_twin.estimate.discrepancy import Graded, graded, variants
-from plow_twin.estimate.fit import MOST_LEFT, Fit, Problem
+from plow_twin.estimate.fit import MOST_LEFT, Fit, Problem, freed
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
 from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
@@ -35,7 +35,7 @@ from plow_twin.estimate.unknowns import (
 )
 from plow_twin.estimate.verdict import COMPONENTS, Verdict, foretold, judge, judge_sensor, sandwich
 from plow_twin.model import geometry
-from plow_twin.model.scene import Scene
+from plow_twin.model.scene import Gravity, Scene
 from plow_twin.solve.compiled_scene import inertias
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ _LONGEST_S = 600.0
 #: Scatter of the last half of the poses, in that of their quick changes, from which on the head moves.
 _MOVES = 5.0
 #: The same up to which it rests, and how much the load scatters meanwhile at most, in weights of the head.
-_RESTS, _IDLE_LOAD, _STANDARD_GRAVITY = 1.3, 0.05, 9.81
+_RESTS, _IDLE_LOAD = 1.3, 0.05
 #: Least time in contact in s of the walls of both sides.
 TOUCHED = 0.02
 #: Share of the measured x, or y, that the model must predict: the rest hardly counts in the fit.
@@ -105,8 +105,6 @@ MOST_ASKEW = 25.0
 #: The same in the chi^2 of the sensor's scales, since each explains the other in part: walls worn askew had 5 and more
 #: (0.3 to 1 times the wear late in a life), scales of 1.05 had 0.4 to 1.6.
 MORE_ASKEW = 3.0
-#: Most that the freedom of the fit adds to the scatter of few swings.
-_MOST_FREED = 3.0
 #: How far gaps may be from each other, and from the motion's estimate, in their standard deviations.
 MOST_CONTRADICTION = 5.0
 #: Logarithms of the penetrations under the reference force that a contact can have, in m.
@@ -679,8 +677,7 @@ def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
     """Return the variance by the swings' scatter over that by the noise, for the unknowns of the motion."""
     scattered = np.diag(sandwich(problem, fit, 1.0 / problem.deviation**2))
     swings, moving = problem.window.swings, list(MOVING)
-    freed = swings / max(swings - len(moving), swings / _MOST_FREED)
-    return freed * float((scattered / variance)[moving].mean())
+    return freed(swings, len(moving)) * float((scattered / variance)[moving].mean())
 
 
 def _groups(
@@ -768,7 +765,7 @@ def _is_dead(load: Load, poses: Poses) -> bool:
 
 def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
     """Return whether a machine stands: its pose is constant but for noise, and the load hardly changes."""
-    weight = scene.head.mass_kg * _STANDARD_GRAVITY
+    weight = scene.head.mass_kg * Gravity().acceleration_m_s2
     most = _IDLE_LOAD * weight * np.array([1.0, 1.0, geometry.half_diagonal(scene)])
     return bool((load.wrench.std(axis=0) < most).all()) and _rests(poses)
 

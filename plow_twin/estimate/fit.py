@@ -37,6 +37,10 @@ HUBER = 3.0
 JITTER_WEIGHT = 100.0
 #: Its weight where fits are compared.
 _COMPARED_WEIGHT = 5.0
+#: Precision of an unknown without a prior.
+NO_PRIOR = 1e-6
+#: Most that the scatter of few swings is widened for the unknowns fitted to them.
+_MOST_FREED = 3.0
 #: Steps of the solver after which no further iteration begins: the cost of a fit is counted, not timed.
 MOST_WORK = 3_000_000
 #: Displacements of a starting state: m, m, rad, m/s, m/s, rad/s.
@@ -400,6 +404,11 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
     gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2
     gradient[SIZE:] += ((problem.window.states - point.states) / START_SPREAD**2).ravel()
     return normal.plus(np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / START_SPREAD**2, swings)])), gradient
+
+
+def freed(swings: int, unknowns: int) -> float:
+    """Return the factor by which unknowns fitted to few swings lessen their scatter, at most `_MOST_FREED`."""
+    return swings / max(swings - unknowns, swings / _MOST_FREED)
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:

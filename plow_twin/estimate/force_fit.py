@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.contact_forces import FEWEST_MESSAGES, Cells, ContactForces, Feeling, cells_of
-from plow_twin.estimate.fit import HUBER, START_SPREAD, Fit, Linear, Point, Problem, pieces
+from plow_twin.estimate.fit import HUBER, START_SPREAD, Fit, Linear, Point, Problem, freed, pieces
 from plow_twin.estimate.result import Cell, ForcesUsed, Interval
 from plow_twin.estimate.unknowns import DAMPING, MOVING, QUANTITIES, SIZE
 from plow_twin.model.pairs import PAIR_NAMES
@@ -43,8 +43,6 @@ _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
 #: the poses, to one side, clearances were off by 4 of their deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
-#: Most that the freedom of the fit adds to the scatter of few swings.
-_MOST_FREED = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,9 +294,8 @@ class _Joint:
         scores = scores - scores.mean(axis=0)
         count, unknown, moving = len(blocks), self._border - (SIZE - len(MOVING)), list(MOVING)
         meat = scores.T @ scores * count / max(count - 1, 1) + np.diag(self._precision)
-        freed = count / max(count - unknown, count / _MOST_FREED)
         ratio = np.diag(covariance @ meat @ covariance) / np.diag(covariance)
-        return freed * float(ratio[moving].mean())
+        return freed(count, unknown) * float(ratio[moving].mean())
 
     def _summary(self, at: _At, covariance: Array) -> JointFit:
         cells, place = self._cells, at.place

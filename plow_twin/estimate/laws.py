@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Share of its own variance in the covariance of a feature: no 160 draws tell that of 200 features.
-_OWN = 0.4
+#: Share of its own variance in the covariance of a feature: 160 draws do not determine that of 200 features.
+OWN_VARIANCE = 0.4
 #: What a coefficient is held to zero by, and the least variance.
 _RIDGE, _LEAST = 1e-2, 1e-9
 #: Parameters that act to the third power, and those whose effect changes with them.
@@ -26,8 +26,8 @@ _FARTHEST = 3.5
 #: Steps to the likeliest parameters (Levenberg, Marquardt), damping of the first, gain that ends them, and distance of
 #: the points of a difference quotient.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
-#: Share of a draw's residual that is left at least once the draw itself is in the fit.
-_LEAST_FREE = 0.2
+#: Least share of a draw's residual that the fit including the draw leaves.
+LEAST_FREE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
     left = np.concatenate([surface.left for surface in surfaces])
     covariance = left.T @ left / len(left)
     own = np.diag(covariance)
-    root = np.linalg.cholesky((1.0 - _OWN) * covariance + np.diag(_OWN * own + _LEAST))
+    root = np.linalg.cholesky((1.0 - OWN_VARIANCE) * covariance + np.diag(OWN_VARIANCE * own + _LEAST))
     seen: Array = np.linalg.solve(root, (measured - middle) / scale)
     one, two = (surface.ln_evidence(root, seen) for surface in surfaces)
     return two - one
@@ -77,7 +77,7 @@ class _Surface:
         inverse = np.linalg.inv(terms.T @ terms + np.diag([0.0] + [_RIDGE] * (terms.shape[1] - 1)))
         coefficients = inverse @ (terms.T @ like)
         leverage = np.einsum("ij,jk,ik->i", terms, inverse, terms)
-        left = (like - terms @ coefficients) / np.sqrt(np.maximum(1.0 - leverage, _LEAST_FREE))[:, None]
+        left = (like - terms @ coefficients) / np.sqrt(np.maximum(1.0 - leverage, LEAST_FREE))[:, None]
         return _Surface(coefficients, left, points)
 
     def ln_evidence(self, root: Array, seen: Array) -> float:

@@ -15,19 +15,17 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate.laws import LEAST_FREE, OWN_VARIANCE
+
 Array = NDArray[np.float64]
 
-#: Share of its own variance in the covariance of a feature: no 200 draws tell that of 150 features.
-_OWN = 0.4
 #: What a coefficient is held to zero by, and the least variance.
 _RIDGE, _LEAST = 1e-2, 1e-14
 #: Deviation of a parameter that all were drawn with alike.
 _SAME = 1e-12
 #: Parameters whose effect changes with each other: clearances, softness and damping.
 _CURVED = tuple(combinations_with_replacement(range(4), 2))
-#: Share of a draw's residual that is left at least once the draw itself is in the fit.
-_LEAST_FREE = 0.2
-#: Parts of the draws, each told by the others.
+#: Parts of the draws, each predicted from the others.
 _PARTS = 10
 #: Gauss-Newton steps, the longest one, and the farthest from the middle, in deviations of the draws.
 _STEPS, _LONGEST, _FARTHEST = 5, 1.5, 5.0
@@ -68,7 +66,7 @@ def _told(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
     terms = _terms((drawn - middle) / scale)
     inverse = np.linalg.inv(terms.T @ terms + np.diag([0.0] + [_RIDGE] * (terms.shape[1] - 1)))
     surface = inverse @ (terms.T @ motions.like)
-    free = np.maximum(1.0 - np.einsum("ij,jk,ik->i", terms, inverse, terms), _LEAST_FREE)
+    free = np.maximum(1.0 - np.einsum("ij,jk,ik->i", terms, inverse, terms), LEAST_FREE)
     error = (motions.like - terms @ surface) / np.sqrt(free)[:, None]
     whiten = np.linalg.inv(_root(error.T @ error / len(error))).T
     seen, late, surface = asked.like @ whiten, asked.late @ whiten, surface @ whiten
@@ -91,7 +89,7 @@ def _told(drawn: Array, gain: float, motions: Seen, asked: Seen) -> Array:
 
 def _root(covariance: Array) -> Array:
     """Return the Cholesky factor of a covariance whose parts are drawn toward each being for itself."""
-    held = (1.0 - _OWN) * covariance + np.diag(_OWN * np.diag(covariance) + _LEAST)
+    held = (1.0 - OWN_VARIANCE) * covariance + np.diag(OWN_VARIANCE * np.diag(covariance) + _LEAST)
     return np.asarray(np.linalg.cholesky(held), np.float64)
 
 

@@ -12,13 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.fit import Fit, Problem, joint_step
+from plow_twin.estimate.fit import NO_PRIOR, Fit, Problem, joint_step
 from plow_twin.estimate.unknowns import BIAS, SIZE
 
 Array = NDArray[np.float64]
-
-#: Precision of a scale of which nothing is known.
-_FREE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +34,7 @@ def scales_of(problem: Problem, found: Fit) -> Scales:
     """Return what the residuals of a fit tell of the sensor's scales."""
     motion = np.nan_to_num(problem.window.poses.q - found.point.residual - found.shared[BIAS])
     columns = motion[:, :, None] * np.eye(3)
-    step, covariance = joint_step(problem, found, columns, np.full(3, _FREE), np.zeros(3))
+    step, covariance = joint_step(problem, found, columns, np.full(3, NO_PRIOR), np.zeros(3))
     scale = step[SIZE:]
     chi2 = float(scale @ np.linalg.solve(covariance[SIZE:, SIZE:], scale))
     return Scales(1.0 + scale, chi2)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.estimate.arrow import OWN
-from plow_twin.estimate.fit import Fit, Problem, joint_step, pieces
+from plow_twin.estimate.fit import NO_PRIOR, Fit, Problem, joint_step, pieces
 from plow_twin.estimate.measurements import FEWEST_POSES, Poses
 from plow_twin.estimate.scales import scales_of
 from plow_twin.estimate.start import noise_level
@@ -44,8 +44,6 @@ MOMENTS = 60
 #: Step from the law believed to another one in its standard deviations (at most 2.1 for 16 right models, seeds from
 #: 42200 on), and the share of the critical damping that the other one has.
 MOST_LAW_STEP, LAW_DAMPING = 5.0, 0.05
-#: Precision of an unknown of which nothing is known.
-_FREE = 1e-6
 #: Chi^2 of the sensor's three scales beside a fit that holds else (right models have 12 at most, see docs/estimate.md).
 MOST_SCALE = 16.0
 #: Quick noise of one part of the window over that of the rest.
@@ -183,7 +181,7 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     if point is None:
         return
     change = np.nan_to_num(fit.point.residual - point.residual)[:, :, None]
-    step, covariance = joint_step(problem, fit, change, np.full(1, _FREE), np.zeros(1))
+    step, covariance = joint_step(problem, fit, change, np.full(1, NO_PRIOR), np.zeros(1))
     moved = float(step[-1] / math.sqrt(covariance[-1, -1]))
     verdict.figures["law"] = moved
     if abs(moved) > MOST_LAW_STEP and not verdict.sensor:
