@@ -37,6 +37,11 @@ def test_a_spreadsheet_s_file_becomes_a_mapping_with_which_the_twin_runs(
     said = capsys.readouterr().out
     assert "semicolon, decimal commas, a row each 0.001 s" in said and "plow-twin live" in said
     assert (out / "setup.png").stat().st_size > 10_000
+    assert cli(["info", str(file), "--map", str(out / "map.yaml"), "--json"]) == 0
+    read = json.loads(capsys.readouterr().out)["roles"]
+    assert (read["excitation"]["messages"], read["excitation"]["unfit"]) == (600, 0)
+    assert read["excitation"]["span_s"] == pytest.approx(0.599) and read["excitation"]["rate_hz"] == pytest.approx(1000)
+    assert read["head_pose"]["values"]["x"] == pytest.approx([0.0, 5e-3 * math.sin(2e-3 * 599)], abs=1e-5)
     run = ["live", str(file), "--map", str(out / "map.yaml"), "--scene", str(out / "scene.yaml"), "--json"]
     assert cli(run) == 0
     facts = json.loads(capsys.readouterr().out)

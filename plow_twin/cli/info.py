@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.text import Text
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts, table
+from plow_twin.cli.console import DONE, DONE_WITH_LOSS, json_option, output_console, show_facts, table, unit_option
 from plow_twin.scene_file.presets import PRESETS
 
 
@@ -25,9 +25,22 @@ from plow_twin.scene_file.presets import PRESETS
 )
 @click.argument("target", required=False)
 @click.option("--unused", is_flag=True, help="Of a recording: each message that came and was not used, one a line.")
+@click.option(
+    "--map",
+    "mapping",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="YAML that says where load, travel and pose stand in a recording of another program.",
+)
+@unit_option
 @json_option
-def info(target: str | None, unused: bool, as_json: bool) -> int:
-    """Describe TARGET: a scene (file or preset) or a recording (.mcap); without it, this installation."""
+def info(target: str | None, unused: bool, mapping: Path | None, units: dict[str, str], as_json: bool) -> int:
+    """Describe TARGET: a scene (file or preset) or a recording; without it, this installation."""
+    if target is not None and (mapping is not None or units):
+        from plow_twin.record.foreign_facts import foreign_facts
+
+        facts, lossy = foreign_facts(Path(target), mapping, units)
+        _show(facts, as_json)
+        return DONE_WITH_LOSS if lossy else DONE
     if unused and target is not None:
         return _unused(Path(target), as_json)
     if target is None:

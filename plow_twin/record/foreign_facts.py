@@ -1,0 +1,81 @@
+"""Facts of a recording of another program, as a mapping reads it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from plow_twin.record.mapping import read_map, readings, stamps_by, with_units
+from plow_twin.record.sources import open_source
+
+
+@dataclass
+class _Seen:
+    """Messages of a role: those that were read, those that did not fit, their stamps [ns] and numbers in SI."""
+
+    used: int = 0
+    unfit: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    least: dict[str, float] = field(default_factory=dict)
+    largest: dict[str, float] = field(default_factory=dict)
+
+    def add(self, reading: tuple[int, dict[str, float]] | None) -> None:
+        if reading is None:
+            self.unfit += 1
+            return
+        stamp_ns, values = reading
+        self.first_ns = min(self.first_ns, stamp_ns) if self.used else stamp_ns
+        self.last_ns = max(self.last_ns, stamp_ns) if self.used else stamp_ns
+        self.used += 1
+        for name, value in values.items():
+            if math.isfinite(value):
+                self.least[name] = min(self.least.get(name, value), value)
+                self.largest[name] = max(self.largest.get(name, value), value)
+
+    def facts(self, topic: str) -> dict[str, Any]:
+        span_s = (self.last_ns - self.first_ns) * 1e-9
+        return {
+            "topic": topic,
+            "messages": self.used,
+            "unfit": self.unfit,
+            "span_s": span_s,
+            "rate_hz": (self.used - 1) / span_s if span_s > 0.0 else None,
+            "values": {name: [self.least[name], self.largest[name]] for name in self.least},
+        }
+
+
+def foreign_facts(path: Path, mapping: Path | None, units: Mapping[str, str]) -> tuple[dict[str, Any], bool]:
+    """Read a recording of another program from front to back.
+
+    Returns
+    -------
+    facts : dict
+        Topics with their types; by role the topic, messages, those that do not fit, span [s], rate [Hz], and the least
+        and the largest value of each number in SI.
+    lossy : bool
+        Whether something could not be read.
+
+    Raises
+    ------
+    RecordingError
+        The recording or the mapping cannot be used.
+    """
+    source = open_source(path)
+    topics = source.topics()
+    roles = with_units(read_map(mapping, topics), units)
+    seen = {name: _Seen() for name in roles}
+    wanted = {role.topic for role in roles.values()}
+    for name, _, reading in readings(source.messages(wanted.__contains__, stamps_by(roles.values())), roles):
+        seen[name].add(reading)
+    lost = {key: count for key, count in source.losses.counts.items() if count}
+    facts = {
+        "file": str(path),
+        "topics": {topic: str(kind) for topic, kind in topics.items()},
+        "roles": {name: found.facts(roles[name].topic) for name, found in seen.items()},
+        "lost": lost,
+    }
+    return facts, bool(lost) or any(found.unfit for found in seen.values())
