@@ -88,10 +88,11 @@ def _begin_sample(s, lanes, lane) -> None:
     lanes.stop[lane], lanes.knot[lane], lanes.before[lane] = s.times[i], lanes.time[lane], state.steps
     s.saved[lane] = state
     span = lanes.stop[lane] - lanes.knot[lane]
+    per_span = 1.0 / span if span > _SHORTEST_SPAN else 0.0
     for j in range(3):
         before = s.wrench[member, i, j]
         lanes.sample[j, lane] = before
-        lanes.slope[j, lane] = (s.wrench[member, i + 1, j] - before) / span if span > _SHORTEST_SPAN else 0.0
+        lanes.slope[j, lane] = (s.wrench[member, i + 1, j] - before) * per_span
 
 
 @kernel()
@@ -111,6 +112,7 @@ def _clear_sums(s, lanes, lane) -> None:
     for pair in range(PAIR_COUNT):
         lanes.peak[pair, lane] = lanes.impulse[pair, lane] = lanes.time_in_contact[pair, lane] = 0.0
         s.totals[lane].makes[pair] = 0
+    s.totals[lane].logged = 0
 
 
 @kernel()
@@ -183,6 +185,7 @@ def _write_row(s, lanes, lane) -> None:
     out.t, out.status, out.steps = s.times[i], _OK, state.steps - lanes.before[lane]
     out.q[0], out.q[1], out.q[2] = now[X, lane], now[Y, lane], now[THETA, lane]
     out.v[0], out.v[1], out.v[2] = now[VX, lane], now[VY, lane], now[OMEGA, lane]
+    set_row(out.wear_depth, 0, exact_row(state.wear_depth, 0))
     for pair in range(PAIR_COUNT):
         out.penetration[pair], out.rate[pair], out.force[pair] = (
             told[0, pair, lane],
@@ -191,21 +194,41 @@ def _write_row(s, lanes, lane) -> None:
         )
         out.peak[pair], out.impulse[pair] = lanes.peak[pair, lane], lanes.impulse[pair, lane]
         out.time_in_contact[pair], out.makes[pair] = lanes.time_in_contact[pair, lane], sums.makes[pair]
-        out.wear_depth[pair] = state.wear_depth[pair]
 
 
 @kernel()
-def _go_on(s, lanes, lane) -> None:
-    """Let a lane that has reached a sample go on to the next one, or its twin leave after the last."""
+def _clear_reached(s, lanes, reached) -> None:
+    """Begin to count anew in the lanes that have reached a sample."""
+    zero = exact_splat(0.0)
+    for pair in range(PAIR_COUNT):
+        set_row(lanes.peak, pair, choose(reached, zero, exact_row(lanes.peak, pair)))
+        set_row(lanes.impulse, pair, choose(reached, zero, exact_row(lanes.impulse, pair)))
+        set_row(lanes.time_in_contact, pair, choose(reached, zero, exact_row(lanes.time_in_contact, pair)))
+    for lane in range(WIDTH):
+        sums = s.totals[lane]
+        if reached >> lane & 1 and sums.logged != 0:
+            sums.logged = 0
+            for pair in range(PAIR_COUNT):
+                sums.makes[pair] = 0
+
+
+@kernel()
+def _go_on(s, lanes, lane) -> bool:
+    """Let a lane that has reached a sample go on to the next one, or its twin leave after the last.
+
+    Tells whether it can take a step at once: nothing else has to be looked at.
+    """
     member = lanes.member[lane]
     state = s.states[member]
-    _clear_sums(s, lanes, lane)
     s.place[member] += 1
     if s.place[member] == s.times.size:
         save_lane(state, s.totals[lane], lanes, lane)
-        return
+        return False
     write_state(state, lanes, lane)
     _begin_sample(s, lanes, lane)
+    left = lanes.stop[lane] - lanes.time[lane]
+    lanes.whole[lane] = min(left, LONGEST_STEP)
+    return left > 0.0
 
 
 @kernel(inline="source")
@@ -264,8 +287,12 @@ def _get_ready(s, viscous, hysteretic, rest, lanes, budget) -> bool:
             for lane in range(WIDTH):
                 if reached >> lane & 1:
                     _write_row(s, lanes, lane)
-                    _go_on(s, lanes, lane)
-        elif not changed:
+            _clear_reached(s, lanes, reached)
+            for lane in range(WIDTH):
+                if reached >> lane & 1:
+                    ready = _go_on(s, lanes, lane)
+                    live, changed = live or ready, changed or not ready
+        if not changed:
             return live
 
 

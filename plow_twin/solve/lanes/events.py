@@ -273,6 +273,7 @@ def _note_root(lanes, lane, root) -> None:
     pair = guard % PAIR_COUNT
     if guard < SECOND and lanes.mode[pair, lane] == CLIPPED:
         lanes.parted[pair, lane] = root
+        lanes.parting[0] |= 1 << lane
         if lanes.leaves[pair] >> lane & 1 == 0:
             lanes.todo[lane] |= 1 << AGAIN + pair
         return
@@ -293,6 +294,7 @@ def first_events(states, lanes, w, order, full, viscous, hysteretic) -> None:
     never = exact_splat(np.inf)
     for pair in range(PAIR_COUNT):
         set_row(lanes.parted, pair, never)
+    lanes.parting[0] = 0
     for lane in range(WIDTH):
         lanes.event[lane] = -1
     _write_guards(lanes, order, viscous, hysteretic)
@@ -352,13 +354,13 @@ def note_switches(lanes, order, viscous, hysteretic) -> None:
     ending = 0
     for lane in range(WIDTH):
         ending |= 1 << lane if lanes.event[lane] >= 0 else 0
+    if ending == 0:
+        return
     at = exact_row(lanes.step, 0)
     within = at * _AT_ONCE
     for pair in range(PAIR_COUNT):
         for lane in range(WIDTH):
             lanes.switch[pair, lane] = -1
-        if ending == 0:
-            continue
         first, again = _ends_with(lanes.guard[pair], order, at, within) & ending, 0
         guarded = 0
         if hysteretic is not None:

@@ -193,8 +193,9 @@ def complete(p, state, sums, lanes, lane, hysteretic) -> None:
     begin, parted = lanes.time[lane], False
     state.steps += 1
     state.evaluations += lanes.orders[lane]
-    for pair in range(PAIR_COUNT):
-        parted |= lanes.parted[pair, lane] < lanes.step[lane]
+    if lanes.parting[0] >> lane & 1:
+        for pair in range(PAIR_COUNT):
+            parted |= lanes.parted[pair, lane] < lanes.step[lane]
     if parted:
         _part(state, sums, lanes, lane)
     end = end_of(lanes, lane)

@@ -72,6 +72,7 @@ LANES: Final = np.dtype(
         ("reach", "f8", _LANES_OF),  # how far a column is searched
         ("root", "f8", _LANES_OF),  # its first root
         ("parted", "f8", _PAIRS),  # when a clipped pair parts within the step, infinity where it does not
+        ("parting", "i8", (1,)),  # a bit for each lane in which one does
         ("peak", "f8", _PAIRS),
         ("impulse", "f8", _PAIRS),
         ("time_in_contact", "f8", _PAIRS),
