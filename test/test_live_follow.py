@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
+from rerun.chunk import RrdReader
 from ros_processes import Probe, bench, value
 from scenes import ROOT
 from sensor_msgs.msg import JointState
@@ -42,6 +43,7 @@ from plow_twin.stream.journal import (
     PartOfPose,
     Pose,
     Reset,
+    Restore,
     Sample,
     SetModel,
     SetWear,
@@ -50,6 +52,7 @@ from plow_twin.stream.journal import (
 from plow_twin.stream.outputs import CLEARANCE_NAMES, NONE, Published
 from plow_twin.stream.session import Session
 from plow_twin.stream.topics import TOPICS
+from plow_twin.view import layout, to_rrd
 
 sys.path.insert(0, str(ROOT / "benchmark"))
 from estimate_truths import GROUPS, Truth, draw
@@ -279,6 +282,11 @@ def test_a_snapshot_holds_all_that_a_later_run_needs(truth: Truth) -> None:
     for name in ROW.names or ():
         assert np.array_equal(live.column(name), other.column(name)), name
     assert live.twin.digest() == other.twin.digest()
+    # the motion of then, with the wear of now
+    live.take([Restore(_stamp(1.1), snapshot.data), *_in_turn(truth, 0.8, 0.9)])
+    # the next sample is that of its time
+    assert live.twin.time == pytest.approx(0.88) and np.isfinite(live.column("force")).all()
+    assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 
 def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
@@ -467,6 +475,9 @@ def test_a_runtime_says_what_follows_and_goes_on_by_the_parameters_where_samples
     report = replay(tmp_path / "run")
     assert (report.exit_code, report.first_divergence) == (0, None)
     assert report.compared["force_intervals"] == sent["force_intervals"]
+    drawn = to_rrd(tmp_path / "run", tmp_path / "run.rrd")
+    entities = {chunk.entity_path for chunk in RrdReader(str(drawn.path)).stream() if not chunk.is_static}
+    assert {f"/{name}" for name in (*layout.FORCE_BOUNDS, *layout.POSE, *layout.MEASURED)} <= entities
 
 
 def test_nothing_follows_in_bounded_time(truth: Truth) -> None:
