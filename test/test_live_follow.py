@@ -311,6 +311,13 @@ def test_live_and_offline_give_the_same_rows(truth: Truth) -> None:
     assert np.array_equal(live.column("known_clearance").reshape(-1, 2, 3), rows.clearance)
 
 
+def test_each_mark_has_a_digest_as_of_a_twin_that_does_not_follow(truth: Truth) -> None:
+    t, marks = np.array([0.01, 0.02, 0.03]), np.array([2, 2, 3])
+    for twin in (Follower(truth.nominal, MEMBERS), Twin(truth.nominal, excitation="sampled")):
+        digests = twin.advance_rows(t, np.zeros((3, 3)), np.zeros(3, ROW), marks).digests
+        assert digests[0] == digests[1] and len(digests) == 3 and digests[2] == twin.digest()
+
+
 def test_without_measurements_the_median_twin_is_the_nominal_one_and_none_is_moved(
     truth: Truth, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,7 +17,8 @@ import math
 import struct
 import time as _time
 from bisect import bisect_left, insort
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
@@ -254,7 +255,7 @@ class Follower:
         wanted[-1] = True
         if self.every_row or not self.steered:
             wanted[:] = self.every_row
-        stops = set(marks.tolist())
+        stops = Counter(marks.tolist())
         failed, digests, begin = 0, list[str](), 0
         while begin < len(t):
             end = self._stop(t, begin, stops)
@@ -268,11 +269,11 @@ class Follower:
                 when, _, what = self._due.pop(0)
                 self._take_in(when, what)
             if end in stops:
-                digests.append(self.digest())
+                digests += [self.digest()] * stops[end]
             begin = end
         return Advanced(failed, digests)
 
-    def _stop(self, t: Array, begin: int, marks: set[int]) -> int:
+    def _stop(self, t: Array, begin: int, marks: Container[int]) -> int:
         """Return up to where to go at once: nothing happens on the way."""
         end = min(begin + _CALL, len(t))
         due = self._due[0][0] if self._due else math.inf
