@@ -127,3 +127,47 @@ def test_command_estimates_a_drop(drops, tmp_path) -> None:
     assert found["vertical"]["state"] == "estimated"
     assert abs(0.5 * (found["vertical"]["mean_m"] - SQUARE.clearance.vertical_m)) < 2e-3
     assert found["figures"]["restitution"] == pytest.approx(0.5, abs=0.3)
+
+
+@pytest.fixture(scope="module")
+def elastic() -> dict[float, tuple[np.ndarray, np.ndarray]]:
+    """Return times and poses, each 4 ms, of a block in a guide of 30 mm and 22 mm, by its contact's stiffness."""
+    found = {}
+    for stiffness in (1e4, 1e8):
+        motion = simulate(guide(stiffness), t_end=12.0, output_dt=0.004, tol=1e-6)
+        noise = np.random.default_rng(1).normal(0.0, [3e-5, 3e-5, 2e-4], motion.q.shape)
+        found[stiffness] = motion.t, motion.q + noise
+    return found
+
+
+def guide(stiffness: float) -> Scene:
+    return Scene(
+        Head(5.0, 5.0 * 0.2**2 / 6.0, carries="corners"),
+        Frame(0.2, 0.2),
+        Clearance(0.030, 0.022),
+        Contact("exact_restitution", stiffness=stiffness, restitution=1.0),
+        loads=(Harmonic("x", (60.0, 0.0), omega_rad_s=7.0), Harmonic("y", (0.0, 55.0), omega_rad_s=11.0)),
+        initial=Initial(v=(0.3, 0.2, 0.1)),
+    )
+
+
+def of_guide(t: np.ndarray, q: np.ndarray, stiffness: float) -> Estimate:
+    at = np.arange(0.0, 12.01, 0.01)
+    wrench = np.stack([60.0 * np.sin(7.0 * at), 55.0 * np.sin(11.0 * at), 0.0 * at], axis=1)
+    nominal = replace(guide(stiffness), clearance=Clearance(0.034, 0.019), loads=())
+    return estimate(nominal, Load(at, wrench), Poses(t, q))
+
+
+def test_a_stiffness_that_is_not_known_widens_the_interval(elastic) -> None:
+    found = of_guide(*elastic[1e8], stiffness=1e5)
+    for value, true in ((found.horizontal, 0.030), (found.vertical, 0.022)):
+        assert value.p05 < true < value.p95
+
+
+@pytest.mark.parametrize(("stiffness", "every"), [(1e4, 1), (1e8, 5)])
+def test_contacts_that_are_no_impacts_between_two_poses_determine_nothing(elastic, stiffness, every) -> None:
+    """A soft contact lasts many rows; at 50 Hz two impacts look like one."""
+    t, q = elastic[stiffness]
+    found = of_guide(t[::every], q[::every], stiffness)
+    assert found.horizontal_state is State.NOT_OBSERVABLE
+    assert "impacts" in found.reasons[0]
