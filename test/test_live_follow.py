@@ -19,7 +19,7 @@ from ros_processes import Probe, bench, value
 from scenes import ROOT
 from sensor_msgs.msg import JointState
 
-from plow_twin import Twin, Wear, simulate
+from plow_twin import Initial, Twin, Wear, simulate
 from plow_twin.estimate.follow import Follower, follower
 from plow_twin.estimate.followed import follow
 from plow_twin.estimate.result import Estimate, Interval, State
@@ -316,6 +316,57 @@ def test_each_mark_has_a_digest_as_of_a_twin_that_does_not_follow(truth: Truth) 
     for twin in (Follower(truth.nominal, MEMBERS), Twin(truth.nominal, excitation="sampled")):
         digests = twin.advance_rows(t, np.zeros((3, 3)), np.zeros(3, ROW), marks).digests
         assert digests[0] == digests[1] and len(digests) == 3 and digests[2] == twin.digest()
+
+
+def test_a_locked_degree_of_freedom_stays_whatever_is_taken_in(truth: Truth) -> None:
+    locked = replace(truth.nominal, locked=("theta", "x"), initial=Initial(q=(0.004, 0.0, 0.01)))
+    live = Live(locked)
+    change = SetModel(_stamp(0.7), json.dumps({"clearance.horizontal_m": 0.020}))
+    live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *_in_turn(truth, 0.5, 0.7)])
+    assert live.twin.poses_used > 10 and live.twin.drawn == 1
+    live.take([change, *_in_turn(truth, 0.7, 0.8)])
+    q = live.twin.poses_of_all()
+    assert q[:, [0, 2]] == pytest.approx(np.tile([0.004, 0.01], (MEMBERS, 1)), abs=1e-12) and np.ptp(q[:, 1]) > 0.0
+
+
+@pytest.mark.parametrize("wrong", [(0.05, 0.0, 0.0), (-0.09, 0.09, -0.5), (0.0, 0.0, 1e200), (1e308, 1e308, 0.0)])
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_single_wrong_pose_moves_nothing(truth: Truth, wrong: tuple[float, float, float]) -> None:
+    live, other = Live(truth.nominal), Live(truth.nominal)
+    for one, poses in ((live, [Pose(_stamp(0.505), wrong)]), (other, [])):
+        one.take([*_in_turn(truth, 0.0, 0.505), *poses, *_in_turn(truth, 0.505, 0.6)])
+    assert live.twin.poses_outlying == 1 and live.twin.digest() == other.twin.digest()
+    value, low, high = live.clearance().T
+    assert (low < value).all() and (value < high).all()
+
+
+def test_a_jump_of_the_head_is_followed_and_angles_are_equal_up_to_full_turns(truth: Truth) -> None:
+    live, other = Live(truth.nominal), Live(truth.nominal)
+    entries = _in_turn(truth, 0.0, 1.0)
+    for one, turn in ((live, 2.0 * np.pi), (other, 0.0)):
+        one.take(
+            Pose(entry.stamp_ns, (entry.pose[0], entry.pose[1], entry.pose[2] + turn))
+            if isinstance(entry, Pose)
+            else entry
+            for entry in entries
+        )
+    assert live.twin.poses_outlying == 0
+    assert live.column("force")[-1] == pytest.approx(other.column("force")[-1], rel=1e-3, abs=1e3)
+    used = live.twin.poses_used
+    side = -0.012 * np.sign(live.twin.poses_of_all()[0, 0])
+    for index in range(20):
+        begin = 1.0 + 0.01 * index
+        live.take([Pose(_stamp(begin), (side, 0.0, 0.0)), *_samples(truth, begin, begin + 0.01)])
+    assert live.twin.poses_outlying >= 1 and live.twin.poses_used >= used + 10
+    assert np.median(live.twin.poses_of_all()[:, 0]) == pytest.approx(side, abs=3e-3)
+
+
+def test_twins_that_leave_the_range_of_the_model_come_back_with_the_next_pose(truth: Truth) -> None:
+    live, lost = Live(truth.nominal), list[int]()
+    for entry in _in_turn(truth, 0.0, 1.0):
+        live.take([entry])
+        lost.append(live.twin.lost)
+    assert max(lost) > 0 and lost[-1] == 0
 
 
 def test_without_measurements_the_median_twin_is_the_nominal_one_and_none_is_moved(

@@ -35,7 +35,7 @@ from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import DAMPING, GAIN, Unknowns
 from plow_twin.model.geometry import penetration_rows
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import Clearance, Scene, fastest_travel
+from plow_twin.model.scene import DOF_NAMES, Clearance, Scene, fastest_travel
 from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Advanced
@@ -57,14 +57,21 @@ _NOISE_ROWS: Final = (20, 400)
 #: Share of the head's weight on earth that a correction may press a pair with, beyond its force.
 _PRESSED: Final = 0.5
 _STANDARD_GRAVITY: Final = 9.81
-#: Members that carry the clearance of the prior at least, as a share: of more the poses would be trusted too far.
+#: Members that carry the clearance of the prior at least, as a share, and never fewer than `FEWEST`, that have points:
+#: of fewer the poses would be trusted too far.
 _FEWEST_CARRY: Final = 0.1
+#: Standard deviations by which a pose may differ from its prediction: noise reaches five in one of a million poses. Of
+#: 780 poses of three truths none was left out behind soft contacts, eight behind a hard one.
+_OUTLYING: Final = 5.0
+#: Outlying poses in a row after which they are used: the head has jumped, a single glitch does not last so long.
+_MOST_OUTLYING: Final = 5
 #: Samples that are advanced through at once: the rows of all members stay in the processor's cache.
 _CALL: Final = 20
 #: What is known of the clearances is told anew so often [1/s]: as often as it is published.
 _KNOWN_HZ: Final = 10.0
 #: Poses that wait for the model to reach their stamps: those of a stopped load do not pile up.
 _MOST_DUE: Final = 1000
+_THETA: Final = DOF_NAMES.index("theta")
 _NO_MARKS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
 #: Nothing is stated of either.
@@ -136,8 +143,8 @@ class Follower:
         self._ends = _NO_MARKS
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: poses that have moved the members
-        self.poses_used = 0
+        #: poses that have moved the members, and poses that are outliers
+        self.poses_used = self.poses_outlying = 0
         #: times that members were drawn anew
         self.drawn = 0
         self._draw("", start, self._unworn())
@@ -204,6 +211,11 @@ class Follower:
     def lost(self) -> int:
         """Members that have left the model's range."""
         return int((~self._ensemble.good).sum())
+
+    def poses_of_all(self) -> Array:
+        """Return the present pose of each member, x, y [m] and theta [rad], shape (m, 3)."""
+        found: Array = self._ensemble.pose.copy()
+        return found
 
     def failure(self, status: int) -> str:
         """Say why the newest advance that failed did so."""
@@ -343,7 +355,7 @@ class Follower:
             "members": self._members, "taken": self.taken, "drawn": self.drawn, "estimate": self._text,
             "due": self._due, "used": list(self._used), "speed": self._speed, "cell": self._cell,
             "span": self._span_start, "worn": self._ensemble.worn_before.tolist(), "random": random,
-            "sizes": [len(blob) for blob in blobs],
+            "outlying": self._ensemble.outlying, "sizes": [len(blob) for blob in blobs],
         }  # fmt: skip
         head = json.dumps(facts).encode()
         return b"".join([_LENGTH.pack(len(head)), head, *blobs])
@@ -370,6 +382,7 @@ class Follower:
         self._used = deque(facts["used"])
         *own, noise, clearance, wrench = blobs
         self._ensemble.set_state(own, facts["random"])
+        self._ensemble.outlying = int(facts["outlying"])
         self._noise_rows = deque(np.frombuffer(noise).reshape(-1, 3).copy(), maxlen=_NOISE_ROWS[1])
         self._clearance, self._wrench = np.frombuffer(clearance).reshape(2, 3).copy(), np.frombuffer(wrench).copy()
 
@@ -423,14 +436,20 @@ class Follower:
     def _use_pose(self, t: float, q: Array) -> None:
         if not self.steered or any(abs(t - used) < APART_S for used in self._used):
             return
-        if np.isfinite(q).all() and (not self._used or t > max(self._used)):
-            self._noise_rows.append(q)
+        newest = not self._used or t > max(self._used)
         self._used.append(t)
         while self._used and self._used[0] < self.time - 2.0 * LATEST_S:
             self._used.popleft()
         noise, bias, delay = self._sensor()
         if noise is not None:
-            self.poses_used += self._ensemble.take_pose(t - delay, q - bias, noise)
+            before = self._ensemble.outlying
+            used = self._ensemble.take_pose(t - delay, q - bias, noise)
+            self.poses_used += used
+            if not used and self._ensemble.outlying > before:
+                self.poses_outlying += 1
+                return
+        if newest and np.isfinite(q).all():
+            self._noise_rows.append(q)
 
     def _sensor(self) -> tuple[Array | None, Array, float]:
         """Return noise, None where too little was measured to tell, bias and delay of the sensor."""
@@ -527,6 +546,9 @@ class Ensemble:
         self._peak, self._impulse = self._told[:, 1], self._told[:, 2]
         #: squares of each member's normalised innovations
         self.square = np.zeros(members)
+        #: degrees of freedom that are not locked, and outlying poses in a row
+        self._free = np.array([name not in scene.locked for name in DOF_NAMES])
+        self.outlying = 0
         #: times and poses (m, 3) of the newest seconds, oldest first; present rates (m, 3), wear and penetration (m, 8)
         self._path: deque[tuple[float, Array]] = deque([(start, np.tile(np.array(scene.initial.q), (members, 1)))])
         self._v, self.worn = np.tile(np.array(scene.initial.v), (members, 1)), np.tile(worn, (members, 1))
@@ -538,6 +560,11 @@ class Ensemble:
     def moved(self) -> bool:
         """Whether any pose has moved the members."""
         return bool(self.square.any())
+
+    @property
+    def pose(self) -> Array:
+        """The present pose of each member, (m, 3)."""
+        return self._path[-1][1]
 
     def set_travel_speed(self, speed_m_s: float) -> None:
         """Set the speed along the face, of each member as far as its damping allows."""
@@ -552,6 +579,8 @@ class Ensemble:
         rows[:] = batch.rows[0]
         rows["followed"] = FOLLOWED
         failed = batch.status.any()
+        if len(self.good) == 1:
+            self.good[:] = True
         for place, (now, is_wanted, is_end) in enumerate(zip(t.tolist(), wanted.tolist(), ends.tolist(), strict=True)):
             if failed:
                 self.good &= batch.status[:, place] == 0
@@ -609,8 +638,8 @@ class Ensemble:
         return values[0].copy(), np.minimum(low, values[0]), np.maximum(high, values[0])
 
     def _used(self) -> NDArray[np.bool_]:
-        """Tell which members determine intervals: those in the model's range, or all where these are too few."""
-        return self.good if self.good.sum() >= FEWEST else np.ones(len(self.good), dtype=bool)
+        """Tell which members determine intervals: those in the model's range, or all where none is."""
+        return self.good if self.good.any() else np.ones(len(self.good), dtype=bool)
 
     def clearance(self) -> Array:
         """Return the clearances with their 5 % and 95 % points, (2, 3), of the members that foretell the poses best.
@@ -620,7 +649,7 @@ class Ensemble:
         use = self._used()
         excess = np.clip(self.square - self.square[use].min(), 0.0, 1e9)
         low, high = 0.0, 1.0
-        fewest = _FEWEST_CARRY * len(excess)
+        fewest = max(_FEWEST_CARRY * len(excess), FEWEST)
         for _ in range(40):
             share = 0.5 * (low + high)
             weight = np.where(use, np.exp(-0.5 * share * excess), 0.0)
@@ -637,8 +666,7 @@ class Ensemble:
     def stand_like(self, before: Ensemble, wrench: Array) -> None:
         """Begin where others stand under a load, each by its own clearances, with what they have gone through."""
         from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
-        there = before._room()[from_]
-        share = np.divide(self._room(), there, out=np.ones_like(there), where=there > 0.0)
+        share = self._shares(before._room()[from_])
         self.twins.set_wrench(wrench * self._gain)
         self._path = deque((t, q[from_] * share) for t, q in before._path)
         before.settle()
@@ -647,30 +675,42 @@ class Ensemble:
 
     def stand_about(self, q: Array, v: Array) -> None:
         """Begin at a pose of the first member, the others by their own clearances."""
-        room = self._room()
-        places = q * np.divide(room, room[0], out=np.ones_like(room), where=room[0] > 0.0)
+        places = q * self._shares(np.broadcast_to(self._room()[0], (len(self.good), 3)))
         force = self._force(self._penetration(places))[:1]
-        self._stand(places, np.tile(v, (len(room), 1)), force)
+        self._stand(places, np.tile(v, (len(places), 1)), force)
 
     def _room(self) -> Array:
-        """Return what the head can move by, horizontally, vertically, and at its corners, shape (m, 3)."""
-        return np.column_stack([self._clearance, self._clearance.min(axis=1)])
+        """Return what the head can move by, horizontally, vertically, and at its corners, shape (m, 3); 1 if locked."""
+        room = np.column_stack([self._clearance, self._clearance.min(axis=1)])
+        return np.where(self._free, room, 1.0)
 
-    def _stand(self, q: Array, v: Array, force: Array) -> None:
+    def _shares(self, room: Array) -> Array:
+        """Return by how much more than a room the head can move by, shape (m, 3)."""
+        return np.divide(self._room(), room, out=np.ones_like(room), where=room > 0.0)
+
+    def _stand(self, q: Array, v: Array, force: Array, which: NDArray[np.int64] | None = None) -> None:
         """Stand at poses; where a pair would be pressed by more than a force, (m, 8), nearer to the middle."""
         low, high = np.zeros(len(q)), np.ones(len(q))
         free = self._allowed(q, force)
         low[free] = 1.0
         for _ in range(40) if not free.all() else ():
             share = 0.5 * (low + high)
-            allowed = self._allowed(share[:, None] * q, force)
+            allowed = self._allowed(self._nearer(q, share), force)
             low, high = np.where(allowed, share, low), np.where(allowed, high, share)
-        self._put(np.arange(len(q)), low[:, None] * q, v)
+        which = np.arange(len(q)) if which is None else which
+        self._put(which, self._nearer(q, low)[which], v[which])
+
+    def _nearer(self, q: Array, share: Array) -> Array:
+        """Return poses nearer to the middle, as far as the head is free to move."""
+        return np.where(self._free, share[:, None] * q, q)
 
     def take_pose(self, t: float, q: Array, noise: Array) -> bool:
-        """Move the members toward a pose measured at `t`, by their covariance with it; False for one too late."""
+        """Move the members toward a pose measured at `t`, by their covariance with it; False if it is not used.
+
+        Not used are poses that are too late, and outliers as long as few of them come in a row.
+        """
         self.settle()
-        there = np.flatnonzero(np.isfinite(q))
+        there = np.flatnonzero(np.isfinite(q) & self._free)
         times = [time for time, _ in self._path]
         if t <= times[0] or not len(there):
             return False
@@ -678,22 +718,46 @@ class Ensemble:
         path = np.stack([self._path[index][1] for index in range(after - 1, len(times))])
         share = min((t - times[after - 1]) / (times[after] - times[after - 1]), 1.0)
         then = ((1.0 - share) * path[0] + share * path[1])[:, there]
-        white = self._rng.standard_normal((len(then), len(there)))
-        white[0] = 0.0
-        off = q[there] - then
-        self.square += ((off / noise[there]) ** 2).sum(axis=1)
         state = np.concatenate([self._v, *path], axis=1)
         use = self._used()
         about, seen = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
-        scatter = seen[use].T @ seen[use] / (use.sum() - 1) + np.diag(noise[there] ** 2)
-        weight = np.linalg.solve(scatter, seen[use].T @ about[use] / (use.sum() - 1))
+        freedom = max(int(use.sum()) - 1, 1)
+        scatter = seen[use].T @ seen[use] / freedom + np.diag(noise[there] ** 2)
+        center = _off(q, then[use].mean(axis=0), there)
+        if (np.abs(center) <= _OUTLYING * np.sqrt(np.diag(scatter))).all():
+            self.outlying = 0
+        else:
+            self.outlying += 1
+            if self.outlying <= _MOST_OUTLYING:
+                return False
+        white = self._rng.standard_normal((len(then), len(there)))
+        white[0] = 0.0
+        off = _off(q, then, there)
+        # no member is worse than an outlier: a bad pose that is used does not outweigh all others
+        most = _OUTLYING * noise[there]
+        self.square += ((off.clip(-most, most) / noise[there]) ** 2).sum(axis=1)
+        weight = np.linalg.solve(scatter, seen[use].T @ about[use] / freedom)
+        weight[:, ~np.tile(self._free, len(path) + 1)] = 0.0
         moved = state + (off + noise[there] * white) @ weight
         v, places = moved[:, :3], moved[:, 3:].reshape(len(moved), -1, 3).transpose(1, 0, 2)
         allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
         for place, index in enumerate(range(after - 1, len(times))):
             self._path[index][1][allowed] = places[place, allowed]
         self._put(allowed, places[-1, allowed], v[allowed])
+        self._recover()
         return True
+
+    def _recover(self) -> None:
+        """Put members that have left the model's range where others are; if all have, they go on as they are."""
+        lost, left = np.flatnonzero(~self.good), np.flatnonzero(self.good)
+        self.good[:] = True
+        if not len(lost) or not len(left):
+            return
+        from_ = np.arange(len(self.good))
+        from_[lost] = np.resize(left, len(lost))
+        share = self._shares(self._room()[from_])
+        self._path = deque((t, q[from_] * share) for t, q in self._path)
+        self._stand(self._path[-1][1], self._v[from_], self._force(self._depth)[from_], lost)
 
     def _force(self, depth: Array) -> Array:
         """Return the elastic force of each pair, (m, 8)."""
@@ -734,6 +798,14 @@ class Ensemble:
         self._newest = None
         self._path = deque(zip(times.tolist(), path.reshape(-1, count, 3), strict=True))
         self._rng.bit_generator.state = random
+
+
+def _off(q: Array, then: Array, there: NDArray[np.int64]) -> Array:
+    """Return by how much a pose differs from others (..., k) in the coordinates `there`; angles up to full turns."""
+    off: Array = q[there] - then
+    turn = there == _THETA
+    off[..., turn] = np.remainder(off[..., turn] + np.pi, 2.0 * np.pi) - np.pi
+    return off
 
 
 def _worn(one: Scene, scene: Scene, worn: Array, moved: Array) -> Scene:

@@ -106,8 +106,9 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "follow": "off, parameters or full",
         "source": "numbers of the model: prior or estimate",
         "members": "twins that are advanced",
-        "members_lost": "twins among them that have left the model's range",
+        "members_lost": "twins among them that have left the model's range since the last pose",
         "poses_used": "measured poses that have moved the twins",
+        "poses_outlying": "measured poses left out because they lie too far from their predictions",
         "taken_over": "times that the twins were drawn anew: by an estimate, its withdrawal or a change of the machine",
         "reduced": "1 where the parameters alone follow because all twins did not keep up",
     },
@@ -379,10 +380,15 @@ class Health:
             "members": str(follower.members),
             "members_lost": str(follower.lost),
             "poses_used": str(follower.poses_used),
+            "poses_outlying": str(follower.poses_outlying),
             "taken_over": str(follower.drawn),
             "reduced": str(int(reduced)),
         }
-        return (WARN, "the twins did not keep up", values) if reduced else (OK, "following", values)
+        if reduced:
+            return WARN, "the twins did not keep up", values
+        if follower.lost:
+            return WARN, f"{follower.lost} of {follower.members} twins have left the model's range", values
+        return OK, "following", values
 
     def recorder(self, runtime: Runtime) -> Part:
         """Return how the recording is doing; loss is an error."""
