@@ -271,6 +271,8 @@ def test_other_pads_and_other_numbers_of_the_model_forget_what_was_told_of_those
         return estimation.poll(session)
 
     assert told()["forecast"].name == ("seconds/p50",)
+    # an estimate of the machine before is under way
+    estimation._worker.found.append(_found(State.ESTIMATED, State.ESTIMATED))
     session.apply(SetModel(START_NS, json.dumps({"clearance.horizontal_m": 0.026})))
     # the clearance is the model's again: no estimate is held beside one that cannot be observed
     assert estimation.entry is None and set(estimation.states.values()) == {State.PRIOR}

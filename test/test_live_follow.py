@@ -369,6 +369,21 @@ def test_twins_that_leave_the_range_of_the_model_come_back_with_the_next_pose(tr
     assert max(lost) > 0 and lost[-1] == 0
 
 
+def test_what_waits_is_bounded_and_dropped_poses_are_counted_and_no_estimate_is_dropped(truth: Truth) -> None:
+    live = Live(truth.nominal)
+    live.take(_in_turn(truth, 0.0, 0.5))
+    live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (11.0, 3600.0)])
+    assert live.session.poses_dropped == 2
+    before, more = live.twin.taken, 10_050
+    # the load is silent, and a late sample would need all of these again
+    live.take([Pose(_stamp(0.51) + 100_000 * index, (0.0, 0.0, 0.0)) for index in range(more)])
+    assert live.session.poses_dropped == 2 + before + more - 10_000
+    assert live.twin.poses_dropped == more - 10_000
+    live.twin.take_estimate(_known(truth).result, 0.505)
+    live.take(_samples(truth, 0.5, 0.52))
+    assert live.twin.estimate is not None
+
+
 def test_without_measurements_the_median_twin_is_the_nominal_one_and_none_is_moved(
     truth: Truth, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -40,6 +40,7 @@ from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Advanced
 from plow_twin.solve.state import FOLLOWED, ROW, WITH_INTERVALS, Status
+from plow_twin.stream.driven import MOST_MEASURED
 from plow_twin.stream.outputs import clearances
 
 Array = NDArray[np.float64]
@@ -69,8 +70,8 @@ _MOST_OUTLYING: Final = 5
 _CALL: Final = 20
 #: What is known of the clearances is told anew so often [1/s]: as often as it is published.
 _KNOWN_HZ: Final = 10.0
-#: Poses that wait for the model to reach their stamps: those of a stopped load do not pile up.
-_MOST_DUE: Final = 1000
+#: Poses that wait for the model to reach their stamps at most: as many as a session keeps to use again.
+_MOST_DUE: Final = MOST_MEASURED
 _THETA: Final = DOF_NAMES.index("theta")
 _NO_MARKS: Final = np.zeros(0, np.int64)
 _UNMOVED: Final = np.zeros(6)
@@ -143,8 +144,8 @@ class Follower:
         self._ends = _NO_MARKS
         self._span_start = start
         self._wrench = np.zeros(3)
-        #: poses that have moved the members, and poses that are outliers
-        self.poses_used = self.poses_outlying = 0
+        #: poses that have moved the members, poses that are outliers, and poses that were dropped because too many wait
+        self.poses_used = self.poses_outlying = self.poses_dropped = 0
         #: times that members were drawn anew
         self.drawn = 0
         self._draw("", start, self._unworn())
@@ -406,8 +407,10 @@ class Follower:
         self.taken += 1
         if t <= self.time:
             self._take_in(t, what)
-        elif len(self._due) < _MOST_DUE:
+        elif isinstance(what, str) or len(self._due) < _MOST_DUE:
             insort(self._due, (t, self.taken, what), key=lambda due: due[:2])
+        else:
+            self.poses_dropped += 1
 
     def _take_in(self, t: float, what: list[float] | str) -> None:
         if not isinstance(what, str):

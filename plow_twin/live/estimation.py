@@ -92,7 +92,8 @@ class Estimation:
                 self.trust, self.reasons = dict.fromkeys(self.trust, ""), ()
                 self.forecast, self.forecast_error = None, "nothing has been estimated since the pads were set"
             case SetModel():
-                # the clearances are those of the other numbers now
+                # the clearances are those of the other numbers now, and no estimate of those before is taken over
+                self._worker.restart()
                 self._forget()
             case Reset():
                 self._worker.restart()

@@ -64,7 +64,7 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
                     windows.take_gaps(stamp_ns, pairs, gaps)
                 case Spread(_, deviation):
                     windows.take_spread(deviation)
-                case Reset() | SetWear():
+                case Reset() | SetWear() | SetModel():
                     windows.restart()
                     formed.clear()
                 case Estimated(end_ns=end_ns) as entry:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Final, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,9 @@ from plow_twin.run.advance import Advance
 from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
+
+#: Poses that are kept for later at most: those of ten seconds at 1 kHz. Estimates are always kept.
+MOST_MEASURED: Final = 10_000
 
 
 class Driven(Protocol):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.model.scene import check_travel_speed
 from plow_twin.solve.samples import model_times
-from plow_twin.stream.driven import Driven, Following
+from plow_twin.stream.driven import MOST_MEASURED, Driven, Following
 from plow_twin.stream.history import History
 from plow_twin.stream.journal import (
     Digest,
@@ -50,6 +50,9 @@ DIGEST_INTERVAL: Final = 100
 #: Is a stamp known, origin, stamp reached, advances, held, speed along the face, number of speeds to come.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
+#: How far ahead of the time reached a pose may be: as far as `MOST_MEASURED` at 1 kHz. Later ones are of another clock,
+#: or the load has ended.
+_AHEAD_NS: Final = 10_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
 _NO_ROWS: Final = NOTHING.rows
@@ -122,6 +125,8 @@ class Session:
         self._use(twin)
         #: what it has taken in since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
+        #: poses too far ahead, and those that a late sample would find no more
+        self.poses_dropped = 0
         self._scene = twin.scene
         #: numbers of the scene that have been changed, by their keys
         self.changes: dict[str, float] = {}
@@ -207,7 +212,10 @@ class Session:
                 self._restore_motion(data)
             case Pose(stamp_ns) | PartOfPose(stamp_ns):
                 self._on_entry(entry)
-                self._follow(stamp_ns, entry)
+                if self.following is not None and self.stamp_ns is not None and stamp_ns > self.stamp_ns + _AHEAD_NS:
+                    self.poses_dropped += 1
+                else:
+                    self._follow(stamp_ns, entry)
             case Parameter("follow", "parameters") if self.following is not None:
                 self._on_entry(entry)
                 self.following.follow_parameters()
@@ -453,6 +461,9 @@ class Session:
         measured.append(_Measured(self.following.taken, reached_ns, stamp_ns, entry))
         while measured and (earliest_ns is None or measured[0].reached_ns < earliest_ns):
             measured.popleft()
+        if len(measured) > MOST_MEASURED:
+            del measured[next(place for place, one in enumerate(measured) if not isinstance(one.entry, Estimated))]
+            self.poses_dropped += 1
 
     def _travel_on_the_way(self, travel: Travel, stamp_ns: int, wrench: NDArray[np.float64]) -> None:
         """Advance to the stamp of a speed that comes before the next sample, and take it over."""
