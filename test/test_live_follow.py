@@ -39,6 +39,7 @@ from plow_twin.stream.journal import (
     Digest,
     Entry,
     Estimated,
+    Hold,
     Parameter,
     PartOfPose,
     Pose,
@@ -267,6 +268,17 @@ def test_late_samples_and_poses_end_in_the_bits_of_those_in_order_and_replay_giv
     assert _again(ordered.journal, truth.nominal, 1000).twin.digest() == ordered.twin.digest()
     force, expected = (one.session.twin.advance(one.twin.time).force for one in (late, ordered))
     assert force == pytest.approx(expected, rel=0.02, abs=2e3)
+
+
+def test_what_is_published_does_not_change_the_motion_where_poses_samples_and_a_hold_are_late(truth: Truth) -> None:
+    """What has been published decides how far a late sample goes back."""
+    live, part = Live(truth.nominal), _in_turn(truth, 0.5, 1.5)
+    live.take([*_in_turn(truth, 0.0, 0.5), _known(truth), *part[30:60], *part[:30], *part[90:120], *part[60:90]])
+    live.take([Hold(_stamp(1.2)), *part[150:], _known(truth, State.WITHDRAWN), *_in_turn(truth, 1.5, 1.6)])
+    live.session.close()
+    assert isinstance(live.journal[-1], Digest)
+    # nothing is published here
+    assert _again(live.journal, truth.nominal).twin.digest() == live.twin.digest()
 
 
 def test_a_snapshot_holds_all_that_a_later_run_needs(truth: Truth) -> None:

@@ -389,12 +389,12 @@ class Follower:
 
     # -- what is measured --------------------------------------------------------------------------------------------
 
-    def take_pose(self, t: float, q: ArrayLike) -> None:
+    def take_pose(self, t: float, q: ArrayLike, known: float = -math.inf) -> None:
         """Take in a pose measured at `t` in s, shape (3,), NaN where it was not; it acts once the model has come there.
 
-        One of the last `LATEST_S` acts at once.
+        It acts at `known` in s where that is later. One of the last `LATEST_S` acts at once.
         """
-        self._take(t, np.asarray(q, dtype=np.float64).tolist())
+        self._take(max(t, known), [t, *np.asarray(q, dtype=np.float64).tolist()])
 
     def take_estimate(self, text: str, t: float) -> None:
         """Take in an estimate, JSON as of `Estimate.as_dict`, that is known from `t` in s on.
@@ -414,7 +414,7 @@ class Follower:
 
     def _take_in(self, t: float, what: list[float] | str) -> None:
         if not isinstance(what, str):
-            self._use_pose(t, np.array(what))
+            self._use_pose(what[0], np.array(what[1:]))
             return
         found = Estimate.from_dict(json.loads(what))
         states = (found.horizontal_state, found.vertical_state)

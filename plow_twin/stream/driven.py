@@ -58,8 +58,8 @@ class Following(Driven, Protocol):
     #: poses and estimates that it has taken in
     taken: int
 
-    def take_pose(self, t: float, q: ArrayLike) -> None:
-        """Take in a pose measured at model time `t` in s, shape (3,), NaN where it was not measured."""
+    def take_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
+        """Take in a pose measured at model time `t` in s, shape (3,), NaN where it was not; it acts from `known` on."""
 
     def take_estimate(self, text: str, t: float) -> None:
         """Take in an estimate, JSON, that is known from model time `t` in s on."""

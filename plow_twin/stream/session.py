@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import struct
 from bisect import insort
 from collections import deque
@@ -63,10 +64,14 @@ def _ignore(entry: Entry) -> None:
 
 
 class _Measured(NamedTuple):
-    """A pose or an estimate that the twin has taken in: its number, the time reached then and its stamp [ns]."""
+    """A pose or an estimate that the twin has taken in: its number, the time reached then and its stamp [ns].
+
+    It is known from the model time `known` [s] on, however far a late sample goes back before it.
+    """
 
     number: int
     reached_ns: int
+    known: float
     stamp_ns: int
     entry: Pose | PartOfPose | Estimated
 
@@ -448,7 +453,7 @@ class Session:
             self._largest_error_m = max(self._largest_error_m, float(rows["error_estimate"].max()))
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
-    def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated) -> None:
+    def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
         """Let the twin that follows, if it is one, take in what was measured; before the first sample nothing moves."""
         if self.following is None or self.origin_ns is None:
             return
@@ -456,9 +461,10 @@ class Session:
         if isinstance(entry, Estimated):
             self.following.take_estimate(entry.result, time)
         else:
-            self.following.take_pose(time, entry.pose if isinstance(entry, Pose) else whole_pose(entry))
+            self.following.take_pose(time, entry.pose if isinstance(entry, Pose) else whole_pose(entry), known)
         measured, earliest_ns, reached_ns = self._measured, self.history.earliest_ns, self.stamp_ns or 0
-        measured.append(_Measured(self.following.taken, reached_ns, stamp_ns, entry))
+        known = max(known, self.following.time)
+        measured.append(_Measured(self.following.taken, reached_ns, known, stamp_ns, entry))
         while measured and (earliest_ns is None or measured[0].reached_ns < earliest_ns):
             measured.popleft()
         if len(measured) > MOST_MEASURED:
@@ -512,11 +518,11 @@ class Session:
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # in the order of their stamps, as if nothing had been late
+            # each as early as it was known: what is published decides how far one goes back, and may change no motion
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.taken:
-                    self._follow(one.stamp_ns, one.entry)
+                    self._follow(one.stamp_ns, one.entry, one.known)
                 else:
                     self._measured.append(one)
         # one that was to come at the snapshot may have been applied, or be to come still
