@@ -327,7 +327,7 @@ def test_a_mapping_takes_units_offsets_clocks_and_names_what_is_wrong(tmp_path: 
         ("gain: 2", "gain: got 2, expected a known key"),
         ("scal: 2", "scal: got 2, expected a known key; did you mean scale?"),
         ("stamp_unit: [s]", "stamp_unit: got ['s'], expected one of s, ms"),
-        ("stamp: [t]", "stamp: got ['t'], expected header, log, the name of a column or a path"),
+        ("stamp: [t]", "stamp: got ['t'], expected header, log, the name of a column, a path, or {node: identifier}"),
         ("sequence: 0.5", "sequence: got 0.5, expected the name"),
         ("fields: {x: [1]}", "fields.x: got [1], expected the name of a column"),
         ("fields: 5", "fields: got 5"),

@@ -189,6 +189,8 @@ def _watch(task: Any, every: float, as_json: bool, quiet: bool) -> dict[str, Any
 def _show_contacts(console: Console, results: Sequence[dict[str, Any]]) -> None:
     """Print what the model computed of each run, runs side by side."""
     shown = table("Contacts computed", "run", "time [s]", "impacts [1/min]", "largest force [kN]", "at")
+    # a long name takes two lines
+    shown.columns[0].no_wrap, shown.columns[0].overflow = False, "fold"
     for facts in results:
         loads = facts["loads"]
         largest = loads["largest_force_n"]
@@ -226,7 +228,11 @@ def _show(results: list[dict[str, Any]], many: bool, as_json: bool, quiet: bool,
         _show_contacts(console, good)
     for facts in good:
         if not facts["signals"]:
-            console.print(f"{facts['run']}: nothing measured that the model could be held against", highlight=False)
+            console.print(
+                f"{facts['run']}: nothing measured that the model could be held against",
+                highlight=False,
+                soft_wrap=True,
+            )
             continue
         shown = table(
             f"{facts['run']}: predicted minus measured", "signal", "n", "bias", "RMS", "correlation [1]", "lag [s]"
