@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -451,7 +452,8 @@ def test_a_file_is_followed_while_it_grows_and_when_it_is_replaced(tmp_path: Pat
 def test_an_alarm_is_said_once_with_value_pad_threshold_and_time_and_acknowledged_without_ros(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    path, control = _csv(tmp_path / "load.csv", 5000), tmp_path / "twin.socket"
+    # the address of a socket is short, unlike a folder of tests
+    path, control = _csv(tmp_path / "load.csv", 5000), Path(tempfile.mkdtemp(dir="/tmp")) / "twin.socket"
     control.touch()
     assert run_cli(["live", str(path), "--control", str(control)]) == 1  # what is there is no socket of a twin
     assert "cannot be a socket" in capsys.readouterr().err
