@@ -384,7 +384,7 @@ def test_twins_that_leave_the_range_of_the_model_come_back_with_the_next_pose(tr
 def test_what_waits_is_bounded_and_dropped_poses_are_counted_and_no_estimate_is_dropped(truth: Truth) -> None:
     live = Live(truth.nominal)
     live.take(_in_turn(truth, 0.0, 0.5))
-    live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (11.0, 3600.0)])
+    live.take([Pose(_stamp(t), (0.0, 0.0, 0.0)) for t in (3601.0, 7200.0)])
     assert live.session.poses_dropped == 2
     before, more = live.twin.taken, 10_050
     # the load is silent, and a late sample would need all of these again

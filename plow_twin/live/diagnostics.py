@@ -109,7 +109,7 @@ KEYS: Final[dict[str, dict[str, str]]] = {
         "members_lost": "twins among them that have left the model's range since the last pose",
         "poses_used": "measured poses that have moved the twins",
         "poses_outlying": "measured poses left out because they lie too far from their predictions",
-        "poses_dropped": "measured poses dropped because they are more than 10 s ahead of the load or too many wait",
+        "poses_dropped": "measured poses dropped because they are more than an hour ahead of the load or too many wait",
         "taken_over": "times that the twins were drawn anew: by an estimate, its withdrawal or a change of the machine",
         "reduced": "1 where the parameters alone follow because all twins did not keep up",
     },

@@ -51,9 +51,9 @@ DIGEST_INTERVAL: Final = 100
 #: Is a stamp known, origin, stamp reached, advances, held, speed along the face, number of speeds to come.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: How far ahead of the time reached a pose may be: as far as `MOST_MEASURED` at 1 kHz. Later ones are of another clock,
-#: or the load has ended.
-_AHEAD_NS: Final = 10_000_000_000
+#: How far ahead of the time reached a pose may be. A bag that is played fast brings poses before their load; those
+#: further ahead are of another clock.
+_AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
 _NO_ROWS: Final = NOTHING.rows
