@@ -12,8 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from record_support import BASE_NS, paper_sample, record_run
 from ros_processes import ROOT
 
+from plow_twin.demo.comparison import compare_forces
 from plow_twin.demo.demo import program
 from plow_twin.demo.excitation_publisher import plan
 from plow_twin.demo.run_summary import summarise
@@ -23,6 +25,7 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.record.reader import FileStatus, RunReader
 from plow_twin.run.twin import Twin
 from plow_twin.scene_file import load_scene
+from plow_twin.stream.journal import Entry, Estimated
 
 
 def _demo(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -87,6 +90,17 @@ def test_the_demo_runs_to_its_end_without_loss(tmp_path: Path, speed: str) -> No
     assert 0.025 < low < horizontal < high
     for shares in summary.contact_sets.values():
         assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_forces_are_compared_with_the_machine_s_and_the_time_of_each_estimate_is_named(tmp_path: Path) -> None:
+    entries: list[Entry] = [paper_sample(index) for index in range(2000)]
+    entries.insert(1500, Estimated(BASE_NS, BASE_NS, 1, 1, (), (0.0,) * 6, ""))
+    beside = compare_forces(record_run(tmp_path / "run", entries).folder, 1.5e-3)
+    assert beside is not None
+    assert beside.estimates_s == pytest.approx([1.499])
+    # nothing follows in this run: it is the nominal one
+    assert beside.error["followed"] == pytest.approx(beside.error["nominal"], rel=1e-3)
+    assert beside.error["nominal"] > 0.02
 
 
 def test_the_synthetic_sensor_is_of_a_wider_guide() -> None:

@@ -15,6 +15,7 @@ from plow_twin.record.messages import JointState
 from plow_twin.record.reader import RunReader
 from plow_twin.run.advance import AdvanceSeries
 from plow_twin.run.twin import Twin
+from plow_twin.stream.journal import Estimated
 
 Array = NDArray[np.float64]
 
@@ -32,10 +33,16 @@ class Comparison:
         Largest force of each pair in N, by `nominal`, `followed` and `true`.
     error : dict of str to float
         RMS of the difference from the true forces over their RMS, by `nominal` and `followed`.
+    estimates_s : list of float
+        Times of the run in s at which an estimate came.
+    since_s : float
+        Time of the run in s from which on the forces are compared.
     """
 
     peaks: dict[str, Array]
     error: dict[str, float]
+    estimates_s: list[float]
+    since_s: float
 
 
 def compare_forces(run: Path, wider_m: float) -> Comparison | None:
@@ -49,7 +56,7 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
         By which the machine's clearances exceed those of the scene in m.
     """
     reader = RunReader(run)
-    stamps, wrench, told = _read(reader)
+    stamps, wrench, told, estimates = _read(reader)
     if not len(stamps) or not told:
         return None
     scene = reader.header.scene(reader.path)
@@ -73,21 +80,25 @@ def compare_forces(run: Path, wider_m: float) -> Comparison | None:
         name: float(np.sqrt(((force - true) ** 2).mean())) / size
         for name, force in (("nominal", motions["nominal"].force[here]), ("followed", followed))
     }
-    return Comparison({**peaks, "followed": followed.max(axis=0)}, error)
+    came = [1e-9 * (stamp_ns - int(stamps[0])) for stamp_ns in estimates]
+    return Comparison({**peaks, "followed": followed.max(axis=0)}, error, came, float(times[-1]) - COMPARED_S)
 
 
 def _motion(scene: Scene, times: Array, wrench: Array) -> AdvanceSeries:
     return Twin(scene, tol=1e-6, excitation="sampled").advance_samples(times, wrench)
 
 
-def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array]]:
-    """Return stamps [ns] and wrenches of the samples, and the published forces by stamp."""
+def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array], list[int]]:
+    """Return stamps [ns] and wrenches of the samples, the published forces by stamp, and when estimates came [ns]."""
     topic = reader.header.topic("contact_forces")
-    stamps, wrench, told = [], [], {}
+    stamps, wrench, told, estimates = [], [], {}, []
     for batch in reader.batches():
         there = np.flatnonzero(batch.entries.sample)
         stamps.append(batch.entries.stamp_ns[there])
         wrench.append(batch.entries.wrench[there])
+        places = [index for index, entry in batch.entries.rest.items() if isinstance(entry, Estimated)]
+        before = np.searchsorted(there, places) - 1
+        estimates += stamps[-1][before[before >= 0]].tolist()
         for part in batch.outputs:
             for place in range(len(part.messages)):
                 record = part.record(place)
@@ -95,4 +106,4 @@ def _read(reader: RunReader) -> tuple[NDArray[np.int64], Array, dict[int, Array]
                     message = record.message()
                     if isinstance(message, JointState):
                         told[message.stamp_ns] = message.effort
-    return np.concatenate(stamps), np.concatenate(wrench), told
+    return np.concatenate(stamps), np.concatenate(wrench), told, estimates
