@@ -139,7 +139,9 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
         states.append(State.ESTIMATED if observed else unseen)
         counts = ", ".join(f"{number} impacts on the {wall} wall" for wall, number in count.items())
         if not observed:
-            reasons.append(f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most 50%")
+            reasons.append(
+                f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most {_OBSERVED_SHARE:.0%}"
+            )
         elif not all(count.values()):
             reasons.append(f"{name}: {counts}: the poses are taken to be measured from the middle")
     bias = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]

@@ -35,7 +35,7 @@ from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import DAMPING, GAIN, Unknowns
 from plow_twin.model.geometry import penetration_rows
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.model.scene import DOF_NAMES, Clearance, Scene, fastest_travel
+from plow_twin.model.scene import DOF_NAMES, Clearance, Gravity, Scene, fastest_travel
 from plow_twin.run.advance import Advance
 from plow_twin.run.batch import TwinBatch
 from plow_twin.run.twin import Advanced
@@ -57,7 +57,6 @@ APART_S: Final = 4e-3
 _NOISE_ROWS: Final = (20, 400)
 #: Share of the head's weight on earth that a correction may press a pair with, beyond its force.
 _PRESSED: Final = 0.5
-_STANDARD_GRAVITY: Final = 9.81
 #: Members that carry the clearance of the prior at least, as a share, and never fewer than `FEWEST`, that have points:
 #: of fewer the poses would be trusted too far.
 _FEWEST_CARRY: Final = 0.1
@@ -542,7 +541,7 @@ class Ensemble:
         self._clearance = np.array([[one.clearance.horizontal_m, one.clearance.vertical_m] for one in scenes])
         self._fastest = np.array([fastest_travel(one.wear, one.contact) for one in scenes])
         self._stiffness, self._exponent = np.array([one.contact.stiffness for one in scenes]), scene.contact.exponent
-        self._pressed = _PRESSED * scene.head.mass_kg * _STANDARD_GRAVITY
+        self._pressed = _PRESSED * scene.head.mass_kg * Gravity().acceleration_m_s2
         self.good = np.ones(members, dtype=bool)
         #: force, and peak and impulse since the span's begin
         self._told = np.zeros((members, 3, PAIR_COUNT))
