@@ -10,7 +10,7 @@ PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
 	if "$$python" -c '$(SUPPORTED)' 2>/dev/null; then echo "$$python"; break; fi; done)
 VENV ?= .venv
 # a sourced ROS 2 is used as it is, otherwise its wheels are installed
-EXTRAS := $(if $(AMENT_PREFIX_PATH),,ros,)record,mqtt,opcua,metrics,dashboard,view,study,dask,dev
+EXTRAS := $(if $(AMENT_PREFIX_PATH),,ros,)record,mqtt,opcua,sparkplug,influx,metrics,dashboard,view,study,dask,dev
 INSTALLED := $(VENV)/.installed
 
 SPEED ?= real

@@ -19,8 +19,10 @@ EXTRAS = {
     ],
     # Writer.flush of mcap came after 1.4; 1.6 is what the tests run with
     "record": ["mcap>=1.6", "rosbags>=0.11", "ruamel.yaml>=0.18", "lz4>=4.3", "zstandard>=0.22", "isal>=1.6"],
-    "mqtt": ["paho-mqtt>=2.0"],
+    "mqtt": ["paho-mqtt>=1.6"],
     "opcua": ["asyncua>=2.1"],
+    "sparkplug": ["paho-mqtt>=1.6", "protobuf>=4.22"],
+    "influx": ["influxdb-client>=1.36"],
     "metrics": ["prometheus-client>=0.19"],
     "dashboard": ["starlette>=0.31", "uvicorn>=0.27", "websockets>=13"],
     "view": ["rerun-sdk>=0.41", "matplotlib>=3.8"],
@@ -32,7 +34,7 @@ EXTRAS = {
         "pytest>=7.4",
         "pytest-cov",
         "pytest-timeout",
-        "pytest-xdist>=3.8",
+        "pytest-xdist>=3.4",
         "hypothesis",
         "amqtt>=0.11",
         "websockets>=13",
@@ -74,16 +76,17 @@ setup(
     ],
     keywords=["digital twin", "contact", "impact", "clearance", "wear", "coal plough", "longwall", "ROS 2"],
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
-    package_data={NAME: ["py.typed", "study/templates/*.j2", "dashboard/page/*"]},
+    package_data={NAME: ["py.typed", "study/templates/*.j2", "dashboard/page/*", "telemetry/opcua/nodesets/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/config", sorted(glob("config/*.yaml"))),
+        (f"share/{NAME}/config", sorted(glob("config/*.[jrxy]*"))),
+        (f"share/{NAME}/config/sros2", ["config/sros2/policy.xml"]),
         (f"share/{NAME}/launch", sorted(glob("launch/*.launch.py"))),
         # executables under the names of ROS; in a bin folder these would be too general
         (f"lib/{NAME}", sorted(glob("scripts/*"))),
     ],
-    python_requires=">=3.11",
+    python_requires=">=3.11,<3.13",
     install_requires=[
         # the model and its solver use these three alone
         "numpy>=1.26",

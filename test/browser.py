@@ -33,7 +33,7 @@ class Page:
         self._number = 0
         self.requests: list[str] = []
         self.errors: list[str] = []
-        for domain in ("Page", "Network", "Runtime"):
+        for domain in ("Page", "Network", "Runtime", "Log"):
             self.call(f"{domain}.enable")
 
     def call(self, method: str, **params: Any) -> dict[str, Any]:
@@ -62,6 +62,10 @@ class Page:
             self.requests.append(message["params"]["request"]["url"])
         elif message.get("method") == "Runtime.exceptionThrown":
             self.errors.append(str(message["params"]["exceptionDetails"]))
+        elif message.get("method") == "Log.entryAdded":
+            entry = message["params"]["entry"]
+            if entry["level"] == "error" and entry["source"] != "network":  # `requests` has those of the network
+                self.errors.append(str(entry))
 
     def evaluate(self, expression: str) -> Any:
         """Return the value of an expression in the page."""

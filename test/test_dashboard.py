@@ -366,6 +366,38 @@ _SEEN = """JSON.stringify({pads: document.querySelectorAll('#pads tbody tr').len
     seconds: screenState.seconds.length, fooled: Boolean(window.fooled)})"""
 
 
+#: The smallest contrast of a text with what lies behind it, as WCAG 2 defines it, disabled controls apart.
+_CONTRAST = """(() => {
+    const parts = (color) => color.match(/[\\d.]+/g).map(Number);
+    const light = (color) => parts(color).slice(0, 3).map((part) => part / 255)
+        .map((part) => part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4)
+        .reduce((sum, part, index) => sum + part * [0.2126, 0.7152, 0.0722][index], 0);
+    const behind = (element) => {
+        for (let one = element; one; one = one.parentElement) {
+            const color = getComputedStyle(one).backgroundColor;
+            if ((parts(color)[3] ?? 1) > 0) return light(color);
+        }
+        return 1;
+    };
+    const texts = [...document.querySelectorAll('h1, h2, td, th, p, span.pill, footer')]
+        .filter((one) => one.innerText.trim());
+    return Math.min(...texts.map((one) => {
+        const [a, b] = [light(getComputedStyle(one).color), behind(one)].sort((x, y) => y - x);
+        return (a + 0.05) / (b + 0.05);
+    }));
+})()"""
+
+
+def _check_readable(page: browser.Page) -> None:
+    """Check contrast in both themes, and that a phone need not scroll sideways."""
+    for theme in ("dark", "light"):
+        page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": theme}])
+        assert page.evaluate(_CONTRAST) >= 4.5, theme
+    page.call("Emulation.setDeviceMetricsOverride", width=390, height=800, deviceScaleFactor=1, mobile=False)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.call("Emulation.clearDeviceMetricsOverride")
+
+
 @pytest.mark.skipif(browser.CHROMIUM is None, reason="no Chromium is installed")
 def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_elsewhere(tmp_path: Path) -> None:
     name = "<img src=x onerror='window.fooled=1'>"
@@ -390,6 +422,7 @@ def test_a_browser_shows_the_twin_takes_names_as_text_and_fetches_nothing_from_e
         assert found["pads"] == 8 and found["charts"] == 3 and len(set(found["colors"])) > 1
         assert "25.000 mm" in found["clearance"] and "assumed" in found["clearance"]
         assert found["seconds"] >= 6 and "kN m" in found["load"] and name in found["source"]
+        _check_readable(page)
         page.evaluate("document.getElementById('mark-text').value = \"<img src=x onerror='window.fooled=1'>\"")
         page.evaluate("document.querySelector('#mark button').click()")
         page.evaluate("document.getElementById('acknowledge').click()")

@@ -1,4 +1,4 @@
-"""The feed of the screen: what has happened is summed up ten times a second, and handed over where there is room.
+"""The feed of a process beside a twin: what has happened is summed up at a rate, and handed over where there is room.
 
 An update that is not taken is not queued: its peaks, and the newest of everything else, stay for the next one.
 """
@@ -20,7 +20,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published
 
 Array = NDArray[np.float64]
 
-#: Updates a second.
+#: Updates of the screen a second.
 RATE_HZ: Final = 10.0
 #: Most publications that wait to be summed up.
 _MOST: Final = 256
@@ -110,21 +110,23 @@ class Motion:
 
 
 class Feed:
-    """What a twin, or a reader beside it, tells the screen.
+    """What a twin, or a reader beside it, tells the screen or a receiver of telemetry.
 
     Parameters
     ----------
     link
-        The way to the server.
+        The way to its process.
     facts
-        What the page shows of the machine (`facts.facts_of`).
+        What is known of the machine (`facts.facts_of`).
     answer
         Does what an operator asks for, `acknowledge` or `mark` with a text; returns whether it was done, and a text.
         None: nothing can be asked for.
     load
         Returns the newest load Fx, Fy [N], M [N m] that is known with a publication, shape (3,).
     on_error
-        Receives the reason why nothing is shown any more.
+        Receives the reason why nothing goes out any more.
+    process, consequence
+        Name of the process, and what its end means.
     """
 
     def __init__(
@@ -134,8 +136,13 @@ class Feed:
         answer: Callable[[str, str], tuple[bool, str]] | None = None,
         load: Callable[[], Array] | None = None,
         on_error: Callable[[str], object] = lambda text: None,
+        process: str = "the server of the screen",
+        consequence: str = "nothing is shown any more",
     ) -> None:
         self._link, self._answer, self._load, self._on_error = link, answer, load, on_error
+        self._end = f"{process} has ended: {consequence}, the twin goes on"
+        #: newest report of the process on itself
+        self.report: dict[str, Any] = {}
         self._ended = False
         self._news: dict[str, Any] = {"facts": {**facts, "can_ask": answer is not None}}
         self._parts: dict[str, Part] = {}
@@ -171,16 +178,23 @@ class Feed:
         del self._events[:-_EVENTS]
 
     def turn(self) -> None:
-        """Do what operators ask for, and send an update: called `RATE_HZ` times a second."""
+        """Do what operators ask for, and send an update: called at the rate of the updates."""
+        self.hear()
+        self.send()
+        if self._link.broken and not self._ended:
+            self._ended = True
+            self._on_error(self._end)
+
+    def hear(self) -> None:
+        """Do what operators ask for, and take in reports of the process."""
         for _ in range(_MOST_ASKED):
             asked = self._link.receive()
             if asked is None:
                 break
-            self._do(asked)
-        self.send()
-        if self._link.broken and not self._ended:
-            self._ended = True
-            self._on_error("the server of the screen has ended: nothing is shown any more, the twin goes on")
+            if asked.get("do") == "report":
+                self.report = asked
+            else:
+                self._do(asked)
 
     def send(self) -> bool:
         """Send an update; False, and counted, where there was no room."""

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from importlib.util import find_spec
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any
 
 from plow_twin.dashboard.access import PageAccess, listening
+from plow_twin.dashboard.beside import Beside
 from plow_twin.dashboard.feed import Array, Feed
-from plow_twin.dashboard.link import pair
-
-#: How long the server may take to end [s].
-_END_S: Final = 3.0
 
 
-class Screen:
+class Screen(Beside):
     """A running server and its feed; a context that ends it.
 
     Parameters
@@ -48,43 +42,14 @@ class Screen:
             if find_spec(name) is None:
                 raise ModuleNotFoundError(name, name=name)
         with listening(access) as page:
-            self._link, theirs = pair()
             port = int(page.getsockname()[1])
-            numbers = (theirs.fileno(), page.fileno())
-            command = [sys.executable, "-m", "plow_twin.dashboard.server", *map(str, numbers)]
-            # a session of its own: Ctrl-C is for the twin, whose end is the server's too
-            self.process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                pass_fds=numbers,
-                start_new_session=True,
-            )
-            theirs.close()
-        self._link.send(asdict(access))
+            super().__init__("plow_twin.dashboard.server", asdict(access), (page.fileno(),))
         host = f"[{access.host}]" if ":" in access.host else access.host
         #: address of the page
         self.url = f"http://{host}:{port}/"
-        self.feed = Feed(self._link, facts, answer, load, on_error)
+        self.feed = Feed(self.link, facts, answer, load, on_error)
 
     @property
     def has_ended(self) -> bool:
         """Whether the server has gone: nothing is shown any more."""
-        return self._link.broken
-
-    def close(self) -> None:
-        """End the server."""
-        self._link.close()
-        try:
-            self.process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        return self.link.broken

@@ -25,7 +25,7 @@ if (location.hash.startsWith("#token=")) {
   history.replaceState(null, "", location.pathname);
 }
 
-const fixed = (value, digits) => (value === null || value === undefined || !Number.isFinite(Number(value)) ? "–" : Number(value).toFixed(digits));
+const fixed = (value, digits) => (value === null || value === undefined || !Number.isFinite(Number(value)) ? "–" : Number(value).toFixed(digits).replace("-", "−"));
 const kilo = (newton) => fixed(newton === null ? null : newton / 1e3, 1);
 const depth = (metre) => (metre === undefined || metre === null ? "–" : metre >= 1e-3 ? `${fixed(metre * 1e3, 2)} mm` : `${fixed(metre * 1e6, 1)} µm`);
 const padName = (name) => { const words = name.split("_"); const wall = words.pop(); return `${words.join(" ")}, ${wall} wall`; };
@@ -202,11 +202,11 @@ function showPads(peak, largest, wear, points) {
     cell(row, kilo(largest[index]), "n");
     const worn = cell(row, depth(wear[index]), "n");
     const bounds = ["p05", "p95"].map((point) => motion.clearance?.[`pad_${pad.name}/${point}`]);
-    worn.title = `5 % and 95 % points: ${bounds.map(depth).join(" .. ")}`;
+    worn.title = `5 % and 95 % points: ${bounds.map(depth).join(" to ")}`;
     worn.style.boxShadow = `inset -4px 0 ${wearColor(wear[index], Math.max(...wear, 1e-6))}`;
   });
   const set = limits.some((limit) => limit > 0);
-  by("pads-note").textContent = `Black: largest of the span shown. ${set ? "Amber and red: thresholds of warning and error." : "No threshold is set (parameter alarm_force)."}` +
+  by("pads-note").textContent = `Upright stroke: largest of the span shown. ${set ? "Amber and red: thresholds of warning and error." : "No threshold is set (parameter alarm_force)."}` +
     (points ? " Thin line: 5 % to 95 % of the peak over the machines that the measurements allow." :
       Object.keys(window).length ? " Thin line: the same of the last window that was estimated, 5 % to 95 % over the machines that it allows." : "");
 }
@@ -216,7 +216,7 @@ function showClearance() {
   const line = (name) => {
     const [value, low, high] = ["", "/p05", "/p95"].map((point) => motion.clearance?.[`${name}${point}`]);
     const millimetre = (metre) => fixed(metre === undefined ? null : metre * 1e3, 3);
-    return [[name, ""], [`${millimetre(value)} mm`, "n"], [`${millimetre(low)} .. ${millimetre(high)}`, "n"], [SOURCES[status[name]] ?? "", ""]];
+    return [[name, ""], [`${millimetre(value)} mm`, "n"], [`${millimetre(low)} to ${millimetre(high)}`, "n"], [SOURCES[status[name]] ?? "", ""]];
   };
   rows("clearance", ["horizontal", "vertical"].map(line));
   by("life").textContent = life(values("forecast"), "forecast" in state.parts, facts.limits);
@@ -229,7 +229,7 @@ function life(found, known, limits) {
   const hours = (point) => (found[`seconds/${point}`] === undefined ? "beyond the horizon" : `${fixed(found[`seconds/${point}`] / 3600, 0)} h`);
   const beyond = found.not_reached_in_horizon === undefined ? "" : `, ${fixed(100 * found.not_reached_in_horizon, 0)} % beyond the horizon`;
   const shifts = found["shifts/p50"] === undefined ? "" : `; ${fixed(found["shifts/p50"], 0)} shifts`;
-  return `Remaining life of operation to the limits ${limits.map((limit) => fixed(limit * 1e3, 1)).join(" and ")} mm: ${hours("p50")} (10 % to 90 %: ${hours("p10")} .. ${hours("p90")}${beyond})${shifts}; from the estimate and the prior of the wear.`;
+  return `Remaining life of operation to the limits ${limits.map((limit) => fixed(limit * 1e3, 1)).join(" and ")} mm: ${hours("p50")} (10 % to 90 %: ${hours("p10")} to ${hours("p90")}${beyond})${shifts}; from the estimate and the prior of the wear.`;
 }
 
 function showInputs() {

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Mapping
+from itertools import chain, pairwise
 
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.live.bridge.source import Messages
+from plow_twin.live.bridge.table import Table
 from plow_twin.live.load_model import LoadModel
+from plow_twin.live.publishing import Outgoing
 from plow_twin.live.runtime import Runtime
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.map_file import ROLES
@@ -57,6 +63,8 @@ class Feeder:
         #: time of a source with its own time [ns]: the newest stamp, unless it lies alone far ahead
         self.newest_ns = 0
         self._far_ahead_ns: int | None = None
+        #: why the first load that could not be read was none; empty: there was no such
+        self.unfit = ""
         self._number = 0
         #: number of the newest message, where it does not continue those before
         self._odd: int | None = None
@@ -65,6 +73,8 @@ class Feeder:
         self._sender = 0
         self._source = next((role.topic for name, role in roles.items() if name in ("excitation", "drive")), "")
         inputs = runtime.inputs
+        #: whether samples need not be published one after the other: a source with its own time is read
+        self._at_once = runtime.reads_at_once
         self._optional: dict[str, Intake] = {
             "travel": inputs.travel,
             "head_pose": inputs.head_pose,
@@ -73,16 +83,19 @@ class Feeder:
         inputs.senders.start([self._name])
         inputs.senders.alive([self._name])
 
-    def begin(self, messages: list[Arrived]) -> None:
+    def begin(self, messages: Iterable[Arrived]) -> None:
         """Begin the time of a source with its own time at the first message that the next one continues."""
-        read = [role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ())]
-        stamps = [found[0] for found in read if found is not None]
+        read = (role.read(arrived) for arrived in messages for _, role in self._by_topic.get(arrived.topic, ()))
+        stamps = (found[0] for found in read if found is not None)
         back_ns = round(self._runtime.settings.jump_back * 1e9)
-        goes_on = (first for first, second in pairwise(stamps) if second >= first - back_ns)
-        self.newest_ns = next(goes_on, stamps[0] if stamps else 0)
+        first_ns = next(stamps, 0)
+        goes_on = (first for first, second in pairwise(chain([first_ns], stamps)) if second >= first - back_ns)
+        self.newest_ns = next(goes_on, first_ns)
 
-    def feed(self, messages: list[Arrived]) -> None:
+    def feed(self, messages: Messages) -> None:
         """Process messages in order of arrival."""
+        if isinstance(messages, Table) and self._feed_table(messages):
+            return
         samples: list[Arrival] = []
         for arrived in messages:
             roles = self._by_topic.get(arrived.topic, ())
@@ -93,11 +106,52 @@ class Feeder:
                     samples += self._sample(role, arrived)
                 elif name in self._optional:
                     self._measured(name, role, arrived)
-        if samples:
-            for stamp_ns, _ in samples:
-                self._follow_time(stamp_ns)
-            for topic, message in self._runtime.step(samples):
-                self._send(topic, message)
+        if not samples:
+            return
+        for stamp_ns, _ in samples:
+            self._follow_time(stamp_ns)
+        if self._at_once and len(samples) > 1:
+            stamps, wrench = zip(*samples, strict=True)
+            self._forward(self._runtime.step_series(np.array(stamps, np.int64), np.array(wrench, np.float64)))
+        else:
+            self._forward(self._runtime.step(samples))
+
+    def _forward(self, outgoing: Iterable[Outgoing]) -> None:
+        for topic, message in outgoing:
+            self._send(topic, message)
+
+    def _feed_table(self, table: Table) -> bool:
+        """Process lines whose load can be read at once; False, and nothing is done, where it cannot."""
+        roles, inputs = self._by_topic.get(table.topic, []), self._runtime.inputs
+        role = next((role for name, role in roles if name == "excitation"), None)
+        if role is None or role.sequence or not (self._at_once and inputs.active):
+            return False
+        if inputs.senders.followed != self._name:
+            return False
+        found = table.read(role)
+        if found is None or not role.all_plausible(found[1]):
+            return False
+        for arrived in table if len(roles) > 1 else ():
+            for name, other in roles:
+                if name in self._optional and not other.empty(arrived):
+                    self._measured(name, other, arrived)
+        stamps, values = found
+        inputs.senders.hear(self._name, self._number + 1, len(stamps))
+        self._number += len(stamps)
+        self._follow_times(stamps)
+        order = [list(role.fields).index(name) for name in ROLES["excitation"]]
+        self._forward(self._runtime.step_series(stamps, np.ascontiguousarray(values[:, order])))
+        return True
+
+    def _follow_times(self, stamps: NDArray[np.int64]) -> None:
+        """Advance to the times of samples, as `_follow_time` of each."""
+        newest = np.maximum.accumulate(np.append(self.newest_ns, stamps))
+        jump_ns = round(self._runtime.settings.jump_forward * 1e9)
+        if self.newest_ns and self._far_ahead_ns is None and (stamps <= newest[:-1] + jump_ns).all():
+            self.newest_ns = newest.item(-1)
+            return
+        for stamp_ns in stamps.tolist():
+            self._follow_time(stamp_ns)
 
     def _follow_time(self, stamp_ns: int) -> None:
         """Advance to the time of a sample; a sample far ahead counts only if the next one stays there."""
@@ -117,6 +171,8 @@ class Feeder:
     def _sample(self, role: Role, arrived: Arrived) -> list[Arrival]:
         intake = self._runtime.driver.intake
         found = role.read(arrived)
+        if found is None and not self.unfit:
+            self.unfit = role.why_unfit(arrived, with_value=True)
         stamp_ns, values = (0, {}) if found is None else found
         numbers = tuple(values.values())
         if arrived.retained:

@@ -10,14 +10,16 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
-from plow_twin.live.bridge.source import BATCH, BridgeError, Lines, Rows
+from plow_twin.live.bridge.source import BATCH, BridgeError, Lines, Messages, Rows
+from plow_twin.live.bridge.table import Table
 from plow_twin.record.merging import StampOf, merged
 from plow_twin.record.sources import Arrived, TopicType, columns_of
 from plow_twin.record.times import NO_TIME
+from plow_twin.scene_file.csv_rows import is_utf16
 
 #: Most bytes read from a source at once.
 _BLOCK: Final = 1 << 18
@@ -54,6 +56,8 @@ class _Tail:
         try:
             with self.path.open("rb") as stream:
                 while rows.columns is None and (line := stream.readline(_BLOCK)):
+                    if is_utf16(line):
+                        raise BridgeError(f"{self.path}: got UTF-16 text, expected UTF-8 (of a spreadsheet: CSV UTF-8)")
                     if grows and not line.endswith(b"\n") and len(line) < _BLOCK:
                         break
                     rows.read(line)
@@ -213,6 +217,8 @@ class Files:
             if not tail.path.parent.is_dir():
                 raise BridgeError(f"{tail.path.parent}: no such folder")
         self._merged: Iterator[Arrived] | None = None
+        #: the messages of a single topic
+        self._tables: Iterator[Messages] | None = None
         #: bytes of the files that are read once, and of them those read
         self._size = self._done = 0
 
@@ -236,14 +242,18 @@ class Files:
             ]
             self._size = sum(file.stat().st_size for file in files)
             streams = [self._all(tail) for tail in self._tails]
-            self._merged = streams[0] if len(streams) == 1 else merged(streams, lambda row: _sent_ns(row, stamp_ns))
+            if len(streams) == 1:
+                self._tables = streams[0]
+            else:
+                rows = [chain.from_iterable(stream) for stream in streams]
+                self._merged = merged(rows, lambda row: _sent_ns(row, stamp_ns))
 
-    def poll(self, timeout_s: float) -> list[Arrived]:
+    def poll(self, timeout_s: float) -> Messages:
         """Return the next messages."""
-        if self._merged is not None:
-            found = list(islice(self._merged, BATCH))
-            self.finished = not found
-            return found
+        if self.ends:
+            messages = self._next()
+            self.finished = not len(messages)
+            return messages
         give_up = time.monotonic() + timeout_s
         while True:
             found = [arrived for tail in self._tails for arrived in tail.read()]
@@ -257,7 +267,12 @@ class Files:
         """Share of the files that has been read, 0..1; 0 where they are followed."""
         return self._done / self._size if self._size else 0.0
 
-    def _all(self, tail: _Tail | _Dated) -> Iterator[Arrived]:
+    def _next(self) -> Messages:
+        if self._tables is not None:
+            return next(self._tables, [])
+        return list(islice(self._merged or (), BATCH))
+
+    def _all(self, tail: _Tail | _Dated) -> Iterator[Messages]:
         """Yield all messages of a file that is read once, or of the files of a pattern one after the other."""
         if isinstance(tail, _Dated):
             for file in tail.files():
@@ -267,7 +282,15 @@ class Files:
         while True:
             data = tail._block()
             self._done += len(data)
-            yield from messages(tail.topic, tail.lines.add(data) if data else tail.lines.end(), tail.rows)
+            lines = tail.lines.add(data) if data else tail.lines.end()
+            begin = 0
+            while begin < len(lines):
+                end = begin + (BATCH if tail.rows.columns is not None else 1)
+                here, rows = lines[begin:end], tail.rows
+                found = Table(tail.topic, here, rows) if rows.under_header else messages(tail.topic, here, rows)
+                if len(found):
+                    yield found
+                begin = end
             if not data:
                 return
 

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import ssl
 import threading
 import time
 from collections import deque
-from importlib.metadata import version
 from typing import Any, Final
 
 from plow_twin.live.bridge.access import Access, host_and_port, is_loopback
+from plow_twin.live.bridge.paho_client import (
+    end_of,
+    is_resumed,
+    make_client,
+    refusal,
+    subscription_refusal,
+    use_tls,
+)
 from plow_twin.live.bridge.source import BridgeError, read_json
 from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived
@@ -87,56 +93,42 @@ class Mqtt:
         self._client.loop_stop()
 
     def _make_client(self, tls: bool) -> Any:
-        from paho.mqtt.client import Client, MQTTv311
-
-        try:
-            from paho.mqtt.enums import CallbackAPIVersion
-        except ModuleNotFoundError as error:
-            found = version("paho-mqtt")
-            raise BridgeError(
-                f"paho-mqtt: got {found}, expected 2.0 or newer: pip install 'plow_twin[mqtt]'"
-            ) from error
-
         access = self._access
-        client = Client(CallbackAPIVersion.VERSION2, access.client_id, clean_session=False, protocol=MQTTv311)
-        client.reconnect_delay_set(1, 30)
+        client = make_client(access.client_id, clean=False)
         if access.user:
             client.username_pw_set(access.user, access.password or None)
         if tls:
             try:
-                ca, certificate, key = (
-                    None if path is None else str(path) for path in (access.ca, access.certificate, access.key)
-                )
-                client.tls_set(ca, certificate, key, cert_reqs=ssl.CERT_REQUIRED)
+                use_tls(client, access.ca, access.certificate, access.key)
             except (OSError, ValueError) as error:
                 raise BridgeError(f"{access.url}: the files of TLS cannot be used: {error}") from error
         client.on_connect, client.on_disconnect = self._on_connect, self._on_disconnect
         client.on_subscribe, client.on_message = self._on_subscribe, self._on_message
         return client
 
-    def _on_connect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
-        if reason.is_failure:
-            self.trouble = f"refused: {reason}"
+    def _on_connect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any = None) -> None:
+        if refused := refusal(reason):
+            self.trouble = f"refused: {refused}"
             self._answer.set()
             return
         # in a resumed session brokers may mark messages that they kept for it as retained too
-        self._from_before = not flags.session_present
-        if self._subscribed and flags.session_present:
+        resumed = is_resumed(flags)
+        self._from_before = not resumed
+        if self._subscribed and resumed:
             self.connected, self.trouble = True, ""
         else:
             client.subscribe([(topic, 1) for topic in self._topics])
 
-    def _on_subscribe(self, client: Any, data: Any, number: Any, reasons: Any, properties: Any) -> None:
-        refused = [
-            f"{topic}: {reason}" for topic, reason in zip(self._topics, reasons, strict=False) if reason.is_failure
-        ]
+    def _on_subscribe(self, client: Any, data: Any, number: Any, reasons: Any, properties: Any = None) -> None:
+        answers = zip(self._topics, map(subscription_refusal, reasons), strict=False)
+        refused = [f"{topic}: {text}" for topic, text in answers if text]
         self.connected = self._subscribed = not refused
         self.trouble = f"refused: {'; '.join(refused)}" if refused else ""
         self._answer.set()
 
-    def _on_disconnect(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any) -> None:
+    def _on_disconnect(self, client: Any, data: Any, *facts: Any) -> None:
         self.connected = False
-        self.trouble = self.trouble or f"the connection broke: {reason}; it is tried again"
+        self.trouble = self.trouble or f"the connection broke: {end_of(*facts)}; it is tried again"
 
     def _on_message(self, client: Any, data: Any, message: Any) -> None:
         if len(self._queue) >= _QUEUE:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final, Protocol, runtime_checkable
 
 from plow_twin.errors import PlowTwinError
@@ -21,6 +21,13 @@ LONGEST: Final = 65536
 
 class BridgeError(PlowTwinError):
     """A source cannot be opened or has failed for good; the message names it and the reason."""
+
+
+class Messages(Protocol):
+    """Messages in order of arrival; some sources read them when they are asked for."""
+
+    def __len__(self) -> int: ...
+    def __iter__(self) -> Iterator[Arrived]: ...
 
 
 class Bridge(Protocol):
@@ -51,7 +58,7 @@ class Bridge(Protocol):
     def start(self, topics: list[str], stamp_ns: StampOf[Arrived] | None = None) -> None:
         """Subscribe to these topics; messages of files that are read once are ordered by `stamp_ns`."""
 
-    def poll(self, timeout_s: float) -> list[Arrived]:
+    def poll(self, timeout_s: float) -> Messages:
         """Return the messages that have come, waiting `timeout_s` at most; unreadable content is None."""
 
     def close(self) -> None:
@@ -113,9 +120,15 @@ class Rows:
         #: names of the columns, or keys of the first object; None before the first line
         self.columns: list[str] | None = None
         self._json = False
-        self._delimiter = ","
+        #: by the header
+        self.delimiter = ","
         #: columns of the file that this one replaces
         self._before: list[str] | None = None
+
+    @property
+    def under_header(self) -> bool:
+        """Whether the lines to come are CSV of known columns."""
+        return self.columns is not None and not self._json
 
     def header(self, source: str) -> Columns:
         """Return the columns of `source`; raises as `columns_of`."""
@@ -151,16 +164,16 @@ class Rows:
             return False  # a file that repeats its header
         if len(cells) != len(self.columns):
             return None
-        if self._delimiter != ",":  # decimal commas
+        if self.delimiter != ",":  # decimal commas
             cells = [cell.replace(",", ".") for cell in cells]
         return dict(zip(self.columns, cells, strict=True))
 
     def _cells(self, line: bytes) -> list[str] | None:
         text = line.decode(errors="replace")
         if self.columns is None:
-            self._delimiter = delimiter_of(text)
+            self.delimiter = delimiter_of(text)
         try:
-            return next(csv.reader([text], delimiter=self._delimiter, strict=True), None)
+            return next(csv.reader([text], delimiter=self.delimiter, strict=True), None)
         except csv.Error:
             return None
 

@@ -1,0 +1,70 @@
+"""Options of the ways out, and the ways that they ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from plow_twin.cli.console import POSITIVE
+
+if TYPE_CHECKING:
+    from plow_twin.telemetry.access import WayOut
+
+
+def telemetry_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add `--mqtt-out`, `--sparkplug`, `--influx`, `--opcua`, and the options that concern all ways out."""
+    for option in (
+        click.option(
+            "--out-access",
+            type=click.Path(path_type=Path, exists=True, dir_okay=False),
+            help="YAML file with users, certificates and files of secrets for what is sent out.",
+        ),
+        click.option(
+            "--out-rate",
+            type=POSITIVE,
+            default=1.0,
+            show_default=True,
+            help="Updates sent out a second [Hz]; peaks are those since the update before.",
+        ),
+        click.option("--opcua-acknowledge", is_flag=True, help="Let clients of --opcua acknowledge alarms."),
+        click.option(
+            "--opcua", metavar="URL", help="Serve results to OPC UA clients at opc.tcp://HOST:PORT (extra opcua)."
+        ),
+        click.option(
+            "--influx", metavar="URL", help="Send results to InfluxDB, http[s]://HOST:PORT/ORG/BUCKET (extra influx)."
+        ),
+        click.option(
+            "--sparkplug",
+            metavar="GROUP/NODE",
+            default="",
+            help="Send results to the broker of --mqtt-out as this edge node of Sparkplug B (extra sparkplug).",
+        ),
+        click.option(
+            "--mqtt-out", metavar="URL", help="Send results as JSON to mqtt[s]://HOST:PORT/PREFIX (extra mqtt)."
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def ways_of(options: dict[str, Any]) -> list[WayOut]:
+    """Return the ways out that the options ask for; raises as the functions of `telemetry.access`."""
+    if options["sparkplug"] and not options["mqtt_out"]:
+        raise click.UsageError("--sparkplug: expected --mqtt-out with the broker")
+    if not any(options[name] for name in ("mqtt_out", "influx", "opcua")):
+        return []
+    from plow_twin.telemetry import access
+
+    credentials, plain = access.Credentials.read(options["out_access"]), options["plain"]
+    ways = []
+    if options["mqtt_out"]:
+        ways += access.mqtt_out(options["mqtt_out"], credentials, plain=plain, sparkplug=options["sparkplug"])
+    if options["influx"]:
+        ways.append(access.influx_out(options["influx"], credentials, plain=plain))
+    if options["opcua"]:
+        acknowledges = options["opcua_acknowledge"]
+        ways.append(access.opcua_out(options["opcua"], credentials, plain=plain, acknowledges=acknowledges))
+    return ways

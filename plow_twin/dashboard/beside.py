@@ -1,0 +1,59 @@
+"""A process beside a twin, at the other end of a link: whatever happens to it, the twin does not notice."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, Final, Self
+
+from plow_twin.dashboard.link import pair
+
+#: How long the process may take to end [s].
+END_S: Final = 3.0
+
+
+class Beside:
+    """A running process and the link to it; a context that ends it.
+
+    Parameters
+    ----------
+    module
+        Module that is run; its arguments are the descriptor of the link, then `descriptors`.
+    first
+        First message; secrets go this way, for others can read a command line.
+    descriptors
+        Further descriptors that it gets.
+    """
+
+    def __init__(self, module: str, first: dict[str, Any], descriptors: Sequence[int] = ()) -> None:
+        self.link, theirs = pair()
+        with theirs:
+            numbers = (theirs.fileno(), *descriptors)
+            # a session of its own: Ctrl-C is for the twin, whose end is the process's too
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", module, *map(str, numbers)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=numbers,
+                start_new_session=True,
+            )
+        self.link.send(first)
+
+    def close(self) -> None:
+        """End the process."""
+        self.link.close()
+        try:
+            self.process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,67 @@
+"""Clients of MQTT by paho 1.6 and 2, whose callbacks get the same facts in other forms."""
+
+from __future__ import annotations
+
+import ssl
+from pathlib import Path
+from typing import Any, Final
+
+#: Longest wait before another attempt to connect [s].
+LONGEST_WAIT_S: Final = 30
+#: Least number of a refused subscription, where refusals are numbers.
+_REFUSED: Final = 0x80
+
+
+def make_client(client_id: str, *, clean: bool) -> Any:
+    """Return a client of MQTT 3.1.1 that connects again at growing intervals; `clean`: without a session that lasts."""
+    from paho.mqtt import client as paho
+
+    interface = getattr(paho, "CallbackAPIVersion", None)  # from 2.0 on
+    make: Any = paho.Client
+    version = () if interface is None else (interface.VERSION2,)
+    client = make(*version, client_id, clean_session=clean, protocol=paho.MQTTv311)
+    client.reconnect_delay_set(1, LONGEST_WAIT_S)
+    return client
+
+
+def use_tls(client: Any, ca: Path | str | None, certificate: Path | str | None, key: Path | str | None) -> None:
+    """Encrypt, and check the broker's certificate and name against `ca` or the system's authorities.
+
+    Raises
+    ------
+    OSError, ValueError
+        A file cannot be used.
+    """
+    files = (None if path is None else str(path) for path in (ca, certificate, key))
+    client.tls_set(*files, cert_reqs=ssl.CERT_REQUIRED)
+
+
+def is_resumed(flags: Any) -> bool:
+    """Return whether the broker has kept the session, from the flags that `on_connect` gets."""
+    found = flags["session present"] if isinstance(flags, dict) else flags.session_present
+    return bool(found)
+
+
+def refusal(reason: Any) -> str:
+    """Return in words why a connection was refused; empty: it was not."""
+    if isinstance(reason, int):
+        from paho.mqtt.client import connack_string
+
+        return str(connack_string(reason)) if reason else ""
+    return str(reason) if reason.is_failure else ""
+
+
+def subscription_refusal(reason: Any) -> str:
+    """Return in words why a subscription was refused; empty: it was not."""
+    if isinstance(reason, int):
+        return "not authorized, or no such topic" if reason >= _REFUSED else ""
+    return str(reason) if reason.is_failure else ""
+
+
+def end_of(*facts: Any) -> str:
+    """Return in words why a connection has ended, from what `on_disconnect` gets behind client and data."""
+    if len(facts) == 1:
+        from paho.mqtt.client import error_string
+
+        return str(error_string(facts[0]))
+    return str(facts[1])

@@ -1,0 +1,89 @@
+"""Lines of a CSV file that are read once, many at a time: the numbers of a role as arrays."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.live.bridge.source import Rows
+from plow_twin.record.mapping import Role
+from plow_twin.record.sources import Arrived
+from plow_twin.record.times import OF_NUMBERS, TIMES, times_ns
+
+
+class Table:
+    """Some lines of a file under its header: messages one by one, or a role of all of them at once.
+
+    Parameters
+    ----------
+    topic
+        Topic of the messages.
+    lines
+        Whole lines, None for one that is too long.
+    rows
+        Parser of the lines, which knows the header.
+    """
+
+    def __init__(self, topic: str, lines: Sequence[bytes | None], rows: Rows) -> None:
+        self.topic, self._lines, self._rows = topic, lines, rows
+        self._cells: list[tuple[bytes, ...]] | None = None
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def __iter__(self) -> Iterator[Arrived]:
+        """Yield the message of each line that is one."""
+        now_ns = time.time_ns()
+        for line in self._lines:
+            content = self._rows.read(line)
+            if content is not False:
+                yield Arrived(self.topic, now_ns, content)
+
+    def read(self, role: Role) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+        """Return stamps [ns], shape (n,), and numbers (n, k) of a role as `Role.read` does.
+
+        None where a line is to be read by itself: it is no row, a number is missing, or is not plain decimal.
+        """
+        names = self._rows.columns or []
+        stamp = next((name for name in TIMES if name in names), None) if role.stamp == "header" else role.stamp
+        columns = self._columns()
+        if columns is None or stamp not in names or not set(role.fields.values()) <= set(names):
+            return None
+        numbers = [self._numbers(columns[names.index(column)]) for column in role.fields.values()]
+        stamps = times_ns(columns[names.index(stamp)], role.stamp_unit)
+        found = [number for number in numbers if number is not None]
+        if stamps is None or len(found) < len(numbers):
+            return None
+        with np.errstate(all="ignore"):  # a number out of range is dropped as infinite
+            values = np.stack([role.in_si(name, number) for name, number in zip(role.fields, found, strict=True)], 1)
+        return stamps + role.clock_offset_ns, values
+
+    def _columns(self) -> list[tuple[bytes, ...]] | None:
+        """Return the cells of each column; None where the lines differ in their number."""
+        if self._cells is None:
+            comma = self._rows.delimiter.encode()
+            whole = [line for line in self._lines if line is not None]
+            text = b"\n".join(whole)
+            if len(whole) < len(self._lines) or b'"' in text or b"#" in text:
+                return None
+            if b"\r" in text:
+                whole = [line.rstrip(b"\r") for line in whole]
+            count = len(self._rows.columns or ())
+            cells = [line.split(comma) for line in whole]
+            if any(len(row) != count for row in cells):
+                return None
+            self._cells = list(zip(*cells, strict=True))
+        return self._cells
+
+    def _numbers(self, cells: Sequence[bytes]) -> NDArray[np.float64] | None:
+        if self._rows.delimiter != ",":  # decimal commas
+            cells = b"\n".join(cells).replace(b",", b".").split(b"\n")
+        if b"".join(cells).translate(None, OF_NUMBERS):
+            return None
+        try:
+            return np.array(list(map(float, cells)))
+        except ValueError:
+            return None

@@ -1,0 +1,238 @@
+"""Where results go, with which credentials: addresses from options, secrets from files or the environment."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from plow_twin.errors import InputError, Problem
+from plow_twin.live.bridge.access import is_loopback
+from plow_twin.scene_file.yaml_text import read_yaml
+
+_PORTS: Final = {"mqtt": 1883, "mqtts": 8883, "opc.tcp": 4840, "http": 8086, "https": 443}
+#: Keys of each section of the file of credentials.
+_KEYS: Final = {
+    "mqtt": ("user", "password_file", "ca", "certificate", "key", "client_id"),
+    "influx": ("token_file", "ca"),
+    "opcua": ("user", "password_file", "certificate", "key", "trusted"),
+}
+
+
+class AccessError(InputError):
+    """A way out is described wrongly."""
+
+    def __init__(self, key: str, got: object, expected: str) -> None:
+        super().__init__([Problem(key, got, expected)], "telemetry")
+
+
+#: What a topic that is sent to cannot hold.
+_NO_TOPIC: Final = re.compile(r"[+#\x00-\x1f]|^\$")
+
+
+@dataclass(frozen=True)
+class WayOut:
+    """One way out.
+
+    Attributes
+    ----------
+    name : str
+        Name of its part of the diagnostics.
+    address : str
+        Its address, without credentials.
+    modules : tuple of str
+        Modules that its process needs.
+    first : dict
+        First message to its process.
+    may_acknowledge : bool
+        Whether an operator there may acknowledge alarms.
+    """
+
+    name: str
+    address: str
+    modules: tuple[str, ...]
+    first: dict[str, Any] = field(repr=False)
+    may_acknowledge: bool = False
+
+
+@dataclass(frozen=True)
+class Credentials:
+    """Credentials by section (`mqtt`, `opcua`, `influx`); files are relative to the file that names them."""
+
+    sections: Mapping[str, Mapping[str, Any]] = field(default_factory=dict, repr=False)
+    folder: Path = Path()
+
+    @classmethod
+    def read(cls, path: Path | None) -> Credentials:
+        """Read a YAML file.
+
+        Raises
+        ------
+        AccessError
+            A section or key is not known, or a value is no text.
+        SceneError
+            It is no YAML within the bounds.
+        OSError
+            The file cannot be read.
+        """
+        if path is None:
+            return cls()
+        data, problems = read_yaml(path, str(path), ", ".join(_KEYS))
+        if problems:
+            raise InputError(problems, str(path))
+        if not isinstance(data, dict):
+            raise AccessError(str(path), type(data).__name__, f"the sections {', '.join(_KEYS)}")
+        for section, values in data.items():
+            keys = _KEYS.get(section)
+            if keys is None or not isinstance(values, dict):
+                raise AccessError(f"{path}: {section}", values, f"one of the sections {', '.join(_KEYS)}")
+            for key, value in values.items():
+                if key not in keys or not isinstance(value, str):
+                    raise AccessError(f"{path}: {section}.{key}", value, f"a text under one of {', '.join(keys)}")
+        return cls(data, path.parent)
+
+    def text(self, section: str, key: str, otherwise: str = "") -> str:
+        """Return a value."""
+        return str(self.sections.get(section, {}).get(key, otherwise))
+
+    def file(self, section: str, key: str) -> str | None:
+        """Return the path of a file, or None.
+
+        Raises
+        ------
+        AccessError
+            It is not there.
+        """
+        name = self.text(section, key)
+        if not name:
+            return None
+        path = (self.folder / name).absolute()
+        if not path.exists():
+            raise AccessError(f"{section}.{key}", str(path), "a file")
+        return str(path)
+
+    def secret(self, section: str, key: str, variable: str) -> str:
+        """Return the first line of a file, or what stands in the environment."""
+        path = self.file(section, key)
+        if path is None:
+            return os.environ.get(f"PLOW_TWIN_{variable}", "")
+        return Path(path).read_text(encoding="utf-8").partition("\n")[0]
+
+
+def mqtt_out(url: str, credentials: Credentials, *, plain: bool, sparkplug: str = "") -> list[WayOut]:
+    """Return the ways to an MQTT broker, `mqtt[s]://HOST[:PORT]/PREFIX`.
+
+    `sparkplug` is `GROUP/NODE`, or empty; with it JSON is sent only where there is a prefix.
+
+    Raises
+    ------
+    AccessError, OSError
+        The address or a name cannot be used, or a file of the credentials.
+    """
+    expected = "mqtt[s]://HOST:PORT/PREFIX"
+    host, port, prefix, tls = _address("--mqtt-out", url, ("mqtt", "mqtts"), expected, plain=plain)
+    if not (prefix or sparkplug) or re.search(_NO_TOPIC, prefix):
+        raise AccessError("--mqtt-out", url, f"{expected}, the prefix without + and #")
+    address = f"{'mqtts' if tls else 'mqtt'}://{host}:{port}"
+    options = _broker_options(host, port, credentials, tls=tls)
+    client_id, ways = options["client_id"], []
+    if prefix:
+        ways.append(WayOut("mqtt_out", f"{address}/{prefix}", ("paho",), {"way": "mqtt", "prefix": prefix, **options}))
+    if sparkplug:
+        group, _, node = sparkplug.partition("/")
+        if not (group and node) or "/" in node or re.search(_NO_TOPIC, sparkplug):
+            raise AccessError("--sparkplug", sparkplug, "GROUP/NODE, without + and #")
+        first = {"way": "sparkplug", "group": group, "node": node, **options, "client_id": f"{client_id}_b"}
+        ways.append(WayOut("sparkplug", f"{address}/{sparkplug}", ("paho", "google.protobuf"), first))
+    return ways
+
+
+def influx_out(url: str, credentials: Credentials, *, plain: bool) -> WayOut:
+    """Return the way to InfluxDB, `http[s]://HOST[:PORT]/ORG/BUCKET`.
+
+    Raises
+    ------
+    AccessError, OSError
+        The address cannot be used, or a file of the credentials.
+    """
+    expected = "http[s]://HOST:PORT/ORG/BUCKET"
+    host, port, path, encrypted = _address("--influx", url, ("http", "https"), expected, plain=plain)
+    org, _, bucket = path.partition("/")
+    if not (org and bucket):
+        raise AccessError("--influx", url, expected)
+    server = f"{'https' if encrypted else 'http'}://{host}:{port}"
+    first = {
+        "way": "influx",
+        "url": server,
+        "org": org,
+        "bucket": bucket,
+        "token": credentials.secret("influx", "token_file", "INFLUX_TOKEN"),
+        "ca": credentials.file("influx", "ca"),
+    }
+    return WayOut("influx", f"{server}/{org}/{bucket}", ("influxdb_client",), first)
+
+
+def opcua_out(url: str, credentials: Credentials, *, plain: bool, acknowledges: bool) -> WayOut:
+    """Return the way to clients of an OPC UA server: `opc.tcp://HOST:PORT` with the address that it listens on.
+
+    Raises
+    ------
+    AccessError, OSError
+        The address cannot be used, or a file of the credentials.
+    """
+    expected = "opc.tcp://HOST:PORT"
+    files = {key: credentials.file("opcua", key) for key in ("certificate", "key", "trusted")}
+    if bool(files["certificate"]) != bool(files["key"]) or (files["trusted"] and not files["key"]):
+        raise AccessError("opcua", ", ".join(key for key in files if files[key]), "certificate and key together")
+    encrypted = files["certificate"] is not None
+    host, port, path, _ = _address("--opcua", url, ("opc.tcp",), expected, plain=True)
+    if path:
+        raise AccessError("--opcua", url, expected)
+    if not (encrypted or plain or is_loopback(host)):
+        raise AccessError("--opcua", url, "certificate and key in --out-access for other machines, or --plain")
+    address = f"opc.tcp://{host}:{port}"
+    first = {
+        "way": "opcua",
+        "endpoint": address,
+        "user": credentials.text("opcua", "user"),
+        "password": credentials.secret("opcua", "password_file", "OPCUA_OUT_PASSWORD"),
+        "acknowledges": acknowledges,
+        **files,
+    }
+    return WayOut("opcua_out", address, ("asyncua",), first, may_acknowledge=acknowledges)
+
+
+def _broker_options(host: str, port: int, credentials: Credentials, *, tls: bool) -> dict[str, Any]:
+    """Return the options of `mqtt.Broker`."""
+    files = {key: credentials.file("mqtt", key) for key in ("ca", "certificate", "key")}
+    return {
+        "host": host,
+        "port": port,
+        "client_id": credentials.text("mqtt", "client_id", "plow_twin_out"),
+        "user": credentials.text("mqtt", "user"),
+        "password": credentials.secret("mqtt", "password_file", "MQTT_OUT_PASSWORD"),
+        "tls": files if tls else None,
+    }
+
+
+def _address(
+    option: str, url: str, schemes: tuple[str, ...], expected: str, *, plain: bool
+) -> tuple[str, int, str, bool]:
+    """Return host, port, path and whether it is encrypted (the last of the schemes)."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port or _PORTS.get(parts.scheme, 0)
+    except ValueError as error:
+        raise AccessError(option, url, expected) from error
+    if parts.username or parts.password:
+        raise AccessError(option, f"{parts.scheme}://...", f"{expected}, user and password in --out-access")
+    if parts.scheme not in schemes or parts.query or parts.fragment:
+        raise AccessError(option, url, expected)
+    host, encrypted = parts.hostname or "localhost", parts.scheme == schemes[-1]
+    if not (encrypted or plain or is_loopback(host)):
+        raise AccessError(option, url, f"{schemes[-1]}:// for another machine, or --plain")
+    return host, port, parts.path.strip("/"), encrypted

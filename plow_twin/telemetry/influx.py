@@ -1,0 +1,108 @@
+"""Points to InfluxDB by its official client: a measurement for each group of values."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from typing import Any, Final
+
+from influxdb_client import InfluxDBClient, Point, WritePrecision
+from influxdb_client.client.write_api import SYNCHRONOUS
+from influxdb_client.rest import ApiException
+from urllib3.exceptions import HTTPError
+
+from plow_twin.dashboard.link import Link
+from plow_twin.telemetry.values import Group, Newest
+from plow_twin.telemetry.way import State
+
+#: Most points that wait for the database: ten minutes of all groups of numbers at 1 Hz; the oldest go first.
+_WAITING: Final = 2000
+#: Most points in one request.
+_AT_ONCE: Final = 500
+#: Longest wait for an answer [ms], first wait before another attempt and the longest [s].
+_ANSWER_MS: Final = 5000
+_FIRST_WAIT_S: Final = 1.0
+_LONGEST_WAIT_S: Final = 30.0
+
+
+class Influx:
+    """Lines `plow_twin_<group>,head=... name=value,... stamp` to a bucket.
+
+    Parameters
+    ----------
+    url
+        Address of the database.
+    org, bucket, token
+        Where the points go, and the right to write there.
+    ca
+        Authority that its certificate is checked against; None: those of the system.
+    """
+
+    def __init__(self, url: str, org: str, bucket: str, token: str, ca: str | None) -> None:
+        self.state = State(trouble="no connection yet")
+        self._client = InfluxDBClient(url, token, org=org, timeout=_ANSWER_MS, ssl_ca_cert=ca, enable_gzip=False)
+        self._write, self._bucket = self._client.write_api(SYNCHRONOUS), bucket
+        self._waiting: deque[str] = deque()
+        self._wait_s, self._again_s = 0.0, 0.0
+
+    async def open(self, link: Link, newest: Newest) -> None:
+        """Do nothing: each request connects by itself."""
+
+    async def send(self, changed: dict[str, Group], newest: Newest) -> None:
+        """Queue the groups that have changed."""
+        for name, group in changed.items():
+            line = line_of(name, group, str(newest.facts.get("head", "")))
+            if line:
+                self._waiting.append(line)
+        while len(self._waiting) > _WAITING:
+            self._waiting.popleft()
+            self.state.lost += 1
+
+    async def turn(self) -> None:
+        """Write what waits, unless the database has failed just now."""
+        while self._waiting and time.monotonic() >= self._again_s:
+            lines = [self._waiting[index] for index in range(min(len(self._waiting), _AT_ONCE))]
+            try:
+                await asyncio.to_thread(self._write.write, self._bucket, record="\n".join(lines))
+            except (ApiException, HTTPError, OSError) as error:
+                self._fail(error, len(lines))
+                return
+            self._take(len(lines))
+            self.state.sent += len(lines)
+            self.state.connected, self.state.trouble, self._wait_s = True, "", 0.0
+
+    async def close(self, patience_s: float) -> None:
+        """Write what waits once more; the rest is lost."""
+        if self.state.connected and patience_s:
+            await self.turn()
+        self.state.lost += len(self._waiting)
+        self._client.close()
+
+    def _fail(self, error: Any, count: int) -> None:
+        """Keep the lines for another attempt, unless the database has refused them for what they are."""
+        self.state.connected = False
+        status = getattr(error, "status", None)
+        reason = f"{status} {error.reason}" if status else str(error)
+        self.state.trouble = f"not written: {reason}"[:300]
+        if status in (400, 413, 422):
+            self._take(count)
+            self.state.lost += count
+        self._wait_s = min(max(2.0 * self._wait_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
+        self._again_s = time.monotonic() + self._wait_s
+
+    def _take(self, count: int) -> None:
+        for _ in range(count):
+            self._waiting.popleft()
+
+
+def line_of(name: str, group: Group, head: str) -> str:
+    """Return a group as a line of InfluxDB's protocol; empty: nothing of it is known."""
+    point = Point(f"plow_twin_{name}")
+    if head:
+        point = point.tag("head", head)
+    for key, value in group.values.items():
+        if value is not None:
+            point = point.field(key, value)
+    stamp_ns = round(group.time_s * 1e9) if group.time_s else time.time_ns()
+    return str(point.time(stamp_ns, WritePrecision.NS).to_line_protocol())

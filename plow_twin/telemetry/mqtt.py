@@ -1,0 +1,200 @@
+"""JSON to an MQTT broker: a topic for each group of values."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+from plow_twin.dashboard.link import Link
+from plow_twin.live.bridge.paho_client import end_of, make_client, refusal, use_tls
+from plow_twin.telemetry.values import UNITS, Group, Newest
+from plow_twin.telemetry.way import State, TelemetryError
+
+#: Most messages that wait for the broker: ten minutes of all groups of numbers at 1 Hz; the oldest go first.
+_WAITING: Final = 2000
+#: Messages that the broker may have without having acknowledged them.
+_UNACKNOWLEDGED: Final = 20
+#: A broker that is silent for longer than one and a half times this is gone [s].
+_KEEPALIVE_S: Final = 10
+
+
+class Message(NamedTuple):
+    """A message; a retained one is what a late subscriber gets."""
+
+    topic: str
+    payload: bytes
+    retain: bool = False
+    qos: int = 1
+
+
+class Broker:
+    """A connection to a broker that is made again when it breaks, and a bounded queue before it.
+
+    Parameters
+    ----------
+    host, port, client_id, user, password
+        The broker, and who connects.
+    tls
+        Files `ca`, `certificate` and `key`, or None: not encrypted.
+    will
+        Returns what the broker sends when the next connection breaks.
+    on_connected
+        Returns what is sent before all that waits, once the broker has accepted.
+    waiting
+        Most messages that wait while the broker does not answer; the oldest are dropped and counted.
+    keeps
+        Whether what waits is sent after a break; else it is dropped and counted.
+
+    Raises
+    ------
+    TelemetryError
+        A file of TLS cannot be used.
+    """
+
+    def __init__(
+        self,
+        *,
+        host: str,
+        port: int,
+        client_id: str,
+        user: str,
+        password: str,
+        tls: dict[str, str | None] | None,
+        will: Callable[[], Message],
+        on_connected: Callable[[], list[Message]],
+        waiting: int = _WAITING,
+        keeps: bool = True,
+    ) -> None:
+        self.state = State(trouble="no connection yet")
+        self._address, self._will, self._on_connected = (host, port), will, on_connected
+        self._most, self._keeps = waiting, keeps
+        self._waiting: deque[Message] = deque()
+        self._unacknowledged: set[int] = set()
+        #: held while messages are put in order
+        self.lock = threading.RLock()
+        self.client = make_client(client_id, clean=True)
+        self._set_will()
+        if user:
+            self.client.username_pw_set(user, password or None)
+        if tls is not None:
+            try:
+                use_tls(self.client, tls["ca"], tls["certificate"], tls["key"])
+            except (OSError, ValueError) as error:
+                raise TelemetryError(f"{host}:{port}: the files of TLS cannot be used: {error}") from error
+        self.client.on_connect, self.client.on_disconnect = self._connected, self._disconnected
+        self.client.on_connect_fail, self.client.on_publish = self._failed, self._published
+
+    def open(self) -> None:
+        """Connect in the background, again and again."""
+        self.client.connect_async(*self._address, keepalive=_KEEPALIVE_S)
+        self.client.loop_start()
+
+    def send(self, message: Message) -> None:
+        """Send a message now, or when the broker answers."""
+        with self.lock:
+            self._waiting.append(message)
+            self._pass_on()
+            self._drop(len(self._waiting) - (self._most if self._keeps or self.state.connected else 0))
+
+    async def close(self, last: Message, patience_s: float) -> None:
+        """Send what waits, then the last message, and disconnect."""
+        self.send(last)
+        give_up = time.monotonic() + patience_s
+        while self.state.connected and (self._waiting or self._unacknowledged) and time.monotonic() < give_up:
+            await asyncio.sleep(0.01)
+        with self.lock:
+            left = [message for message in self._waiting if message is not last]
+            self.state.lost += len(left) + len(self._unacknowledged)
+        self.client.on_disconnect = None
+        self.client.disconnect()
+        self.client.loop_stop()
+
+    def _pass_on(self) -> None:
+        while self.state.connected and self._waiting and len(self._unacknowledged) < _UNACKNOWLEDGED:
+            topic, payload, retain, qos = self._waiting.popleft()
+            self._unacknowledged.add(self.client.publish(topic, payload, qos, retain).mid)
+
+    def _drop(self, count: int) -> None:
+        for _ in range(count):
+            self._waiting.popleft()
+            self.state.lost += 1
+
+    def _set_will(self) -> None:
+        topic, payload, retain, qos = self._will()
+        self.client.will_set(topic, payload, qos, retain)
+
+    def _connected(self, client: Any, data: Any, flags: Any, reason: Any, properties: Any = None) -> None:
+        if refused := refusal(reason):
+            self.state.trouble = f"refused: {refused}"
+            return
+        with self.lock:
+            self.state.connected, self.state.trouble = True, ""
+            self._waiting.extendleft(reversed(self._on_connected()))
+            self._pass_on()
+
+    def _failed(self, client: Any, data: Any) -> None:
+        self.state.trouble = f"no broker at {self._address[0]}:{self._address[1]}: {sys.exc_info()[1]}"
+
+    def _disconnected(self, client: Any, data: Any, *facts: Any) -> None:
+        self.state.connected = False
+        with self.lock:
+            if not self._keeps:
+                self._drop(len(self._waiting))
+                self.state.lost += len(self._unacknowledged)
+                self._unacknowledged.clear()
+            self._set_will()
+        self.state.trouble = self.state.trouble or f"the connection broke: {end_of(*facts)}; it is tried again"
+
+    def _published(self, client: Any, data: Any, number: int, *facts: Any) -> None:
+        with self.lock:
+            self.state.sent += 1
+            self._unacknowledged.discard(number)
+            self._pass_on()
+
+
+class MqttOut:
+    """JSON objects on `<prefix>/<group>`; all but peaks are retained, and `<prefix>/online` is true or false.
+
+    Parameters
+    ----------
+    prefix
+        Begin of the topics.
+    options
+        As of `Broker`.
+    """
+
+    def __init__(self, prefix: str, **options: Any) -> None:
+        online = f"{prefix}/online"
+        self._prefix, self._gone = prefix, Message(online, b"false", True)
+        there = Message(online, b"true", True)
+        self._broker = Broker(will=lambda: self._gone, on_connected=lambda: [there], **options)
+        self.state = self._broker.state
+
+    async def open(self, link: Link, newest: Newest) -> None:
+        """Connect in the background."""
+        self._broker.open()
+
+    async def send(self, changed: dict[str, Group], newest: Newest) -> None:
+        """Send the groups that have changed."""
+        for name, group in changed.items():
+            self._broker.send(Message(f"{self._prefix}/{name}", _payload(name, group), name != "peaks"))
+
+    async def turn(self) -> None:
+        """Do nothing: the connection has a thread."""
+
+    async def close(self, patience_s: float) -> None:
+        """Send what waits, then that the twin has gone."""
+        await self._broker.close(self._gone, patience_s)
+
+
+def _payload(name: str, group: Group) -> bytes:
+    """Return a group as JSON text."""
+    unit = {"unit": UNITS[name]} if name in UNITS else {}
+    found = {"t": group.time_s or None, **unit, "held": group.held, "values": group.values}
+    return json.dumps(found, separators=(",", ":"), allow_nan=False).encode()

@@ -1,0 +1,171 @@
+"""The OPC UA server: what the twin knows as variables with stamp and status, read by clients and written by none."""
+
+from __future__ import annotations
+
+import hmac
+import logging
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Final
+
+from asyncua import ua
+from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.crypto.truststore import TrustStore
+from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
+from asyncua.server.server import Server
+from asyncua.server.user_managers import UserManager
+from asyncua.ua.status_codes import StatusCodes
+from cryptography import x509
+
+from plow_twin.dashboard.link import Link
+from plow_twin.telemetry.opcua.conditions import Conditions
+from plow_twin.telemetry.opcua.model import Model
+from plow_twin.telemetry.values import Group, Newest, Value
+from plow_twin.telemetry.way import State, TelemetryError
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_POLICIES: Final = [
+    ua.SecurityPolicyType.Aes256Sha256RsaPss_SignAndEncrypt,
+    ua.SecurityPolicyType.Aes128Sha256RsaOaep_SignAndEncrypt,
+    ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt,
+]
+#: A number that is not known, and one that was computed without samples.
+_UNKNOWN: Final = ua.StatusCode(StatusCodes.BadWaitingForInitialData)
+_HELD: Final = ua.StatusCode(StatusCodes.UncertainLastUsableValue)
+_GOOD: Final = ua.StatusCode()
+
+
+class OneUser(UserManager):
+    """Admits one user, or without one everybody that may connect."""
+
+    def __init__(self, user: str, password: str) -> None:
+        self._user, self._password = user, password
+
+    def get_user(
+        self, iserver: Any, username: str | None = None, password: str | None = None, certificate: Any = None
+    ) -> User | None:
+        """Return the user with the right to read, or None."""
+        given = zip((self._user, self._password), (username or "", password or ""), strict=True)
+        right = all([hmac.compare_digest(own.encode(), found.encode("utf-8", "replace")) for own, found in given])
+        return User(UserRole.User, username) if right or not self._user else None
+
+
+class OpcUaServer:
+    """A way out that clients come to.
+
+    Parameters
+    ----------
+    endpoint
+        Address, `opc.tcp://HOST:PORT`.
+    certificate, key
+        Files that identify the server; with them all connections are signed and encrypted.
+    trusted
+        Folder of the certificates of clients, or of their authorities, that are admitted; None: all.
+    user, password
+        The only user; empty: nobody is asked for a name.
+    acknowledges
+        Whether alarms may be acknowledged.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        certificate: str | None,
+        key: str | None,
+        trusted: str | None,
+        user: str,
+        password: str,
+        acknowledges: bool,
+    ) -> None:
+        self.state = State()
+        self._endpoint, self._certificate, self._key, self._trusted = endpoint, certificate, key, trusted
+        self._acknowledges = acknowledges
+        logger = logging.getLogger("asyncua")
+        logger.addHandler(logging.NullHandler())
+        logger.propagate = False
+        self._server = Server(user_manager=OneUser(user, password))
+        self._tokens: list[type] = [ua.UserNameIdentityToken] if user else [ua.AnonymousIdentityToken]
+        self._model = Model(self._server)
+        self._conditions = Conditions(self._server, self._model)
+
+    async def open(self, link: Link, newest: Newest) -> None:
+        """Make the model of the machine, and listen."""
+        if self._acknowledges:
+            self._conditions.acknowledge = lambda: link.send({"do": "acknowledge"})
+        server = self._server
+        server.iserver.bind_condition_methods = True
+        await server.init()
+        server.set_endpoint(self._endpoint)
+        server.set_server_name("plow_twin")
+        server.set_identity_tokens(self._tokens)
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        if self._certificate and self._key:
+            await self._encrypt(self._certificate, self._key)
+        await self._model.build(newest.groups, newest.facts)
+        await self._conditions.build(newest.facts["thresholds"])
+        await self.send(newest.groups, newest)
+        try:
+            await server.start()
+        except OSError as error:
+            raise TelemetryError(f"{self._endpoint}: cannot listen there: {error.strerror}") from error
+
+    async def send(self, changed: dict[str, Group], newest: Newest) -> None:
+        """Write the values that have changed."""
+        for name, group in changed.items():
+            for key, value in group.values.items():
+                await self._server.write_attribute_value(self._model.nodes[f"{name}/{key}"], _data(value, group))
+            if name == "alarms":
+                await self._conditions.take(group)
+        self.state.sent += 1
+
+    async def turn(self) -> None:
+        """Note whether a client is there."""
+        listening = self._server.bserver
+        self.state.connected = bool(listening is not None and listening.clients)
+
+    async def close(self, patience_s: float) -> None:
+        """Stop listening."""
+        await self._server.stop()
+
+    async def _encrypt(self, certificate: str, key: str) -> None:
+        try:
+            data, private = Path(certificate).read_bytes(), Path(key).read_bytes()
+            await self._server.load_certificate(data, _format(data))
+            await self._server.load_private_key(private, format=_format(private))
+            loaded = self._server.iserver.certificate
+            assert loaded is not None
+            uri = _uri(loaded)
+            if uri:
+                await self._server.set_application_uri(uri)
+            if self._trusted:
+                store = TrustStore([Path(self._trusted)], [])
+                await store.load()
+                checks = CertificateValidatorOptions.BASIC_VALIDATION | CertificateValidatorOptions.TRUSTED
+                validator = CertificateValidator(checks | CertificateValidatorOptions.PEER_CLIENT, store)
+                self._server.set_certificate_validator(validator.validate)
+        except (OSError, ValueError, TypeError) as error:
+            raise TelemetryError(f"{self._endpoint}: the certificates cannot be used: {error}") from error
+        self._server.set_security_policy(_POLICIES)
+
+
+def _data(value: Value, group: Group) -> ua.DataValue:
+    """Return a value with its status, and as stamp the time that the model had reached."""
+    stamp = _EPOCH + timedelta(seconds=group.time_s) if group.time_s else datetime.now(UTC)
+    if value is None:
+        return ua.DataValue(ua.Variant(), _UNKNOWN, stamp, datetime.now(UTC))
+    kind = ua.VariantType.String if isinstance(value, str) else ua.VariantType.Double
+    kind = ua.VariantType.Int32 if isinstance(value, int) else kind
+    status = _HELD if group.held and isinstance(value, float) else _GOOD
+    return ua.DataValue(ua.Variant(value, kind), status, stamp, datetime.now(UTC))
+
+
+def _format(data: bytes) -> str:
+    return "pem" if b"-----BEGIN" in data else "der"
+
+
+def _uri(certificate: x509.Certificate) -> str:
+    with suppress(x509.ExtensionNotFound):
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        return next(iter(names.get_values_for_type(x509.UniformResourceIdentifier)), "")
+    return ""

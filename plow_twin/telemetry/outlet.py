@@ -1,0 +1,103 @@
+"""A way out beside a twin: its process, the feed that it is told by, and its part of the diagnostics."""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any, Final
+
+from plow_twin.dashboard.beside import END_S, Beside
+from plow_twin.dashboard.feed import Feed
+from plow_twin.live.part import Part
+from plow_twin.telemetry.access import WayOut
+from plow_twin.telemetry.way import TelemetryError
+
+#: How long a process may take to open its way [s]: it imports its library, and compiles nothing.
+_START_S: Final = 60.0
+
+
+class Outlet(Beside):
+    """A running way out; a context that ends it.
+
+    Parameters
+    ----------
+    way
+        The way out.
+    facts, answer
+        As of `Feed`.
+    on_error
+        Receives in words when the receiver stops and begins to take messages.
+
+    Raises
+    ------
+    TelemetryError
+        The way cannot be opened.
+    ModuleNotFoundError
+        Its library is not installed.
+    """
+
+    def __init__(
+        self,
+        way: WayOut,
+        facts: dict[str, Any],
+        answer: Callable[[str, str], tuple[bool, str]] | None,
+        on_error: Callable[[str], object],
+    ) -> None:
+        for name in way.modules:
+            if not _is_there(name):
+                raise ModuleNotFoundError(name, name=name)
+        super().__init__("plow_twin.telemetry.process", {**way.first, "facts": facts})
+        self.name, self.address, self._on_error = way.name, way.address, on_error
+        ended = f"the process of {way.address}", "nothing is sent there any more"
+        self.feed = Feed(self.link, facts, answer, None, on_error, *ended)
+        self._trouble = ""
+        give_up = time.monotonic() + _START_S
+        while not (self.feed.report or self.link.broken) and time.monotonic() < give_up:
+            select.select([self.link], [], [], 0.1)
+            self.feed.hear()
+        if not self.feed.report or "failed" in self.feed.report:
+            failed = self.feed.report.get("failed", f"{self.address}: its process has ended")
+            super().close()
+            raise TelemetryError(failed)
+
+    def turn(self) -> None:
+        """Send an update, and say what has changed at the receiver."""
+        self.feed.turn()
+        self._say()
+
+    def _say(self) -> None:
+        trouble = self.feed.report["trouble"]
+        if trouble != self._trouble:
+            self._on_error(f"{self.address}: {trouble or 'takes messages now'}")
+            self._trouble = trouble
+
+    def part(self) -> Part:
+        """Return level, message and values for the diagnostics."""
+        report = self.feed.report
+        values = {"address": self.address, "connected": str(report["connected"]).lower()}
+        values |= {key: str(report[key]) for key in ("sent", "lost")}
+        values |= {"not_taken": str(self.feed.not_taken), "trouble": report["trouble"]}
+        ended = "its process has ended" if self.link.broken else ""
+        said = ended or report["trouble"]
+        return int(bool(said)), said, values
+
+    def close(self) -> None:
+        """Send the newest, let the receiver have what waits, and end the process."""
+        self.feed.send()
+        give_up = time.monotonic() + END_S
+        asked = False
+        while not self.link.broken and time.monotonic() < give_up:
+            asked = asked or self.link.send({"end": True})
+            select.select([self.link], [], [], 0.1)
+            self.feed.hear()
+        super().close()
+
+
+def _is_there(name: str) -> bool:
+    """Return whether a module can be imported; it is not imported here, but its parents are."""
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False

@@ -1,0 +1,95 @@
+"""The process of one way out: `python -m plow_twin.telemetry.process LINK`; the first message says which and where.
+
+It takes the updates of a feed one by one. While the receiver does not answer, the way out keeps as many as its own
+bound allows and counts the others; the twin does not wait for any of it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import sys
+from contextlib import suppress
+from dataclasses import asdict
+from importlib import import_module
+from typing import Any, Final
+
+from plow_twin.dashboard.link import LONGEST, Link
+from plow_twin.errors import PlowTwinError
+from plow_twin.telemetry.values import Newest
+from plow_twin.telemetry.way import Way
+
+#: Module and class of each way out.
+WAYS: Final = {
+    "mqtt": ("plow_twin.telemetry.mqtt", "MqttOut"),
+    "sparkplug": ("plow_twin.telemetry.sparkplug", "Sparkplug"),
+    "influx": ("plow_twin.telemetry.influx", "Influx"),
+    "opcua": ("plow_twin.telemetry.opcua.server", "OpcUaServer"),
+}
+#: How much the process gives way to the twin (`nice`).
+_NICE: Final = 5
+#: Longest time between two reports [s].
+_REPORT_S: Final = 0.5
+#: How long the receiver has for what waits at the end [s].
+_END_S: Final = 2.0
+
+
+def _report(way: Way) -> dict[str, Any]:
+    return {"do": "report", **asdict(way.state)}
+
+
+async def serve(link: Link, way: Way, newest: Newest) -> None:
+    """Pass on updates until the other end asks for the end, or has gone."""
+    told, ends = _report(way), False
+    link.send(told)
+    while not (ends or link.broken):
+        await _readable(link)
+        while not ends and (update := link.receive()) is not None:
+            ends = "end" in update
+            if not ends:
+                await way.send(newest.take(update), newest)
+        await way.turn()
+        report = _report(way)
+        if report != told and link.send(report):
+            told = report
+    await way.close(0.0 if link.broken else _END_S)
+    link.send(_report(way))
+
+
+async def _readable(link: Link) -> None:
+    """Wait for a message, or until a report is due."""
+    loop, readable = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_reader(link.fileno(), readable.set)
+    with suppress(TimeoutError):
+        await asyncio.wait_for(readable.wait(), _REPORT_S)
+    loop.remove_reader(link.fileno())
+
+
+async def _run(link: Link, first: dict[str, Any]) -> None:
+    module, name = WAYS[first.pop("way")]
+    newest = Newest()
+    newest.take({"facts": first.pop("facts")})
+    try:
+        way: Way = getattr(import_module(module), name)(**first)
+        await way.open(link, newest)
+    except PlowTwinError as error:
+        link.send({"do": "report", "failed": str(error)})
+        return
+    await serve(link, way, newest)
+
+
+def main() -> None:
+    """Run the way on the descriptor given."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(_NICE)
+    end = socket.socket(fileno=int(sys.argv[1]))
+    end.setblocking(True)
+    data = end.recv(LONGEST)
+    asyncio.run(_run(Link(end), json.loads(data)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,143 @@
+"""What goes out: the newest numbers and texts of a twin, in groups with the same names on every way out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+#: None: a number that is not known.
+Value = float | int | str | None
+
+_POINTS: Final = ("", "/p05", "/p95")
+_ALARMS: Final = ("force", "clearance", "clearance_rate", "wear_rate", "residual")
+_ALARM_TEXTS: Final = ("level", "latched", "place")
+_FLAGS: Final = (
+    "lifecycle", "stream", "stale_inputs", "clock", "recorder", "horizontal", "vertical", "pads", "follow",
+    "model", "sensor",
+)  # fmt: skip
+_LIFE: Final = (
+    *(f"{name}/{point}" for name in ("seconds", "metres", "passes", "shifts") for point in ("p10", "p50", "p90")),
+    "not_reached_in_horizon", "probability_before_stop",
+)  # fmt: skip
+#: Units of the groups of numbers.
+UNITS: Final = {"clearance": "m", "wear": "m", "peaks": "N"}
+
+
+class Group(NamedTuple):
+    """Values that go out together.
+
+    Attributes
+    ----------
+    time_s : float
+        Stamp that the model had reached, in seconds since 1970; 0: none yet.
+    values : mapping
+        Values by name; numbers in SI.
+    held : bool
+        Whether they were computed without samples.
+    """
+
+    time_s: float
+    values: dict[str, Value]
+    held: bool = False
+
+
+class Newest:
+    """The newest of all groups, from the updates of a feed.
+
+    The groups are `clearance` [m] and `wear` [m] with their 5 % and 95 % points, `peaks` [N] since the update before,
+    `life` (points of the forecast), `flags`, `status` and `alarms`. Each has all of its names from the first update on.
+    """
+
+    def __init__(self) -> None:
+        self.facts: dict[str, Any] = {}
+        self.not_taken = 0
+        self.groups: dict[str, Group] = {}
+        self._time_s = 0.0
+        self._held = False
+
+    def take(self, update: Mapping[str, Any]) -> dict[str, Group]:
+        """Take in an update; return the groups that it has changed."""
+        self.not_taken = update.get("not_taken", self.not_taken)
+        changed: dict[str, dict[str, Value]] = {}
+        if "facts" in update:
+            self.facts = update["facts"]
+            changed |= _unknown([pad["name"] for pad in self.facts["pads"]])
+        motion = update.get("motion")
+        if motion is not None and (motion["t"] != self._time_s or any(motion["peak"])):
+            self._time_s, self._held = motion["t"], motion["was_held"]
+            changed |= self._motion(motion)
+        for name, (level, message, values) in update.get("parts", {}).items():
+            changed |= _part(name, level, message, values)
+        found = {name: Group(self._time_s, values, self._held) for name, values in changed.items()}
+        self.groups |= found
+        return found
+
+    def _motion(self, motion: Mapping[str, Any]) -> dict[str, dict[str, Value]]:
+        names = [pad["name"] for pad in self.facts["pads"]]
+        count, points = len(names), motion.get("points") or ()
+        found: dict[str, dict[str, Value]] = {
+            "peaks": {
+                **dict(zip(names, motion["peak"], strict=True)),
+                **{
+                    f"{name}{point}": points[index + offset] if points else None
+                    for point, offset in (("/p05", 0), ("/p95", count))
+                    for index, name in enumerate(names)
+                },
+            }
+        }
+        clearance = motion.get("clearance")
+        if clearance is not None:
+            pads = {name.removeprefix("pad_"): value for name, value in clearance.items() if name.startswith("pad_")}
+            found["wear"] = pads
+            found["clearance"] = {name: value for name, value in clearance.items() if not name.startswith("pad_")}
+        return found
+
+
+def _unknown(names: list[str]) -> dict[str, dict[str, Value]]:
+    """Return all groups before anything is known."""
+    by_pair: dict[str, Value] = {f"{name}{point}": None for point in _POINTS for name in names}
+    axes: dict[str, Value] = {f"{axis}{point}": None for point in _POINTS for axis in ("horizontal", "vertical")}
+    return {
+        "clearance": axes,
+        "wear": dict(by_pair),
+        "peaks": by_pair,
+        "life": dict.fromkeys(_LIFE),
+        "flags": dict.fromkeys(_FLAGS, ""),
+        "status": {"level": 0, "message": ""},
+        "alarms": _alarms(0, "", {}),
+    }
+
+
+def _part(name: str, level: int, message: str, values: Mapping[str, str]) -> dict[str, dict[str, Value]]:
+    """Return the groups that follow from a part."""
+    if name == "status":
+        return {
+            "status": {"level": level, "message": message},
+            "flags": {flag: values.get(flag, "") for flag in _FLAGS},
+        }
+    if name == "alarms":
+        return {"alarms": _alarms(level, message, values)}
+    if name == "forecast":
+        return {"life": {point: _number(values.get(point, "")) for point in _LIFE}}
+    return {}
+
+
+def _alarms(level: int, message: str, values: Mapping[str, str]) -> dict[str, Value]:
+    found: dict[str, Value] = {"level": level, "message": message}
+    for name in _ALARMS:
+        stamp = _number(values.get(f"{name}_stamp_ns", ""))
+        found[name] = _number(values.get(name, ""))
+        found |= {f"{name}_{key}": values.get(f"{name}_{key}", "") for key in _ALARM_TEXTS}
+        found |= {f"{name}_{key}": _number(values.get(f"{name}_{key}", "")) for key in ("raised", "threshold")}
+        found[f"{name}_time"] = None if stamp is None else stamp * 1e-9
+    return found
+
+
+def _number(text: str) -> float | None:
+    """Return a finite number, or None."""
+    try:
+        found = float(text)
+    except ValueError:
+        return None
+    return found if math.isfinite(found) else None

@@ -1,0 +1,52 @@
+"""Interface of a way out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from plow_twin.dashboard.link import Link
+from plow_twin.errors import PlowTwinError
+from plow_twin.telemetry.values import Group, Newest
+
+
+class TelemetryError(PlowTwinError):
+    """A way out cannot be opened; the message names it, and what was expected."""
+
+
+@dataclass
+class State:
+    """State of a way out.
+
+    Attributes
+    ----------
+    connected : bool
+        Whether the receiver answers.
+    sent, lost : int
+        Messages (or points, or updates) that the receiver has taken, and those that were dropped.
+    trouble : str
+        Why the receiver does not take anything, or empty.
+    """
+
+    connected: bool = False
+    sent: int = 0
+    lost: int = 0
+    trouble: str = ""
+
+
+class Way(Protocol):
+    """One way out."""
+
+    state: State
+
+    async def open(self, link: Link, newest: Newest) -> None:
+        """Open the way of a machine, of which `newest` has the facts; wishes of operators go back through `link`."""
+
+    async def send(self, changed: dict[str, Group], newest: Newest) -> None:
+        """Send the groups that have changed."""
+
+    async def turn(self) -> None:
+        """Do what waits; called twice a second at least."""
+
+    async def close(self, patience_s: float) -> None:
+        """Send what waits within `patience_s` [s], and close."""

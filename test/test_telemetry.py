@@ -1,0 +1,422 @@
+"""What goes out to a plant: real brokers, servers and clients in other processes get what the recording holds."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import paho.mqtt.client as paho
+import pytest
+from asyncua import Client, ua
+from asyncua.crypto.security_policies import SecurityPolicyAes256Sha256RsaPss
+from asyncua.crypto.uacrypto import CertProperties
+from commands import plow_twin_here
+from paho.mqtt.enums import CallbackAPIVersion
+from test_live import ROOT, Live, _csv, _free_port, _live, broker
+
+from plow_twin.live.bridge.access import Access
+from plow_twin.record.entries import EntryRecord
+from plow_twin.record.reader import RunReader
+from plow_twin.stream.journal import Digest, Parameter
+from plow_twin.telemetry.mqtt import Broker, Message
+from plow_twin.telemetry.opcua.model import NAMESPACE
+from plow_twin.telemetry.sparkplug import Payload
+
+__all__ = ["broker"]
+
+STALE = ("--set", "excitation_timeout=3600")
+
+
+class Subscriber:
+    """A client that hears all topics, in order of arrival."""
+
+    def __init__(self, port: int, access: Access | None = None, topics: str = "#") -> None:
+        self.messages: list[tuple[str, bytes, bool]] = []
+        self._subscribed = threading.Event()
+        self.client = paho.Client(CallbackAPIVersion.VERSION2)
+        if access is not None:
+            self.client.username_pw_set(access.user, access.password)
+            self.client.tls_set(str(access.ca))
+        self.client.on_connect = lambda client, *_: client.subscribe(topics, 1)
+        self.client.on_subscribe = lambda *_: self._subscribed.set()
+        self.client.on_message = lambda _, __, found: self.messages.append((found.topic, found.payload, found.retain))
+        self.client.connect("localhost" if access else "127.0.0.1", port)
+        self.client.loop_start()
+        assert self._subscribed.wait(30.0)
+
+    def until(self, reached: Callable[[], bool]) -> None:
+        _until(reached, self.messages)
+
+    def newest(self, topic: str) -> Any:
+        found = [payload for name, payload, _ in self.messages if name == topic]
+        return json.loads(found[-1]) if found else None
+
+    def close(self) -> None:
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+def _until(reached: Callable[[], bool], seen: object = None) -> None:
+    give_up = time.monotonic() + 90.0
+    while not reached():
+        assert time.monotonic() < give_up, seen
+        time.sleep(0.02)
+
+
+@contextmanager
+def _open_broker(folder: Path, port: int) -> Iterator[None]:
+    """A broker without TLS that admits everybody."""
+    config = {
+        "listeners": {"default": {"type": "tcp", "bind": f"127.0.0.1:{port}"}},
+        "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {"allow_anonymous": True}},
+    }
+    (folder / "open.yaml").write_text(json.dumps(config))
+    command = [sys.executable, str(ROOT / "test" / "mqtt_broker.py"), str(folder / "open.yaml")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+        try:
+            assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+            yield
+        finally:
+            process.kill()
+
+
+def test_a_broker_gets_all_groups_with_tls_and_says_when_the_twin_has_died(broker: Access, tmp_path: Path) -> None:
+    (tmp_path / "secret").write_text(broker.password + "\n")
+    (tmp_path / "out.yaml").write_text(f"mqtt: {{user: plough, password_file: secret, ca: '{broker.ca}'}}\n")
+    path, url = _csv(tmp_path / "load.csv", 1500), f"{broker.url}/face/plough"
+    port = urlsplit(broker.url).port or 0
+    arguments = (str(path), "--follow", "--mqtt-out", url, "--out-access", str(tmp_path / "out.yaml"), *STALE)
+    alarm = ("--set", "alarm_force=[20e3,1e9]", "--set", "alarm_duration=0.0")
+    early = Subscriber(port, broker)
+    with _live(*arguments, *alarm, "--out-rate", "5") as live:
+        live.until_count("samples_used", 1500)
+        live.until(lambda heard: heard.get("mqtt_out", {}).get("values", {}).get("sent", 0) > 8, "sent")
+        assert broker.password not in Path(f"/proc/{live.process.pid}/cmdline").read_text()
+        # a late subscriber gets the newest of everything but the peaks, which are over
+        late = Subscriber(port, broker)
+        late.until(lambda: late.newest("face/plough/alarms") is not None and len(late.messages) >= 7)
+        groups = {"clearance", "wear", "life", "flags", "status", "alarms", "online"}
+        assert {topic.removeprefix("face/plough/") for topic, _, _ in late.messages} == groups
+        clearance, alarms = late.newest("face/plough/clearance"), late.newest("face/plough/alarms")["values"]
+        assert clearance["unit"] == "m" and clearance["values"]["horizontal/p05"] == pytest.approx(0.025)
+        assert alarms["force_latched"] == "warn" and alarms["force_raised"] > alarms["force_threshold"] == 20e3
+        peaks = [json.loads(found) for topic, found, _ in early.messages if topic == "face/plough/peaks"]
+        largest = max(max(filter(None, found["values"].values()), default=0.0) for found in peaks[1:])
+        assert largest == pytest.approx(alarms["force_raised"], rel=1e-6) or largest > alarms["force_raised"]
+        assert late.newest("face/plough/online") is True
+        live.process.kill()
+        late.until(lambda: late.newest("face/plough/online") is False)
+    for subscriber in (early, late):
+        subscriber.close()
+
+
+def test_a_broker_that_is_not_there_costs_the_twin_nothing_and_is_said(tmp_path: Path) -> None:
+    path, runs = _csv(tmp_path / "load.csv", 2000), [tmp_path / "alone", tmp_path / "with"]
+    url = f"mqtt://127.0.0.1:{_free_port()}/plough"
+    done = [
+        plow_twin_here("live", path, "--record", run, "--json", *more)
+        for run, more in zip(runs, ((), ("--mqtt-out", url)), strict=True)
+    ]
+    assert [found.returncode for found in done] == [0, 0], done[1].stderr
+    part = json.loads(done[1].stdout)["mqtt_out"]
+    assert part["connected"] == "false" and part["sent"] == "0" and int(part["lost"]) > 0
+    assert "mqtt_out" not in json.loads(done[0].stdout)
+    digests = [[entry for entry in _entries(run) if isinstance(entry, Digest)] for run in runs]
+    assert digests[0] == digests[1] and digests[0]
+
+
+def _entries(run: Path) -> list[object]:
+    return [record.entry for record in RunReader(run) if isinstance(record, EntryRecord)]
+
+
+def test_what_waits_for_a_broker_is_bounded_counted_and_comes_in_order(tmp_path: Path) -> None:
+    port = _free_port()
+    there = Message("online", b"true", True)
+    way = Broker(
+        host="127.0.0.1", port=port, client_id="out", user="", password="", tls=None, will=lambda: there,
+        on_connected=lambda: [there], waiting=5,
+    )  # fmt: skip
+    way.open()
+    for number in range(8):
+        way.send(Message("n", str(number).encode(), False))
+    _until(lambda: way.state.trouble.startswith("no broker at 127.0.0.1"), way.state)
+    assert (way.state.sent, way.state.lost, way.state.connected) == (0, 3, False)
+    with _open_broker(tmp_path, port):
+        subscriber = Subscriber(port)
+        _until(lambda: way.state.sent == 6, way.state)
+        subscriber.until(lambda: len(subscriber.messages) == 6)
+        assert [payload for _, payload, _ in subscriber.messages] == [b"true", b"3", b"4", b"5", b"6", b"7"]
+        assert (way.state.lost, way.state.trouble) == (3, "")
+        subscriber.close()
+    _until(lambda: not way.state.connected)
+    asyncio.run(way.close(there, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("mqtt://plant.example/plough", "mqtts:// for another machine, or --plain"),
+        ("mqtt://user:secret@localhost/plough", "user and password in --out-access"),
+        ("mqtt://localhost", "expected mqtt[s]://HOST:PORT/PREFIX"),
+        ("mqtt://localhost/a/+/b", "the prefix without + and #"),
+    ],
+)
+def test_an_address_that_cannot_be_used_says_what_was_expected(url: str, said: str, tmp_path: Path) -> None:
+    done = plow_twin_here("live", _csv(tmp_path / "load.csv", 3), "--mqtt-out", url, "--quiet")
+    assert done.returncode == 2 and said in " ".join(done.stderr.split()) and "secret" not in done.stderr
+
+
+class Heard:
+    """Events of conditions as a client gets them."""
+
+    def __init__(self) -> None:
+        self.events: list[Any] = []
+
+    def event_notification(self, event: Any) -> None:
+        self.events.append(event)
+
+    def states(self) -> list[tuple[bool, bool]]:
+        """Return whether each was active, and acknowledged."""
+        return [(getattr(event, "ActiveState/Id"), getattr(event, "AckedState/Id")) for event in self.events]
+
+
+async def _device(client: Client) -> tuple[Any, Callable[[str], Any]]:
+    index = await client.get_namespace_index(NAMESPACE)
+    return client.get_node(f"ns={index};s=plough"), lambda name: client.get_node(f"ns={index};s=plough.{name}")
+
+
+async def _acknowledge(client: Client, heard: Heard, condition: Any, event_id: bytes | None = None) -> str:
+    method = ua.NodeId(ua.ObjectIds.AcknowledgeableConditionType_Acknowledge)
+    given = ua.Variant(event_id or heard.events[-1].EventId, ua.VariantType.ByteString)
+    try:
+        await condition.call_method(method, given, ua.Variant(ua.LocalizedText("seen")))
+    except ua.UaStatusCodeError as error:
+        return type(error).__name__
+    return "Good"
+
+
+async def _conditions(client: Client) -> Heard:
+    """Subscribe to conditions, and ask for those that are there."""
+    heard = Heard()
+    subscription = await client.create_subscription(50, heard)
+    alarm_type = client.get_node(ua.NodeId(ua.ObjectIds.ExclusiveLevelAlarmType))
+    await subscription.subscribe_alarms_and_conditions(client.nodes.server, alarm_type)
+    conditions = client.get_node(ua.NodeId(ua.ObjectIds.ConditionType))
+    number = ua.Variant(subscription.subscription_id, ua.VariantType.UInt32)
+    await conditions.call_method("0:ConditionRefresh", number)
+    await _soon(lambda: bool(heard.events))
+    return heard
+
+
+async def _soon(reached: Callable[[], Any]) -> None:
+    give_up = time.monotonic() + 60.0
+    while not (done := reached()) or (asyncio.iscoroutine(done) and not await done):
+        assert time.monotonic() < give_up
+        await asyncio.sleep(0.05)
+
+
+def test_opcua_clients_read_a_typed_model_and_acknowledge_alarms_where_that_is_allowed(tmp_path: Path) -> None:
+    path, run, url = _csv(tmp_path / "load.csv", 1500), tmp_path / "run", f"opc.tcp://127.0.0.1:{_free_port()}"
+    arguments = (str(path), "--follow", "--opcua", url, "--out-rate", "5", "--set", "alarm_force=[20e3,1e9]", *STALE)
+
+    async def look(*, allowed: bool) -> None:
+        async with Client(url) as client:
+            device, node = await _device(client)
+            kind = client.get_node(await device.read_type_definition())
+            (supertype,) = await kind.get_referenced_nodes(ua.ObjectIds.HasSubtype, ua.BrowseDirection.Inverse)
+            assert (await supertype.read_browse_name()).Name == "MiningEquipmentType"
+            horizontal = node("clearance.horizontal")
+            unit = await (await horizontal.get_child("0:EngineeringUnits")).read_value()
+            await _soon(lambda: _is_good(horizontal))
+            value, low = await horizontal.read_data_value(), await node("clearance.horizontal.p05").read_value()
+            assert (value.Value.Value, low, unit.DisplayName.Text) == (pytest.approx(0.025), pytest.approx(0.025), "m")
+            assert value.SourceTimestamp.timestamp() == pytest.approx(1.0 + 1499e-3, abs=0.01)  # of the last sample
+            assert not (await node("life.seconds.p50").read_data_value(raise_on_bad_status=False)).StatusCode.is_good()
+            for written in (horizontal, node("flags.stream"), node("alarms.force")):
+                with pytest.raises(ua.UaStatusCodeError):
+                    await written.write_value(await written.read_value())
+            heard, condition = await _conditions(client), node("alarms.force.condition")
+            assert heard.events[-1].ConditionName == "force" and not heard.states()[-1][1] and heard.events[-1].Retain
+            if not allowed:
+                assert await _acknowledge(client, heard, condition) == "BadUserAccessDenied"
+                return
+            assert await _acknowledge(client, heard, condition, b"another") == "BadEventIdUnknown"
+            assert await _acknowledge(client, heard, condition) == "Good"
+            await _soon(lambda: heard.states()[-1][1])
+
+    for allowed, more in ((False, ()), (True, ("--opcua-acknowledge", "--record", str(run)))):
+        with _live(*arguments, *more) as live:
+            live.until_count("samples_used", 1500)
+            _meanwhile(live, look(allowed=allowed))
+            live.until(lambda heard: heard["opcua_out"]["values"]["sent"] > 2, "sent")
+            assert live.stop() == 0
+    assert [entry.name for entry in _entries(run) if isinstance(entry, Parameter)] == ["alarms_acknowledged"]
+
+
+def _meanwhile(live: Live, work: Coroutine[Any, Any, Any]) -> Any:
+    """Do something while what the twin says is read: it waits for its readers."""
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(asyncio.run, work)
+        live.until(lambda _: done.done(), "done")
+        return done.result()
+
+
+async def _is_good(node: Any) -> bool:
+    found = await node.read_data_value(raise_on_bad_status=False)
+    return bool(found.StatusCode.is_good())
+
+
+def test_an_opcua_server_for_other_machines_encrypts_and_admits_whom_it_trusts(tmp_path: Path) -> None:
+    for name in ("server", "client", "other"):
+        _certificate(tmp_path, name)
+    (tmp_path / "trusted").mkdir()
+    (tmp_path / "client.pem").rename(tmp_path / "trusted" / "client.pem")
+    (tmp_path / "secret").write_text("s3cret\n")
+    (tmp_path / "out.yaml").write_text(
+        "opcua: {certificate: server.pem, key: server.key.pem, trusted: trusted, user: plant, password_file: secret}\n"
+    )
+    path, port = _csv(tmp_path / "load.csv", 100), _free_port()
+    arguments = (str(path), "--follow", "--opcua", f"opc.tcp://0.0.0.0:{port}")
+
+    async def connects(certificate: Path | None, password: str) -> bool:
+        client = Client(f"opc.tcp://localhost:{port}", timeout=20)
+        client.application_uri = "urn:plow-twin:client"
+        client.set_user("plant")
+        client.set_password(password)
+        try:
+            if certificate is not None:
+                key = CertProperties(tmp_path / f"{certificate.stem}.key.pem")
+                await client.set_security(
+                    SecurityPolicyAes256Sha256RsaPss, CertProperties(certificate), key,
+                    server_certificate=CertProperties(tmp_path / "server.pem"),
+                )  # fmt: skip
+            async with client:
+                await (await _device(client))[0].read_browse_name()
+        except (ua.UaError, ConnectionError, TimeoutError, asyncio.CancelledError):
+            return False
+        return True
+
+    done = plow_twin_here("live", *arguments, "--quiet")
+    assert done.returncode == 2 and "certificate and key in --out-access for other machines" in done.stderr
+    with _live(*arguments, "--out-access", str(tmp_path / "out.yaml"), *STALE) as live:
+        live.until_count("samples_used", 100)
+        trusted, other = tmp_path / "trusted" / "client.pem", tmp_path / "other.pem"
+        cases = ((trusted, "s3cret"), (trusted, "guess"), (other, "s3cret"), (None, "s3cret"))
+        found = [_meanwhile(live, connects(*given)) for given in cases]
+        assert found == [True, False, False, False]
+        assert live.stop() == 0
+
+
+def _certificate(folder: Path, name: str) -> None:
+    uri = "urn:plow-twin:client" if name != "server" else "urn:plow-twin:server"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
+         "-addext", f"subjectAltName=DNS:localhost,URI:{uri}",
+         "-addext", "keyUsage=digitalSignature,nonRepudiation,keyEncipherment,dataEncipherment,keyCertSign",
+         "-addext", "extendedKeyUsage=serverAuth,clientAuth",
+         "-keyout", str(folder / f"{name}.key.pem"), "-out", str(folder / f"{name}.pem")],
+        check=True, capture_output=True,
+    )  # fmt: skip
+
+
+class EdgeNode:
+    """What a host of Sparkplug B hears of the node `mine/plough`."""
+
+    def __init__(self, port: int) -> None:
+        self.subscriber = Subscriber(port, topics="spBv1.0/#")
+
+    def messages(self, kind: str) -> list[Any]:
+        topic = f"spBv1.0/mine/{kind}/plough"
+        return [Payload.FromString(payload) for name, payload, _ in self.subscriber.messages if name == topic]
+
+    def until(self, kind: str, count: int) -> Any:
+        self.subscriber.until(lambda: len(self.messages(kind)) >= count)
+        return self.messages(kind)[count - 1]
+
+    def ask_for_rebirth(self) -> None:
+        # field 2 of the payload: a metric with its name (1), data type boolean (4) and value (14)
+        name = b"Node Control/Rebirth"
+        metric = bytes([0x0A, len(name)]) + name + bytes([0x20, 11, 0x70, 1])
+        for payload in (b"\xff\xff", bytes([0x12, len(metric)]) + metric):
+            self.subscriber.client.publish("spBv1.0/mine/NCMD/plough", payload, 1).wait_for_publish(30.0)
+
+
+def _metrics(payload: Any) -> dict[str, Any]:
+    return {found.name: found for found in payload.metrics}
+
+
+def test_a_host_of_sparkplug_hears_birth_data_rebirth_and_death_in_sequence(tmp_path: Path) -> None:
+    port, path = _free_port(), _csv(tmp_path / "load.csv", 500)
+    arguments = (str(path), "--follow", "--mqtt-out", f"mqtt://127.0.0.1:{port}", "--sparkplug", "mine/plough")
+    with ExitStack() as opened:
+        opened.enter_context(_open_broker(tmp_path, port))
+        host = EdgeNode(port)
+        live = opened.enter_context(_live(*arguments, "--out-rate", "10", "--set", "excitation_timeout=0.1"))
+        live.until_count("samples_used", 500)
+        birth, data = host.until("NBIRTH", 1), host.until("NDATA", 5)
+        born = _metrics(birth)
+        assert birth.seq == 0 and born["bdSeq"].long_value == 0 and not born["Node Control/Rebirth"].boolean_value
+        assert born["clearance/horizontal"].datatype == 10 and born["flags/stream"].datatype == 12
+        assert [value.string_value for value in born["wear/top_left_top/p05"].properties.values] == ["m"]
+        assert _metrics(data).keys() <= born.keys()
+        numbers = [found.seq for found in host.messages("NDATA")]
+        assert numbers == list(range(1, len(numbers) + 1))
+        host.ask_for_rebirth()
+        assert host.until("NBIRTH", 2).seq == 0
+        again = _metrics(host.messages("NBIRTH")[1])
+        assert again.keys() == born.keys() and again["bdSeq"].long_value == 0
+        assert again["clearance/horizontal"].double_value == pytest.approx(0.025)
+        live.process.kill()
+        assert _metrics(host.until("NDEATH", 1))["bdSeq"].long_value == 0
+        host.subscriber.close()
+
+
+class Database(BaseHTTPRequestHandler):
+    """The write interface of InfluxDB 2."""
+
+    def do_POST(self) -> None:
+        server: Any = self.server
+        text = self.rfile.read(int(self.headers["Content-Length"])).decode()
+        right = self.headers["Authorization"] == "Token a-token" and "org=mine&bucket=face" in self.path
+        self.send_response(204 if right and server.open else 503 if right else 401)
+        self.end_headers()
+        if right and server.open:
+            server.lines += text.splitlines()
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""
+
+
+def test_influxdb_gets_lines_and_what_waited_while_it_was_down(tmp_path: Path) -> None:
+    path = _csv(tmp_path / "load.csv", 500)
+    (tmp_path / "token").write_text("a-token\n")
+    (tmp_path / "out.yaml").write_text("influx: {token_file: token}\n")
+    with ThreadingHTTPServer(("127.0.0.1", 0), Database) as database:
+        database.lines, database.open = [], False  # type: ignore[attr-defined]
+        threading.Thread(target=database.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{database.server_address[1]}/mine/face"
+        arguments = (str(path), "--follow", "--influx", url, "--out-access", str(tmp_path / "out.yaml"), *STALE)
+        with _live(*arguments, "--out-rate", "5") as live:
+            live.until(lambda heard: "503" in str(heard.get("influx", {}).get("message")), "trouble")
+            database.open = True  # type: ignore[attr-defined]
+            values = live.until(lambda heard: heard["influx"]["values"]["sent"] > 5, "sent")
+            assert live.heard["influx"]["values"]["lost"] == 0 and values["samples_used"] == "500"
+            assert live.stop() == 0
+        lines = database.lines  # type: ignore[attr-defined]
+        database.shutdown()
+    clearance = [line for line in lines if line.startswith("plow_twin_clearance,head=plough_head ")][-1]
+    fields, _, stamp = clearance.partition(" ")[2].rpartition(" ")
+    assert "horizontal=0.025," in fields and "horizontal/p05=" in fields
+    assert int(stamp) == 1_000_000_000 + 499 * 1_000_000  # of the last sample
+    assert any('stream="running"' in line for line in lines if line.startswith("plow_twin_flags"))
