@@ -30,7 +30,8 @@ def test_a_wheel_holds_package_data_executables_and_metadata(tmp_path: Path, ver
     assert modules <= names and "plow_twin/py.typed" in names
     page = ROOT / "plow_twin" / "dashboard" / "page"
     assert {f"plow_twin/dashboard/page/{path.name}" for path in page.iterdir()} <= names
-    assert {f"{data}share/plow_twin/config/{path.name}" for path in (ROOT / "config").glob("*.yaml")} <= names
+    config = [path for path in (ROOT / "config").rglob("*.*") if path.suffix != ".service"]
+    assert {f"{data}share/plow_twin/{path.relative_to(ROOT)}" for path in config} <= names
     assert {f"{data}share/plow_twin/launch/twin.launch.py", f"{data}share/plow_twin/package.xml"} <= names
     folders = {name.partition("/")[0] for name in names}
     assert folders == {"plow_twin", f"plow_twin-{version}.dist-info", f"plow_twin-{version}.data"}

@@ -36,15 +36,20 @@ SUBPACKAGES = {
     "live": CORE | {"scene_file", "stream", "estimate", "record"},
     "ros": CORE | {"build", "scene_file", "stream", "estimate", "record", "live"},
     "dashboard": CORE | {"scene_file", "stream", "record", "live", "ros"},
+    "telemetry": CORE | {"scene_file", "stream", "record", "live", "ros", "dashboard"},
     "demo": CORE | {"scene_file", "stream", "record", "view", "live", "ros"},
     "cli": CORE
-    | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "dashboard", "demo"},
+    | {"build", "scene_file", "stream", "estimate", "record", "view", "study", "live", "ros", "dashboard", "demo"}
+    | {"telemetry"},
     "__init__": CORE | {"scene_file", "record"},
     "__main__": {"cli"},
 }
 #: Parts of scipy that are imported where they are used; numba looks at the package itself.
 SCIPY = ("scipy.linalg", "scipy.optimize", "scipy.special")
-MESSAGES = {f"{name}_msgs" for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std")}
+MESSAGES = {
+    f"{name}_msgs"
+    for name in ("diagnostic", "geometry", "lifecycle", "nav", "rosgraph", "sensor", "std", "visualization", "tf2")
+}
 #: Libraries beside numpy, by subpackage.
 LIBRARIES = {
     "build": {"numba", "llvmlite"},
@@ -52,7 +57,7 @@ LIBRARIES = {
     "model": {"scipy"},
     "solve": {"scipy"},
     "estimate": {"scipy"},
-    "run": set(),
+    "run": {"matplotlib"},  # as the type of `Result.plot`; a test sees that it is not imported
     "scene_file": {"yaml", "jsonschema"},
     "record": {
         "mcap",
@@ -82,6 +87,7 @@ LIBRARIES = {
     "live": {"scipy", "yaml", "paho", "asyncua", "cryptography", "prometheus_client"},
     "ros": {"rclpy", "rcl_interfaces", "builtin_interfaces", "std_srvs", "ament_index_python", *MESSAGES},
     "dashboard": {"starlette", "uvicorn", "rclpy", "rcl_interfaces", "std_srvs", *MESSAGES},
+    "telemetry": {"asyncua", "cryptography", "google", "influxdb_client", "urllib3"},
     "demo": {"rclpy", "rich", *MESSAGES},
     "cli": {"click", "rich"},
 }

@@ -1,8 +1,7 @@
-"""Who is at the other end of a node's topics, looked up in the graph.
+"""The publishers and subscribers at the other end of a node's topics, from the ROS graph.
 
-The middleware has events for it. None is asked for: rmw_fastrtps takes two locks in one order where an event is taken
-or asked for and in the other where one arises (ros2/rmw_fastrtps#890), and a node that meets both at once stands still
-for good, the interpreter with it.
+The middleware offers events for this purpose. The node requests none, because rmw_fastrtps can deadlock: it takes two
+locks in one order when an event is requested or taken, and in the other order when one arises (ros2/rmw_fastrtps#890).
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
-#: Looked up so often [s].
+#: Period of the look-up [s].
 LOOK_S: Final = 0.2
 #: Name of a node whose topics are discovered before the node itself (rmw_dds_common: they come by two messages).
 _UNNAMED: Final = "_NODE_NAME_UNKNOWN_"
-#: A wrong time on `/clock` is said so often [s].
+#: Period of the warning about a wrong time on `/clock` [s].
 _SAY_AGAIN_S: Final = 5.0
 
 
 class WithoutEvents(Node):
     """A node that asks for no events of the middleware, neither for its own topics nor for those that rclpy makes.
 
-    A time before 0 on `/clock`, with which rclpy would end the program, is passed over and said.
+    A time before 0 on `/clock`, with which rclpy would end the program, is ignored with a warning.
     """
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Publisher:
@@ -58,7 +57,7 @@ class WithoutEvents(Node):
 
 
 class Connections:
-    """The other ends of a node's topics; one that cannot connect is said once.
+    """The other ends of a node's topics; each that cannot connect is reported once.
 
     Parameters
     ----------
@@ -72,7 +71,7 @@ class Connections:
         self._unnamed: set[tuple[str, bytes]] = set()
 
     def publishers(self, subscription: Subscription) -> tuple[list[Any], int]:
-        """Return who publishes what a subscription can take, and how many that cannot connect are new."""
+        """Return the publishers that a subscription can receive from, and how many new ones cannot connect."""
         topic, found = subscription.topic_name, []
         kind, refused = type_name(subscription.msg_type), 0
         for publisher in self._node.get_publishers_info_by_topic(topic):
@@ -84,7 +83,7 @@ class Connections:
         return found, refused
 
     def look_for_subscribers(self, publishers: Iterable[Publisher]) -> None:
-        """Say which subscribers of the node's own topics cannot connect."""
+        """Report the subscribers that cannot connect to the node's own topics."""
         for publisher in publishers:
             topic, kind = publisher.topic_name, type_name(publisher.msg_type)
             for subscriber in self._node.get_subscriptions_info_by_topic(topic):
@@ -111,7 +110,7 @@ def type_name(message_class: Any) -> str:
 
 
 def _in_full(own: QoSProfile) -> QoSProfile:
-    """Return a profile of the node's own, as it was asked for, with what is understood as the graph has it."""
+    """Return one of the node's own profiles as requested, with its defaults resolved as in the graph."""
     return QoSProfile(
         depth=own.depth,
         reliability=own.reliability,
@@ -123,7 +122,7 @@ def _in_full(own: QoSProfile) -> QoSProfile:
 
 
 def _reason(other: Any, kind: str, offered: Any, asked: Any) -> str:
-    """Return why a publisher and a subscriber do not connect; empty: they do."""
+    """Return why a publisher and a subscriber cannot connect; empty if they can."""
     if other.topic_type != kind:
         return f"type: got {other.topic_type}, expected {kind}"
     compatibility, reason = qos_check_compatible(offered, asked)

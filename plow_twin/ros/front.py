@@ -25,7 +25,7 @@ from plow_twin.stream.topics import TOPICS
 
 
 class RosFront:
-    """Everything on the node that is made on configure and released on cleanup, with the runtime in its middle.
+    """The topics, timers and services that configure makes around the runtime, and cleanup releases.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class RosFront:
         self.follows_samples: bool = node.get_parameter("use_sim_time").value
         self.sends_motion = True
         self._changed = changed
-        #: one thread at a time has to do with the twin
+        #: one thread at a time uses the twin
         self.turns = Turns()
         self._lost: list[str] = []
         with ExitStack() as made:
@@ -66,7 +66,7 @@ class RosFront:
             self._made = made.pop_all()
 
     def _make(self, settings: Settings, prepared: Prepared, kept_wear: Mapping[str, KeptWear], made: ExitStack) -> None:
-        """Make everything on the node; what is made is noted to be undone, on an error too."""
+        """Make everything on the node; each part is registered for release, also after an error."""
         node = self._node
         self.runtime = runtime = Runtime(self, settings, prepared, kept_wear)
         made.callback(lambda: self._lost.extend(runtime.close()))
@@ -80,11 +80,27 @@ class RosFront:
         self._loop = loop = InputLoop(self.turns, self._inputs_failed)
         made.callback(loop.close)
         self.subscriptions = Subscriptions(node, runtime, self, loop, self.turns)
+        if settings.marker_rate:
+            self._draw(settings, made)
         for rate_hz, do in runtime.periodic():
             loop.every(1.0 / rate_hz, do)
         self._services = Services(runtime, self.changed)
         runtime.start()
         loop.start()
+
+    def _draw(self, settings: Settings, made: ExitStack) -> None:
+        """Publish markers; without them their messages are not imported."""
+        from plow_twin.ros.markers import Markers
+
+        markers = Markers(self._node, settings, self.runtime.scene)
+        made.callback(markers.close)
+
+        def publish() -> None:
+            newest = self.runtime.publishing.newest
+            if newest is not None:
+                markers.publish(int(newest["stamp_ns"][0]), newest[0])
+
+        self._loop.every(1.0 / settings.marker_rate, publish)
 
     def now_ns(self) -> int:
         """Return the node's time [ns]."""
@@ -95,7 +111,7 @@ class RosFront:
         self._publishers.send(topic, message)
 
     def look_for_senders(self, topic: str) -> None:
-        """Find out whether the followed publisher of an input is still there."""
+        """Check whether the followed publisher of an input still exists."""
         self.subscriptions.look_for_senders(topic)
 
     def sender_name(self, topic: str, sender: bytes) -> str:
@@ -115,7 +131,7 @@ class RosFront:
         return time_text(stamp_ns)
 
     def changed(self) -> None:
-        """Take note that the state of the stream may have changed."""
+        """Note that the state of the stream may have changed."""
         self._changed()
 
     def say_error(self, text: str) -> None:
@@ -124,11 +140,11 @@ class RosFront:
 
     @property
     def error(self) -> Exception | None:
-        """What ended the thread of the inputs, None while it runs."""
+        """The error that ended the input thread; None while it runs."""
         return self._loop.error
 
     def look_for_others(self) -> None:
-        """Find out whether somebody else publishes what this twin does."""
+        """Check whether another node publishes on this twin's topics."""
         self.runtime.others_publish = self._node.count_publishers(self.topics["contact_forces"]) > 1
 
     def activate(self) -> None:
@@ -144,14 +160,14 @@ class RosFront:
         self._loop.run_timers(False)
 
     def answer(self, name: str) -> tuple[bool, str]:
-        """Do what a service of that name is for; return whether it was done, and a text for who asked."""
+        """Execute the service of that name; return success and a text for the caller."""
         with self.turns:
             if self.runtime.waits_for_clock:
                 return False, "use_sim_time is set and nothing has come on /clock yet"
             return self._services.call(name)
 
     def close(self) -> list[str]:
-        """Release everything, last things first; return what was lost, in words."""
+        """Release everything in reverse order; return a text that names the losses."""
         self.deactivate()
         self._made.close()
         return self._lost

@@ -1,4 +1,4 @@
-"""A thread that empties the queues of inputs as messages come, and does what is due by a steady clock.
+"""A thread that empties the input queues as messages arrive, and runs timers by a steady clock.
 
 An executor of rclpy makes a task of each message, and rclpy's events executor looks at its timers only when nothing
 waits: at 10 kHz, 95 % of its tasks found a queue that the one before had emptied, and nothing was published.
@@ -16,14 +16,14 @@ from typing import Final, Protocol
 from plow_twin.live.timer import Timer
 from plow_twin.ros.input_queue import InputQueue, Taken
 
-#: Most messages taken at once: what is due, and who waits for a turn, comes in between.
+#: Largest number of messages taken at once; timers and waiting threads get their turn in between.
 _MOST: Final = 200
-#: All queues are looked at this often [s], even without a sign that something has come.
+#: Period at which all queues are polled [s], even without a notification.
 _LOOK_S: Final = 0.1
 
 
 class Turns:
-    """A lock whose users take turns: who waits is let in before the one that has just left; a user may enter again."""
+    """A fair, reentrant lock: a waiting thread enters before the thread that has just left."""
 
     def __init__(self) -> None:
         self._inside, self._next = threading.Lock(), threading.Lock()
@@ -45,14 +45,14 @@ class Turns:
 
 
 class Receiver(Protocol):
-    """Takes the messages of some topics."""
+    """Receives the messages of some topics."""
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Take in what has been in the queue of a topic."""
+        """Receive the messages that were in the queue of a topic."""
 
 
 class InputLoop:
-    """The thread of a node's inputs. All that it does it does in its turn.
+    """The thread of a node's inputs. It holds `turns` while it works.
 
     Parameters
     ----------
@@ -64,36 +64,36 @@ class InputLoop:
 
     def __init__(self, turns: Turns, on_error: Callable[[Exception], None]) -> None:
         self._turns, self._on_error = turns, on_error
-        #: by file descriptor, each with its receiver and its topic
+        #: queue, receiver and topic by file descriptor
         self._queues: dict[int, tuple[InputQueue, Receiver, str]] = {}
         #: the first one always runs
         self._timers = [Timer(_LOOK_S, self._look_at_all)]
         self._active = self._stopped = False
-        #: when the next one is due
+        #: time at which the next timer is due
         self._due = 0.0
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._signs = [self._wake]
         self._thread = threading.Thread(target=self._run, name="plow_twin_inputs", daemon=True)
-        #: what ended the thread; None: it runs, or has been stopped
+        #: the error that ended the thread; None while it runs and after `stop`
         self.error: Exception | None = None
 
     def add(self, queue: InputQueue, receiver: Receiver, topic: str) -> None:
-        """Give what comes in the queue of a topic to its receiver from now on, and close the queue at the end."""
+        """Pass the messages in the queue of a topic to its receiver from now on, and close the queue at the end."""
         with self._turns:
             self._queues[queue.fd] = queue, receiver, topic
             self._signs.append(queue.fd)
         self._look_again()
 
     def every(self, period_s: float, do: Callable[[], float | None]) -> None:
-        """Do something, as `Timer`, each `period_s` while the timers run; before the start."""
+        """Call a function each `period_s` while the timers run; to be called before the start."""
         self._timers.append(Timer(period_s, do))
 
     def start(self) -> None:
-        """Start the thread; the timers stand still."""
+        """Start the thread with its timers stopped."""
         self._thread.start()
 
     def run_timers(self, active: bool) -> None:
-        """Let the timers run, beginning anew, or stand still."""
+        """Restart the timers, or stop them."""
         with self._turns:
             for timer in self._timers:
                 timer.restart()
@@ -101,7 +101,7 @@ class InputLoop:
         self._look_again()
 
     def close(self) -> None:
-        """End the thread and close the queues; not in a turn."""
+        """End the thread and close the queues; the caller must not hold the lock."""
         self._stopped = True
         self._look_again()
         if self._thread.is_alive():
@@ -112,7 +112,7 @@ class InputLoop:
         os.close(self._wake)
 
     def flush(self) -> None:
-        """Hand over what waits in the queues now."""
+        """Pass on the messages that are in the queues now."""
         with self._turns:
             for fd in self._queues:
                 while self._receive(fd, all_there_are=True):
@@ -136,12 +136,12 @@ class InputLoop:
                     left = [fd for fd in ready if self._receive(fd)]
                     if time.monotonic() >= self._due:
                         self._look_at_timers()
-        except Exception as error:  # a thread that ended unseen would be a twin that stands still
+        except Exception as error:  # a thread that ended unnoticed would stop the twin
             self.error = error
             self._on_error(error)
 
     def _receive(self, fd: int, *, all_there_are: bool = False) -> bool:
-        """Take what waits in a queue; True when there is more."""
+        """Take messages from a queue; return True if more are waiting."""
         queue, receiver, topic = self._queues[fd]
         batch, more = queue.take(_MOST, all_there_are=all_there_are)
         if batch:

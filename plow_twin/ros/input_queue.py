@@ -1,7 +1,7 @@
-"""The queue of one input, emptied in one go, each message with the publisher it came from and its number there.
+"""The queue of one input, emptied at once; each message has its publisher and the publisher's sequence number.
 
-The C interface below rclpy tells it, and writes to an eventfd when something has come: that needs neither executor nor
-interpreter. Of rclpy's own it touches `Node._subscriptions`, so that no executor takes from the queue as well.
+The C interface below rclpy gives both, and signals new messages through an eventfd, which needs neither executor nor
+interpreter. The subscription is removed from `Node._subscriptions`, so that no executor takes from the queue as well.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _FIRST_CAPACITY: Final = 1024
 
 
 class Taken(NamedTuple):
-    """One message: publisher, its number there (from 1), time of reception [ns], CDR bytes, time of sending [ns]."""
+    """One message: publisher, sequence number (from 1), time of reception [ns], CDR bytes, time of sending [ns]."""
 
     sender: bytes
     number: int
@@ -31,7 +31,7 @@ class Taken(NamedTuple):
 
 
 class _Info(ctypes.Structure):
-    """`rmw_message_info_t`, with room behind for the longer ones of other versions."""
+    """`rmw_message_info_t`, with spare room at the end because other versions have more fields."""
 
     _fields_ = [
         ("source_ns", ctypes.c_int64),
@@ -44,9 +44,9 @@ class _Info(ctypes.Structure):
     ]
 
 
-#: Of `_Info`: times of sending and of reception, number, publisher; of `SerializedMessage`: where it is, and length.
+#: `_Info`: times of sending and reception, sequence number, publisher; `SerializedMessage`: address, length.
 _INFO, _PLACE = struct.Struct("=qqQ16x16s"), struct.Struct("=QQ")
-#: What rcl answers when the queue is empty.
+#: Return code of rcl for an empty queue.
 _NOTHING_TAKEN: Final = 401
 
 
@@ -54,8 +54,8 @@ _NOTHING_TAKEN: Final = 401
 def _count_up() -> ctypes.c_void_p:
     """Return `eventfd_write(fd, count)` as a callback of rcl.
 
-    rcl calls it with what it was given, here the number of the eventfd, and the number of new messages: each in the
-    register where the function expects it.
+    rcl passes the user data, here the number of the eventfd, and the number of new messages: the arguments of
+    `eventfd_write` in their order.
     """
     return ctypes.cast(ctypes.CDLL(None).eventfd_write, ctypes.c_void_p)
 
@@ -70,19 +70,19 @@ def _new_buffer() -> SerializedMessage:
 
 
 class InputQueue:
-    """Take a subscription out of the executor's hands, and tell by a file descriptor that something has arrived.
+    """Take a subscription away from the executor, and signal arrivals by a file descriptor.
 
     Parameters
     ----------
     node
-        The node that the subscription was made on; made in the thread of its executor, as the subscription.
+        The node of the subscription. Both must be made in the thread of its executor.
     subscription
         The subscription; its own callback is never called.
 
     Attributes
     ----------
     fd : int
-        Can be read once something has arrived.
+        Becomes readable when a message has arrived.
     """
 
     def __init__(self, node: Node, subscription: Subscription) -> None:
@@ -93,30 +93,30 @@ class InputQueue:
         self._places = ctypes.byref(self._buffer), ctypes.byref(self._info)
         self._signs = 0
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        # no executor shall take from it as well
+        # the executor must not take from it as well
         node._subscriptions.remove(subscription)
         with subscription.handle:
             self._listen(subscription.handle.pointer, _count_up(), self.fd)
 
     def take(self, most: int, *, all_there_are: bool = False) -> tuple[list[Taken], bool]:
-        """Return what waits now in order of arrival, up to `most` messages, and whether there are more.
+        """Return up to `most` waiting messages in order of arrival, and whether there are more.
 
-        As many are asked for as signs have come, or `most` where `all_there_are` says so: to ask in vain takes a fifth
-        of a sample's time.
+        It takes as many messages as were signalled, or `most` with `all_there_are`: a take from an empty queue costs a
+        fifth of a sample's time.
         """
         try:
             signs = os.eventfd_read(self.fd)
-        except BlockingIOError:  # asked without a sign
+        except BlockingIOError:  # polled without a notification
             signs = 0
         self._signs += signs
         wanted = most if all_there_are else min(most, self._signs)
         taken = self._taken(wanted)
-        # where the queue has overrun there were more signs than messages
+        # after an overrun of the queue there were more notifications than messages
         self._signs = max(0, self._signs - len(taken)) if len(taken) == wanted else 0
         return taken, self._signs > 0 or (all_there_are and len(taken) == most)
 
     def close(self) -> None:
-        """Take the subscription off the node."""
+        """Remove the subscription from the node."""
         with self._subscription.handle:
             self._listen(self._subscription.handle.pointer, None, None)
         os.close(self.fd)

@@ -18,7 +18,7 @@ _SPIN_S: Final = 0.1
 
 
 def make_executor() -> Executor:
-    """Return the events executor where rclpy has it: a third of the work per message."""
+    """Return the events executor where rclpy has it: it does a third of the work per message."""
     try:
         from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
@@ -73,7 +73,7 @@ def _run(arguments: Sequence[str] | None, stop: StopSignals) -> int:
         while not stop.stopped and rclpy.utilities.ok():
             if starting and node.prepared:
                 starting = False
-                if node.lifecycle == "unconfigured":  # a manager may have been quicker
+                if node.lifecycle == "unconfigured":  # a lifecycle manager may have been quicker
                     node.start()
             executor.spin_once(timeout_sec=_SPIN_S)
         executor.remove_node(node)

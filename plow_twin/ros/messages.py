@@ -1,4 +1,4 @@
-"""Between ROS messages and plain numbers."""
+"""Conversion between ROS messages and plain numbers."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from std_msgs.msg import Header
 from plow_twin.record import messages as plain
 from plow_twin.stream.intake import NS_PER_S
 
-#: Stamp [ns] and numbers of a message, whether they are a load, and whether one outside the plane is not zero.
+#: Stamp [ns] and numbers of a message, whether they are a load, and whether an out-of-plane component is not zero.
 Read = tuple[int, tuple[float, ...], bool, bool]
-#: What cannot be read at all.
+#: A message that cannot be read.
 UNREADABLE: Final[Read] = (0, (), False, False)
 
 _QUANTITIES: Final = ("position", "velocity", "effort")
@@ -33,7 +33,7 @@ def stamp_ns(header: Header) -> int:
 def deviations(covariance: Sequence[float]) -> tuple[float, ...]:
     """Return the standard deviations of x, y [m] and theta [rad] of a covariance, row-major 6 x 6.
 
-    NaN where a variance is negative: such a message is not used. Empty where all are 0, which says that none is known.
+    NaN if a variance is negative: such a message is not used. Empty if all are 0, which means unknown.
     """
     variances = [float(covariance[7 * axis]) for axis in (0, 1, 5)]
     found = tuple(math.sqrt(variance) if variance >= 0.0 else math.nan for variance in variances)
@@ -46,7 +46,7 @@ def set_stamp(header: Header, stamp: int) -> None:
 
 
 def read_wrench(data: bytes) -> Read:
-    """Return what the CDR bytes of a `WrenchStamped` hold: Fx, Fy [N] and M [N m].
+    """Decode the CDR bytes of a `WrenchStamped`: Fx, Fy [N] and M [N m].
 
     One sample costs a tenth of what rclpy's own message objects cost.
     """

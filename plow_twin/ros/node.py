@@ -33,7 +33,7 @@ from plow_twin.ros.messages import ros_status
 from plow_twin.ros.parameter_server import ParameterServer
 from plow_twin.ros.qos import DIAGNOSTICS, OUTPUTS
 
-#: Reports between two times that a lasting trouble is logged.
+#: Reports between two log lines about a lasting problem.
 _SAY_AGAIN: Final = 5
 
 
@@ -41,8 +41,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
     """The twin on ROS 2.
 
     Takes the keyword arguments of `rclpy.node.Node`, so that several can live in one process and executor. Code that
-    makes one calls `start` for what the parameter `autostart` does in the program. `stop_asked` is looked at while the
-    solver is compiled.
+    creates one calls `start` to do as `autostart` does in the program. `stop_asked` is polled while the solver is
+    compiled.
 
     Raises
     ------
@@ -60,7 +60,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self.lifecycle = "unconfigured"
         #: why the last configure failed
         self.reason = ""
-        #: wear of the scenes that have been configured: cleanup does not lose them
+        #: wear of the scenes configured so far, which cleanup does not lose
         self._kept_wear: dict[str, KeptWear] = {}
         self._preparation: Preparation | None = None
         self._health = diagnostics.Health()
@@ -71,9 +71,9 @@ class TwinNode(WithoutEvents, LifecycleNode):
         self._status = self.create_publisher(DiagnosticStatus, "status", OUTPUTS["status"])
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS)
         for name in SERVICES:
-            # for good: a request that waits when its service is destroyed ends rclpy's executor
+            # never destroyed: a request that waits while its service is destroyed ends rclpy's executor
             self.create_service(Trigger, f"~/{name}", partial(self._answer, name))
-        # steady: reports go on when /clock is paused
+        # steady clock: reports continue while /clock is paused
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._publish_diagnostics, clock=steady)
         self.create_timer(LOOK_S, self._look_for_publishers, clock=steady)
@@ -88,11 +88,11 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     @property
     def autostart(self) -> bool:
-        """Whether the program shall configure and activate the node."""
+        """Whether the program should configure and activate the node."""
         return self._table.settings.autostart
 
     def prepare(self) -> None:
-        """Begin to compile the solver for the present parameters in a thread, unless that has been done already."""
+        """Start a thread that compiles the solver for the present parameters, unless it is compiled already."""
         settings = self._table.settings
         if self.runtime is None and (self._preparation is None or self._preparation.key != key(settings)):
             self.get_logger().info(f"scene {settings.scene}: preparing the solver (the first time it is compiled)")
@@ -100,7 +100,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
 
     @property
     def prepared(self) -> bool:
-        """Whether configuring does not have to wait for the compiler."""
+        """Whether configuring need not wait for the compiler."""
         return self._preparation is None or self._preparation.done
 
     def _take_preparation(self) -> Preparation:
@@ -109,7 +109,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return preparation
 
     def start(self) -> bool:
-        """Configure and activate; False when one of them failed (the reason is in log, status and diagnostics)."""
+        """Configure and activate; return False if either fails (log, status and diagnostics give the reason)."""
         done = TransitionCallbackReturn.SUCCESS
         return self.trigger_configure() == done and self.trigger_activate() == done
 
@@ -134,7 +134,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Take samples from now on."""
         super().on_activate(state)
-        # what lives now lives long: the collector need not walk it while samples arrive
+        # objects alive now live long: the garbage collector need not visit them while samples arrive
         gc.collect()
         gc.freeze()
         self._configured().activate()
@@ -153,7 +153,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return self._entered("unconfigured")
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As cleanup, for good."""
+        """Release everything, as cleanup does."""
         self.release()
         return self._entered("finalized")
 
@@ -163,8 +163,8 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return self._entered("unconfigured")
 
     def release(self) -> None:
-        """Give back everything and close the recording; can be called at any time."""
-        # a frozen runtime, being part of cycles, would never be given back
+        """Release everything and close the recording; can be called at any time."""
+        # a frozen runtime is part of reference cycles and would never be freed
         gc.unfreeze()
         front, self._front = self._front, None
         if front is None:
@@ -195,7 +195,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def _turn(self) -> AbstractContextManager[None]:
-        """Return what keeps the thread of the inputs away from the runtime meanwhile."""
+        """Return the lock that keeps the input thread away from the runtime."""
         return nullcontext() if self._front is None else self._front.turns
 
     def _refusals(self, settings: Settings) -> list[str]:
@@ -244,7 +244,7 @@ class TwinNode(WithoutEvents, LifecycleNode):
     def _publish_diagnostics(self) -> None:
         if self._front is not None:
             if self._front.error is not None:
-                raise self._front.error  # as from any callback: the program ends, and says why
+                raise self._front.error  # as from any callback: the program ends with the reason
             self._connections.look_for_subscribers(self.publishers)
             self._front.look_for_others()
         elif self.lifecycle == "unconfigured" and not self.reason:

@@ -36,19 +36,19 @@ def descriptor(spec: Field[Any]) -> ParameterDescriptor:
 class ParameterServer:
     """Declare all parameters on a node and hold their current values in `settings`.
 
-    The node must have been made with `automatically_declare_parameters_from_overrides=True`: what the user gave is then
-    seen before any type check, so that an integer can be taken for a double and all bad values be named together.
+    The node must have `automatically_declare_parameters_from_overrides=True`: the given values are then seen before any
+    type check, so that an integer can stand for a double and one message can name all bad values.
 
     Parameters
     ----------
     node
         The node.
     unconfigured
-        Tells whether parameters that take effect on configure can be changed now.
+        Returns whether parameters that take effect on configure can be changed now.
     changed
         Called with name and value of each parameter that has changed at run time and takes effect at once.
     refusals
-        Returns why settings cannot be taken now, each of whose values alone could.
+        Returns why a combination of valid values cannot be accepted now.
 
     Raises
     ------
@@ -83,7 +83,7 @@ class ParameterServer:
         node.add_post_set_parameters_callback(self._after)
 
     def _before(self, asked: list[Parameter]) -> list[Parameter]:
-        """Take integers for doubles, and name all bad values in one message: rclpy's own checks stop at the first."""
+        """Convert integers to doubles, and name all bad values in one message: rclpy's own checks stop at the first."""
         found = parameters.problems({parameter.name: parameter.value for parameter in asked})
         if found:
             self._node.get_logger().warning(str(parameters.ParameterError(found, "parameters refused")))
@@ -98,7 +98,7 @@ class ParameterServer:
         values = {parameter.name: parameter.value for parameter in asked}
         reasons = [str(problem) for problem in parameters.problems(values)]
         if not self._unconfigured():
-            # the same value again, as a file of all parameters holds, changes nothing
+            # an unchanged value, as in a file of all parameters, has no effect
             reasons += [
                 f"{name}: takes effect {Effect.CONFIGURE.value}"
                 for name, value in values.items()

@@ -1,4 +1,4 @@
-"""The outputs on ROS topics: the same bytes that a recording holds."""
+"""The outputs on ROS topics, with the same bytes as in a recording."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class OutputPublishers:
     without
         Base names of outputs that are not published here.
     memory
-        What holds the bytes of the messages that are sent often, by base name of their topic.
+        Buffers of the messages that are sent often, by base name of their topic.
     """
 
     def __init__(self, node: Node, without: Collection[str], memory: Mapping[str, memoryview]) -> None:
@@ -43,14 +43,14 @@ class OutputPublishers:
         self._senders = {topic: Sender(self._publishers[topic], data) for topic, data in memory.items()}
 
     def send(self, topic: str, message: memoryview | Message) -> None:
-        """Send a message, or its bytes in the memory of its topic."""
+        """Send a message, or the bytes in the buffer of its topic."""
         if isinstance(message, memoryview):
             self._senders[topic].send()
         else:
             self._publishers[topic].publish(encode(message))
 
     def close(self) -> None:
-        """Take the publishers off the node."""
+        """Remove the publishers from the node."""
         self._senders.clear()
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)

@@ -1,4 +1,4 @@
-"""Quality of service of the topics: of the outputs from their table, of the inputs to be overridden by parameters."""
+"""Quality of service: of the outputs from their table, of the inputs with overrides by parameters."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from plow_twin.stream.topics import TOPICS, Topic
 
-#: What the user may override by parameters `qos_overrides.<topic>.subscription.<policy>`.
+#: Policies that parameters `qos_overrides.<topic>.subscription.<policy>` may override.
 OVERRIDABLE: Final = QoSOverridingOptions(
     policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 )
 
 
 def sensor_input(depth: int) -> QoSProfile:
-    """Connect to reliable and best-effort senders alike, with room for a burst."""
+    """Return a profile that connects to reliable and best-effort publishers, with room for a burst."""
     return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
@@ -30,6 +30,6 @@ def offered(topic: Topic) -> QoSProfile:
     )
 
 
-#: Of each output by its base name.
+#: Profile of each output by its base name.
 OUTPUTS: Final = {topic.name: offered(topic) for topic in TOPICS}
 DIAGNOSTICS: Final = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE)

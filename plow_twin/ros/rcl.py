@@ -1,6 +1,6 @@
-"""The C interface below rclpy, a public and stable one, for what is done with each sample: serialised messages.
+"""The public, stable C interface below rclpy, for serialised messages: the work done for each sample.
 
-rclpy hands messages over one by one, without the publisher's identity, and looks at the type of each one sent.
+rclpy delivers messages one by one, without the publisher's identity, and checks the type of each one it sends.
 """
 
 from __future__ import annotations
@@ -44,21 +44,21 @@ def libraries() -> tuple[ctypes.CDLL, ctypes.CDLL]:
 
 @cache
 def _publish() -> Any:
-    # with the interpreter's lock, as rclpy: to give it up and wait for it takes longer than to send
+    # keeps the interpreter's lock, as rclpy does: releasing and taking it again takes longer than sending
     publish = ctypes.PyDLL("librcl.so").rcl_publish_serialized_message
     publish.argtypes = [ctypes.c_void_p] * 3
     return publish
 
 
 class Sender:
-    """Send the same bytes, whatever stands in them, on a topic again and again.
+    """Sends the present content of a fixed buffer on a topic.
 
     Parameters
     ----------
     publisher
-        A publisher of rclpy; nothing is sent any more once it has been destroyed.
+        A publisher of rclpy; nothing is sent once it is destroyed.
     data
-        Contiguous bytes that can be written to: a CDR message.
+        Contiguous writable bytes: a CDR message.
     """
 
     def __init__(self, publisher: Any, data: memoryview) -> None:
@@ -70,4 +70,4 @@ class Sender:
     def send(self) -> None:
         """Send the bytes as they are now."""
         if self._publish(*self._arguments):
-            self._publisher.publish(bytes(self._data))  # which says what is wrong
+            self._publisher.publish(bytes(self._data))  # raises with the reason

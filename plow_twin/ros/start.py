@@ -1,4 +1,4 @@
-"""The start of the programs on ROS 2."""
+"""Start of the ROS 2 programs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from plow_twin.errors import PlowTwinError
 
 
 class RosArgumentsError(PlowTwinError):
-    """What stands behind `--ros-args` cannot be used, or names a file that cannot."""
+    """The arguments after `--ros-args`, or a file that they name, cannot be used."""
 
 
 def start_ros(arguments: Sequence[str] | None) -> None:
@@ -50,7 +50,7 @@ def without_ros(arguments: Sequence[str]) -> list[str]:
 
 @contextmanager
 def _said_plainly() -> Iterator[None]:
-    """Turn what rclpy raises for arguments into an error without the places in rcl's sources."""
+    """Turn rclpy's exception about arguments into an error without locations in rcl's sources."""
     try:
         yield
     except RuntimeError as error:

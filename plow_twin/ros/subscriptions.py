@@ -27,9 +27,9 @@ from plow_twin.stream.intake import Intake, Verdict
 
 #: Depth of the optional inputs' queues.
 _SLOW_DEPTH: Final = 200
-#: Publishers whose numbers are remembered; the oldest is forgotten.
+#: Number of publishers whose sequence numbers are remembered; the oldest is forgotten.
 _MOST_PUBLISHERS: Final = 256
-#: By so many samples a publisher's rate is known.
+#: Samples from which a publisher's rate is estimated.
 _RATE_KNOWN: Final = 20
 _PAIR_NUMBERS: Final = {name: number for number, name in enumerate(PAIR_NAMES)}
 
@@ -62,7 +62,7 @@ class Subscriptions:
         #: number of the next message, by topic and publisher
         self._following: dict[tuple[str, bytes], int] = {}
         self._since_ns = time.time_ns()  # when the excitation was subscribed to
-        #: publishers of it that were not known to be there then: first message, and losses counted before it
+        #: publishers of the excitation unknown at that time: first message, and losses counted before it
         self._appeared: dict[bytes, tuple[Taken, int]] = {}
         self._before: frozenset[bytes] = frozenset()
         self._pose = PoseWithCovarianceStamped if runtime.poses_have_covariance else PoseStamped
@@ -73,7 +73,7 @@ class Subscriptions:
         self._subscribe(JointState, "gaps", _SLOW_DEPTH)
 
     def look(self) -> None:
-        """Look who publishes the inputs; not in a turn, which the samples would have to wait for."""
+        """Look up the publishers of the inputs; called without the lock, because samples would have to wait."""
         found = {topic: self._connections.publishers(taken) for topic, taken in self._taken_from.items()}
         present = {topic: self._noted(topic, publishers) for topic, (publishers, _) in found.items()}
         refused = sum(count for _, count in found.values())
@@ -84,22 +84,22 @@ class Subscriptions:
             self._inputs.refused_publishers += refused
             self._inputs.publishers |= {topic: len(publishers) for topic, publishers in present.items()}
             for topic in present:
-                self.look_for_senders(topic)  # anew: messages may have been taken since
+                self.look_for_senders(topic)  # again: messages may have been taken since
         self._front.changed()
 
     def look_for_senders(self, topic: str) -> None:
-        """Find out whether the followed publisher of an input is still there."""
+        """Check whether the followed publisher of an input still exists."""
         if topic == self._source:
             self._inputs.senders.alive(self._present(topic))
         elif topic in self._inputs.optional:
             self._inputs.optional[topic].alive(self._present(topic))
 
     def _present(self, topic: str) -> list[bytes]:
-        """Return the publishers of an input that there are."""
+        """Return the present publishers of an input."""
         return self._noted(topic, self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic)))
 
     def _noted(self, topic: str, publishers: list[Any]) -> list[bytes]:
-        """Return the identities of publishers, and take note of their names."""
+        """Return the identities of publishers, and remember their names."""
         present = [bytes(publisher.endpoint_gid) for publisher in publishers]
         for gid, publisher in zip(present, publishers, strict=True):
             space = publisher.node_namespace.rstrip("/")
@@ -109,7 +109,7 @@ class Subscriptions:
         return present
 
     def name_of(self, topic: str, sender: bytes) -> str:
-        """Return node and identity of a publisher; of one that has gone unseen the identity alone."""
+        """Return node and identity of a publisher; the identity alone if it vanished before it was looked up."""
         if (topic, sender) not in self._names:
             self._present(topic)
         return self._names.get((topic, sender), sender.hex())
@@ -118,7 +118,7 @@ class Subscriptions:
         subscription = self._node.create_subscription(
             kind,
             topic,
-            lambda message: None,  # never called: the queue below gives the messages, with their publishers
+            lambda message: None,  # never called: the input queue delivers the messages with their publishers
             sensor_input(depth),
             qos_overriding_options=OVERRIDABLE,
             raw=True,
@@ -130,7 +130,7 @@ class Subscriptions:
         self._loop.add(InputQueue(self._node, subscription), self, topic)
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Take in what has been in the queue of an input: the way of every message.
+        """Receive the messages that were in the queue of an input; every message comes this way.
 
         Gaps in the publishers' numbers are counted first.
         """
@@ -168,10 +168,10 @@ class Subscriptions:
             self._not_selected(topic, batch)
 
     def _count_before_first(self, batch: list[Taken]) -> None:
-        """Count what publishers sent before the first sample heard, if they began after the subscription.
+        """Count messages sent before the first one received, by publishers that began after the subscription.
 
-        Discovery takes its time: one that is new to the node may have been sending for long. The rate at which it goes
-        on tells whether it began before.
+        Discovery takes time: a publisher that is new to the node may have been sending for long. Its rate shows
+        whether it began before the subscription.
         """
         newest = {message.sender: message for message in batch}
         for sender, (first, counted) in list(self._appeared.items()):
@@ -187,7 +187,7 @@ class Subscriptions:
                 del self._appeared[sender]
 
     def _samples(self, topic: str, batch: list[Taken]) -> None:
-        """Take in what has been in the queue of the selected source."""
+        """Receive the messages that were in the queue of the selected source."""
         inputs = self._inputs
         inputs.waited(len(batch), (time.time_ns() - batch[0].received_ns) * 1e-9)
         arrived: list[Arrival] = []
@@ -196,7 +196,7 @@ class Subscriptions:
             stamp, values, fits, out_of_plane = self._read(topic, message.data)
             wanted = inputs.wanted(message.sender, message.number, stamp, values, fits)
             if inputs.senders.followed != followed:
-                # those before were another publisher's
+                # earlier messages came from another publisher
                 self._step(arrived)
                 arrived, followed = [], inputs.senders.followed
             if wanted:
@@ -206,7 +206,7 @@ class Subscriptions:
         self._step(arrived)
 
     def _step(self, arrived: list[Arrival]) -> None:
-        """Let the twin take samples, and send what follows."""
+        """Step the twin by the samples, and send the resulting messages."""
         if arrived:
             for topic, message in self._runtime.step(arrived):
                 self._front.send(topic, message)
@@ -218,7 +218,7 @@ class Subscriptions:
             self._intake.refuse(Verdict.NOT_SELECTED, stamp, values)
 
     def _read(self, topic: str, data: bytes) -> Read:
-        """Return what the bytes of a load hold."""
+        """Decode the bytes of a load."""
         return read_wrench(data) if topic == "excitation" else self._read_tool_forces(data)
 
     def _read_tool_forces(self, data: bytes) -> Read:
@@ -247,7 +247,7 @@ class Subscriptions:
             with_covariance = self._pose is PoseWithCovarianceStamped
             pose = message.pose.pose if with_covariance else message.pose
             turn, stamp = pose.orientation, stamp_ns(message.header)
-            if turn.z == turn.w == 0.0:  # no turn about z: never filled in, or upside down
+            if turn.z == turn.w == 0.0:  # no rotation about z: never filled in, or upside down
                 self._inputs.head_pose.refuse(Verdict.MALFORMED, stamp, (pose.position.x, pose.position.y))
                 continue
             theta = 2.0 * math.atan2(turn.z, turn.w)
@@ -255,7 +255,7 @@ class Subscriptions:
             self._runtime.take_pose(stamp, (pose.position.x, pose.position.y, theta), deviation)
 
     def _messages(self, topic: str, kind: type, intake: Intake, batch: list[Taken]) -> Iterator[Any]:
-        """Yield the messages of an input besides the load; what cannot be read is counted."""
+        """Yield the messages of an input other than the load; unreadable ones are counted."""
         for taken in batch:
             self._inputs.arriving = (topic, taken.sender)
             message = _message(taken.data, kind)
@@ -266,7 +266,7 @@ class Subscriptions:
 
 
 def _message(data: bytes, kind: type) -> Any | None:
-    """Return the message that CDR bytes hold, or None."""
+    """Decode CDR bytes into a message; None if they cannot be read."""
     try:
         return deserialize_message(data, kind)
     except (RuntimeError, UnicodeDecodeError):

@@ -1,4 +1,4 @@
-"""`plow-twin record`: any topics as the bytes that came, with their types' texts, beside a run of the twin."""
+"""`plow-twin record`: the received bytes of any topics, with their message definitions, beside a run of the twin."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _FLUSH_S: Final = 1.0
 
 
 class _Quality(NamedTuple):
-    """What of a quality of service decides who hears whom."""
+    """The policies that decide whether a publisher and a subscriber connect."""
 
     reliable: bool
     latched: bool
@@ -62,20 +62,20 @@ class TopicRecorder:
     writer
         Takes the messages.
     wanted
-        Asked for each topic that there is.
+        Returns whether a topic is to be recorded.
     """
 
     def __init__(self, node: Node, writer: BagWriter, wanted: Callable[[str], bool]) -> None:
         self._node, self._writer, self._wanted = node, writer, wanted
         #: by topic: its type, its number in the file, and the qualities of service that are subscribed to
         self._topics: dict[str, tuple[str, int, set[_Quality]]] = {}
-        #: of the publishers that are known, which subscription their messages are taken from
+        #: for each known publisher, the subscription that takes its messages
         self._taken_as: dict[tuple[str, bytes], _Quality] = {}
         self._turns = Turns()
         self._loop = InputLoop(self._turns, lambda error: None)
-        #: why a topic is not recorded
+        #: reason by topic that is not recorded
         self.skipped: dict[str, str] = {}
-        #: messages that publishers sent and that never came, by their own numbering
+        #: messages sent but never received, by the publishers' sequence numbers
         self.missed: dict[str, int] = {}
         self._newest: dict[tuple[str, bytes], int] = {}
         self._loop.every(_FLUSH_S, writer.flush)
@@ -85,11 +85,11 @@ class TopicRecorder:
 
     @property
     def topics(self) -> list[str]:
-        """What is recorded."""
+        """The recorded topics."""
         return sorted(self._topics)
 
     def look(self) -> None:
-        """Subscribe to what has appeared."""
+        """Subscribe to new topics."""
         if self._loop.error is not None:
             raise self._loop.error
         for name, types in self._node.get_topic_names_and_types():
@@ -101,7 +101,7 @@ class TopicRecorder:
                     self.skipped[name] = f"{', '.join(types)}: {error}"
 
     def _subscribe(self, name: str, types: Sequence[str], publishers: Sequence[Any]) -> None:
-        """Subscribe to each quality of service that publishers of a topic offer, as they come."""
+        """Subscribe with each quality of service that publishers of a topic offer, as they appear."""
         if name not in self._topics:
             if len(types) != 1:
                 raise LookupError("expected one type")
@@ -156,7 +156,7 @@ class TopicRecorder:
             self._writer.add(number, message.number, received_ns, message.sent_ns or received_ns, message.data)
 
     def close(self) -> None:
-        """Take what still waits, and end the subscriptions."""
+        """Take the waiting messages, and end the subscriptions."""
         self._loop.flush()
         self._loop.close()
 
@@ -169,7 +169,7 @@ class _Subscription(NamedTuple):
     number: int
 
     def receive(self, topic: str, batch: list[Taken]) -> None:
-        """Take in what has been in the queue."""
+        """Receive the messages that were in the queue."""
         self.recorder.take(topic, self.quality, self.number, batch)
 
 
@@ -184,18 +184,18 @@ def record_topics(
     on_started: Callable[[Path], object] = lambda folder: None,
     on_trouble: Callable[[str], object] = lambda text: None,
 ) -> Mapping[str, Any]:
-    """Record topics to a new folder until `stopped`; return what was written, lost and skipped by topic.
+    """Record topics to a new folder until `stopped`; return the counts written, lost and skipped by topic.
 
-    `complete` is whether nothing was lost and all that was asked for by name has been recorded.
+    `complete` is True if nothing was lost and every topic requested by name was recorded.
 
     Parameters
     ----------
     folder
-        Made for the recording; `<folder>_2`, ... when it holds something already.
+        Created for the recording; `<folder>_2`, ... if it exists and is not empty.
     topics
-        Names, without a namespace those of the root.
+        Names, in the root namespace unless they have their own.
     every
-        Take all topics but hidden ones, those in `but`, and those that match `exclude`.
+        Record all topics except hidden ones, those in `but`, and those that match `exclude`.
     """
     named = {name if name.startswith("/") else f"/{name}" for name in topics}
     left_out = {*but, "/parameter_events"}
