@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from figure_checks import check_figure, kept_figures
 from record_support import paper_sample, record_run
 from scenes import ROOT, preset
 
@@ -130,7 +131,7 @@ def test_known_parameters_are_recovered_from_published_figures() -> None:
 
 
 def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rec = recording(2.0)
     np.savetxt(tmp_path / "run.csv", np.column_stack([rec.t, rec.q]), delimiter=",", header="t,x,y,theta", comments="")
@@ -150,7 +151,13 @@ def test_the_command_fits_a_recording_and_marks_the_fitted_numbers(
     for path in ("contact.damping", "loads.fy.phase_rad", "clearance.horizontal_m"):
         arguments += ["--set", f"{path}={TRUTH[path]}"]
     arguments += ["--unknown", RANGES[0], "--unknown", RANGES[4], "--screen", "40", "--population", "10"]
-    assert run([*arguments, "--out", str(tmp_path / "fit")]) == 0
+    figures = kept_figures(monkeypatch)
+    assert run([*arguments, "--out", str(tmp_path / "fit"), "--plot", str(tmp_path / "fit.png")]) == 0
+    check_figure(figures[0])
+    pose, residual = figures[0].axes[:2]
+    np.testing.assert_allclose(pose.lines[0].get_ydata(), 1e3 * rec.q[:, 0])
+    assert np.abs(residual.lines[0].get_ydata()).max() < 1e-6  # mm: the recording is exact
+    assert figures[0].axes[-1].get_yticklabels()[0].get_text() == "contact stiffness [MN/mⁿ]"
     assert "singular values" in capsys.readouterr().out
     fit = load_scene(tmp_path / "fit" / "fit.yaml")
     assert fit.contact.stiffness == pytest.approx(TRUTH["contact.stiffness"], rel=1e-6)

@@ -15,6 +15,7 @@ from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
 from plow_twin.cli.app import run as cli
 from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.messages import JointState
+from plow_twin.record.recording import read_recording
 from plow_twin.stream.journal import Parameter, Sample
 from plow_twin.study.comparison.change import change
 from plow_twin.study.comparison.compare import by_time
@@ -35,7 +36,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
 
 
 def test_windows_hold_the_recorded_numbers(runs: tuple[Run, Run]) -> None:
-    windows = windows_of(runs[0].folder, 1.0)
+    windows = windows_of(read_recording(runs[0].folder), 1.0)
     assert len(windows.start_ns) == SECONDS and (windows.start_ns % 10**9 == 0).all()
     peaks = [m for topic, m in runs[0].outputs if topic == "/contact_peaks" and isinstance(m, JointState)]
     forces = [m for topic, m in runs[0].outputs if topic == "/contact_forces" and isinstance(m, JointState)]
@@ -58,7 +59,7 @@ def test_windows_hold_the_recorded_numbers(runs: tuple[Run, Run]) -> None:
 
 
 def test_the_window_is_the_period_of_the_load(runs: tuple[Run, Run]) -> None:
-    starts = windows_of(runs[0].folder).start_ns
+    starts = windows_of(read_recording(runs[0].folder)).start_ns
     assert np.diff(starts)[0] * 1e-9 == pytest.approx(np.pi, rel=0.3)  # 2 rad/s, seen for two and a half periods
 
 

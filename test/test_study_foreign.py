@@ -10,12 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_support import MAP, PAPER, STORE, wrench_message
+from bag_support import MAP, PAPER, STORE, motion, wrench_message, write_bag
+from figure_checks import kept_figures
 from mcap.writer import Writer
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 
+from plow_twin.cli.app import run as run_cli
 from plow_twin.errors import RecordingError
 from plow_twin.record.doctor import examine, repair
 from plow_twin.record.measured import read_measured, read_recording
@@ -297,3 +299,23 @@ def test_of_a_bag_with_a_damaged_or_missing_part_the_others_are_used(kind: Stora
         part.write_bytes(b"no recording at all")
     with pytest.raises(RecordingError, match=str(tmp_path / "bag")):
         analyse(tmp_path / "bag", scene=PAPER)
+
+
+def test_a_bag_of_another_program_is_drawn_by_its_mapping(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bag(tmp_path / "bag", tuple(part[:400] for part in motion()), StoragePlugin.SQLITE3)
+    figures = kept_figures(monkeypatch)
+    arguments = ["view", str(tmp_path / "bag"), "--map", str(tmp_path / "map.yaml"), "--scene", "paper", "--quiet"]
+    assert run_cli([*arguments, "--png", str(tmp_path / "bag.png")]) == 0
+    force, load = figures[0].axes[2:4]
+    assert figures[0].get_suptitle().startswith("bag/run, ")
+    largest = max(float(np.nanmax(line.get_ydata())) for line in force.lines[:8])
+    assert largest == pytest.approx(analyse_force(tmp_path) / 1e3, rel=1e-6)
+    np.testing.assert_allclose(load.lines[0].get_ydata(), motion()[1][:400, 0] / 1e3)
+    assert run_cli([*arguments, "--out", str(tmp_path / "bag.rrd")]) == 0
+    assert (tmp_path / "bag.rrd").stat().st_size > 10_000
+
+
+def analyse_force(folder: Path) -> float:
+    """Return the largest force [N] that an analysis of the same bag finds."""
+    found = analyse(folder / "bag", scene=PAPER, mapping=folder / "map.yaml")
+    return max(found.facts()["loads"]["largest_force_n"].values())

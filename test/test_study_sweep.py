@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from figure_checks import check_figure, kept_figures
 from scenes import preset
 
 from plow_twin import Friction, simulate
@@ -23,6 +24,7 @@ from plow_twin.study.parameters import StudyError, parameter_of, parameter_paths
 from plow_twin.study.store import Store
 from plow_twin.study.sweep.run import run_here, run_on_cluster
 from plow_twin.study.sweep.table import Sweep, parse_axis
+from plow_twin.study.words import parameter_words, statistic_words
 
 GRID = ["--x", "clearance.horizontal_m=0.020:0.030:5", "--y", "contact.stiffness=6e6:6e7:3:log"]
 STATISTICS = (
@@ -62,6 +64,16 @@ def test_every_member_has_the_numbers_of_its_single_run(tmp_path: Path) -> None:
         )
         assert table.numbers[member] == pytest.approx(expected, rel=1e-7, abs=0.0)
     assert np.unique(table.numbers[:, 0]).size == 15
+
+
+def test_parameters_and_statistics_have_words_and_units() -> None:
+    for path in parameter_paths(preset("paper")):
+        words, factor = parameter_words(path)
+        assert not words.endswith(("_m", "_n", "_kg", "_rad")) and factor > 0.0, path
+    assert parameter_words("clearance.horizontal_m") == ("horizontal clearance [mm]", 1e3)
+    assert parameter_words("loads.fy.phase_rad") == ("load fy phase [rad]", 1.0)
+    assert statistic_words("max.ccw.a") == ("largest force, counter-clockwise, corner a [kN]", 1e-3)
+    assert statistic_words("contact_points.cw.2") == ("share of contact time, clockwise, force at 2 corners", 1.0)
 
 
 def test_parameters_are_set_and_refused_by_path() -> None:
@@ -122,7 +134,12 @@ def test_failed_members_are_listed_and_other_questions_refused(
     monkeypatch.setattr("plow_twin.study.cluster.CONNECT_TIMEOUT_S", 0.5)
     arguments = ["study", "sweep", "paper", "--statistic", "max", "--t-end", "2", "--out", str(tmp_path)]
     arguments += ["--x", "contact.stiffness=1e3,-1,1e7,1e8"]
+    figures = kept_figures(monkeypatch)
     assert run(arguments) == 3
+    check_figure(figures[0])
+    assert figures[0].get_suptitle().startswith("Sweep of paper: 2 s each, drawn 20")
+    assert figures[0].axes[0].get_xlabel() == "contact stiffness [MN/mⁿ]"
+    assert figures[0].axes[0].get_ylabel() == "largest force [kN]"
     said = capsys.readouterr()
     assert "left the model's range" in said.err and "contact.stiffness: got -1.0" in said.err
     stored = (tmp_path / "sweep.parquet").read_bytes()

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from figure_checks import check_figure, kept_figures
 from hypothesis import given
 from hypothesis import strategies as st
-from matplotlib.backends import backend_agg
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from record_support import BASE_NS, STEP_NS, paper_sample, record_run
@@ -23,15 +23,7 @@ from plow_twin.view.picture import to_png
 @pytest.fixture
 def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """Receive the figures that are drawn."""
-    kept: list[Figure] = []
-
-    class Kept(backend_agg.FigureCanvasAgg):
-        def __init__(self, figure: Figure) -> None:
-            kept.append(figure)
-            super().__init__(figure)
-
-    monkeypatch.setattr(backend_agg, "FigureCanvasAgg", Kept)
-    return kept
+    return kept_figures(monkeypatch)
 
 
 def test_an_hour_of_load_fills_the_same_band_everywhere() -> None:
@@ -90,6 +82,8 @@ def test_a_stretch_without_samples_is_shaded(tmp_path: Path, figures: list[Figur
         [*(paper_sample(index) for index in range(200)), *held, *(paper_sample(index) for index in range(500, 700))],
     )
     to_png(run.folder, tmp_path / "run.png")
+    check_figure(figures[0])
+    assert "grey: without samples" in figures[0].axes[4].get_xlabel()
     for axis in figures[0].axes[2:]:
         (shade,) = axis.patches
         assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx((0.199, 0.5))
@@ -100,7 +94,9 @@ def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the
 ) -> None:
     run = record_run(tmp_path / "run", map(paper_sample, range(3000)))
     to_png(run.folder, tmp_path / "run.png")
+    check_figure(figures[0])
     section = figures[0].axes[0]
+    assert "to scale" in section.get_xlabel() and "head turned by" in section.get_title()
     values = [text for text in section.texts if text.get_text().endswith("kN")]
     largest = float(section.get_title().split()[-2])
     assert max(float(text.get_text().split()[0]) for text in values) == pytest.approx(largest, abs=0.51)
@@ -109,3 +105,22 @@ def test_every_force_of_the_instant_shown_has_its_arrow_and_its_value_inside_the
     for text in values:
         at = text.get_position()
         assert x[0] < at[0] < x[1] and y[0] < at[1] < y[1] and math.isfinite(at[0])
+
+
+def test_the_title_has_run_scene_and_date_and_thresholds_are_drawn(tmp_path: Path, figures: list[Figure]) -> None:
+    alarms = {"alarm_force": [1.2e5, 1.5e5], "alarm_clearance": [0.031, 0.0], "scene": "paper"}
+    run = record_run(tmp_path / "monday", map(paper_sample, range(300)), parameters=alarms)
+    to_png(run.folder, tmp_path / "run.png")
+    title = figures[0].get_suptitle()
+    assert title.startswith(f"{tmp_path.name}/monday, scene paper, 20") and " UTC" in title
+    drawn = {
+        (axis.get_ylabel().split()[0], line.get_label()): line.get_ydata()[0]
+        for axis in figures[0].axes
+        for line in axis.lines
+        if str(line.get_label()).endswith("threshold")
+    }
+    assert drawn == {
+        ("largest", "warning threshold"): pytest.approx(120.0),
+        ("largest", "error threshold"): pytest.approx(150.0),
+        ("clearance", "warning threshold"): pytest.approx(31.0),
+    }

@@ -12,8 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import rerun as rr
-from matplotlib.backends import backend_agg
-from matplotlib.figure import Figure
+from figure_checks import kept_figures
 from record_support import BASE_NS, STEP_NS, Run, paper_sample, record_run
 from rerun.chunk import RrdReader
 
@@ -83,19 +82,6 @@ def journal_around_the_hole(folder: Path) -> list[Sample]:
 
 def scalars(table: pa.Table) -> np.ndarray:
     return np.array(table["Scalars:scalars"].to_pylist(), dtype=np.float64).ravel()
-
-
-def kept_figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """Return a list that receives the figures drawn from now on."""
-    figures: list[Figure] = []
-
-    class Kept(backend_agg.FigureCanvasAgg):
-        def __init__(self, figure: Figure) -> None:
-            figures.append(figure)
-            super().__init__(figure)
-
-    monkeypatch.setattr(backend_agg, "FigureCanvasAgg", Kept)
-    return figures
 
 
 def test_rerun_verifies_the_file_and_finds_a_blueprint(view: tuple[ViewSummary, dict[str, pa.Table]]) -> None:
@@ -365,7 +351,12 @@ def test_gaps_are_drawn_as_wide_as_asked_with_their_wear() -> None:
     np.testing.assert_allclose(top[:, 1], -(135.0 + 20.0))  # 10 mm, twice as wide, y down
     np.testing.assert_allclose(right[:, 0], 165.0 + 60.0)
     np.testing.assert_allclose(bottom[:, 1], 135.0 + 10.0)
-    np.testing.assert_allclose(sorted(left[:, 0]), [-165.0 - 40.0, -165.0 + 2.0])
+    # the left wall is slanted: it passes through its points beside the corners
+    slope = (left[0, 0] - left[1, 0]) / (left[0, 1] - left[1, 1])
+    np.testing.assert_allclose(
+        left[0, 0] + slope * (np.array([-135.0, 135.0]) - left[0, 1]), [-165.0 - 40.0, -165.0 + 2.0]
+    )
+    np.testing.assert_allclose(walls[:, 1], np.roll(walls[:, 0], -1, axis=0))  # a closed outline
     assert touching.tolist() == [False, False, False, True]
 
 

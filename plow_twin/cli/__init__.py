@@ -18,10 +18,15 @@ from typing import NoReturn
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and leave with its exit code."""
     _open_what_is_closed()
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        sys.exit("plow-twin: NUMBA_DISABLE_JIT is set, expected it unset: the solver is compiled code")
     with _ending_at_once():
         # the imports of the verbs: an interrupted import may end in another error
-        import plow_twin.run.twin  # noqa: F401
-        from plow_twin.cli.app import main as run
+        try:
+            import plow_twin.run.twin  # noqa: F401
+            from plow_twin.cli.app import main as run
+        except (ImportError, OSError, MemoryError) as error:  # memory for libraries is short, or one is missing
+            sys.exit(f"plow-twin: a library cannot be loaded: {error.__context__ or error or 'not enough memory'}")
 
     run(arguments)
 

@@ -30,7 +30,7 @@ from plow_twin.cli.setup import setup
 from plow_twin.cli.simulate import simulate
 from plow_twin.cli.study import study
 from plow_twin.cli.view import view
-from plow_twin.errors import InputError, PlowTwinError, RunInterrupted, UnitError
+from plow_twin.errors import ExcessError, InputError, PlowTwinError, RunInterrupted, UnitError
 
 #: Extra of the package that brings a module.
 EXTRA_OF_MODULE: Final = {
@@ -45,10 +45,13 @@ EXTRA_OF_MODULE: Final = {
     "sensor_msgs": "ros",
     "std_msgs": "ros",
     "std_srvs": "ros",
+    "visualization_msgs": "ros",
     "mcap": "record",
     "rosbags": "record",
     "paho": "mqtt",
     "asyncua": "opcua",
+    "google": "sparkplug",
+    "influxdb_client": "influx",
     "prometheus_client": "metrics",
     "starlette": "dashboard",
     "uvicorn": "dashboard",
@@ -61,6 +64,9 @@ EXTRA_OF_MODULE: Final = {
     "jinja2": "study",
     "distributed": "dask",
 }
+
+#: Longest message [characters]: a file may have a million names to choose from.
+_LONGEST: Final = 16_000
 
 
 @click.group(
@@ -135,7 +141,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # click turns every KeyboardInterrupt into an Abort
         stopped = error.__cause__
         return _fail(str(stopped) if isinstance(stopped, RunInterrupted) else "interrupted")
-    except (InputError, UnitError) as error:
+    except (InputError, UnitError, ExcessError) as error:
         return _fail(str(error), WRONG_INPUT)
     except PlowTwinError as error:
         return _fail(str(error))
@@ -154,5 +160,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, code: int = FAILED) -> int:
+    if len(message) > _LONGEST:
+        message = f"{message[:_LONGEST]} ... ({len(message)} characters)"
     say_error(f"plow-twin: {message}")
     return code

@@ -81,6 +81,11 @@ if TYPE_CHECKING:
     show_default=True,
     help="Twins that follow.",
 )
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Picture of the fit: measured and fitted motion, residuals, intervals. PNG, or .rrd for rerun.",
+)
 @quiet_option
 def estimate(
     source: Path,
@@ -92,6 +97,7 @@ def estimate(
     following: bool,
     follow_dt: float | None,
     follow_members: int,
+    plot: Path | None,
     quiet: bool,
 ) -> int:
     """Estimate clearances, contact, load gains, bias and delay from INPUT, with 90 % intervals.
@@ -143,10 +149,12 @@ def estimate(
                 form = ["%.15g", *["%.9g"] * (len(names) - 1)]
                 np.savetxt(stream, rows, fmt=form, delimiter=",", header=",".join(names), comments="")
         write_whole(out / "estimate.json", (text + "\n").encode())
+    if plot is not None:
+        _plot(task, result, plot, _title(source, scene, task))
     if as_json:
         click.echo(text)
     elif not quiet:
-        _show(result, task.scene)
+        show_estimate(result, task.scene)
         if "live" in more:
             _show_live(more["live"])
         if forces is not None:
@@ -161,11 +169,13 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Task:
-    """An estimate to make: `run` returns the estimate and further facts."""
+    """An estimate to make: `run` returns the estimate and further facts. Its times count from `first_ns`, if known."""
 
     scene: Scene
     load: Load
+    poses: Poses
     run: Callable[[], tuple[Estimate, dict[str, Any]]]
+    first_ns: int | None = None
 
 
 @dataclass(frozen=True)
@@ -210,7 +220,7 @@ def _given(source: Path, scene: Path | None, mapping: Path | None, folder: bool)
     def found() -> tuple[Estimate, dict[str, Any]]:
         return run(measured.scene, given.load, given.poses, lost, given.gaps, forces), losses
 
-    return _Task(measured.scene, given.load, found)
+    return _Task(measured.scene, given.load, given.poses, found)
 
 
 def _followed(given: _Given, members: int, dt: float | None) -> tuple[list[str], Any]:
@@ -240,14 +250,13 @@ def _repeated(source: Path) -> _Task | None:
     from plow_twin.live.parameters import settings
     from plow_twin.record.estimated import live_estimates
     from plow_twin.record.reader import RunReader
-    from plow_twin.scene_file import loads_scene
 
     reader = RunReader(source)
     found = list(live_estimates(reader))
     whole = [one for one in found if one.window is not None]
     if not whole:
         return None
-    scene = loads_scene(reader.header.scene_yaml, source=str(reader.path))
+    scene = reader.header.scene(reader.path)
     losses = {**reader.lost, "damaged_chunks": reader.damaged_chunks, **reader.lost_parts}
     losses = {name: count for name, count in losses.items() if count}
 
@@ -261,7 +270,39 @@ def _repeated(source: Path) -> _Task | None:
 
     newest = whole[-1].window
     assert newest is not None
-    return _Task(scene, newest.load, run)
+    return _Task(scene, newest.load, newest.pose, run, whole[-1].entry.start_ns)
+
+
+def _title(source: Path, scene: Path | None, task: _Task) -> str:
+    """Return the first line of the picture's title: the measurements, the scene and the date."""
+    from datetime import UTC, datetime
+
+    from plow_twin.view.figures import date_text
+
+    date = date_text(task.first_ns) or f"drawn {datetime.now(UTC):%Y-%m-%d}"
+    its = "its own scene" if scene is None else f"scene {scene.name}"
+    return f"Estimate from {source.resolve().name}, {its}, {date}"
+
+
+def _plot(task: _Task, result: Estimate, path: Path, title: str) -> None:
+    """Draw the fit."""
+    from plow_twin.estimate.estimate import priors
+    from plow_twin.view.estimate import estimate_picture
+    from plow_twin.view.fitted_file import write_fit_picture
+
+    prior = priors(task.scene, task.load, task.poses)
+    write_fit_picture(estimate_picture(result, prior, task.poses, _labels(task.scene), title), path)
+
+
+def _labels(scene: Scene) -> dict[str, str]:
+    """Return name and unit of each quantity."""
+    from plow_twin.estimate.unknowns import QUANTITIES
+
+    labels = {one.name: one.label for one in QUANTITIES}
+    labels["damping"] = "restitution [1]" if scene.contact.damping is None else f"damping [{damping_unit(scene)}]"
+    power = scene.contact.exponent
+    labels["stiffness"] = labels["stiffness"].replace("m^n", "m" if power == 1.0 else f"m^{power:g}")
+    return labels
 
 
 def _forces(task: _Task, result: Estimate, members: int) -> Forces | None:
@@ -293,12 +334,12 @@ def _show_live(live: dict[str, Any]) -> None:
     output_console().print(text, highlight=False, soft_wrap=True)
 
 
-def _show(result: Estimate, scene: Scene) -> None:
+def show_estimate(result: Estimate, scene: Scene) -> None:
+    """Print an estimate as a table."""
     from plow_twin.estimate.unknowns import QUANTITIES
 
     states = {"horizontal": result.horizontal_state.value, "vertical": result.vertical_state.value}
-    labels = {one.name: one.label for one in QUANTITIES}
-    labels["damping"] = "restitution [1]" if scene.contact.damping is None else f"damping [{damping_unit(scene)}]"
+    labels = _labels(scene)
     values = result.values()
     rows = [
         (labels[one.name], values[one.name], one.factor, one.digits, states.get(one.name, ""))

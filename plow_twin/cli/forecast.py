@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -121,8 +122,7 @@ def forecast(
     if plot is not None:
         from plow_twin.view.forecast import draw_forecast
 
-        plot.parent.mkdir(parents=True, exist_ok=True)
-        draw_forecast(found, plot)
+        draw_forecast(found, plot, f"Forecast of {Path(scene).name}, drawn {datetime.now(UTC):%Y-%m-%d}")
     facts["lost"] = lost
     if lost:
         say_error(f"plow-twin: {scene}: lost {counts(lost)}; there may be a newer estimate")

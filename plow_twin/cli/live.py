@@ -29,6 +29,7 @@ from plow_twin.cli.console import (
 )
 from plow_twin.cli.dashboard import access_of, access_options, dashboard_option, say_where, stay
 from plow_twin.cli.live_report import Report
+from plow_twin.cli.telemetry import telemetry_options, ways_of
 
 if TYPE_CHECKING:
     from plow_twin.dashboard.access import PageAccess
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from plow_twin.live.parameters import Settings
     from plow_twin.live.part import Part
     from plow_twin.live.stop import StopSignals
+    from plow_twin.telemetry.access import WayOut
 
 #: Time between two looks of the progress bar [s].
 _PROGRESS_S = 0.2
@@ -71,12 +73,13 @@ _FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 @click.option("--tls-cert", type=_FILE, help="Certificate of this client.")
 @click.option("--tls-key", type=_FILE, help="Key of that certificate.")
 @click.option("--client-id", default="plow_twin", show_default=True, help="Name under which the broker keeps messages.")
-@click.option("--plain", is_flag=True, help="Allow a broker or server on another machine without encryption.")
+@click.option("--plain", is_flag=True, help="Allow brokers and servers on other machines without encryption.")
 @click.option("--lines", is_flag=True, help="Status, alarms and diagnostics as JSON lines on standard output.")
 @click.option(
     "--control", type=click.Path(path_type=Path), help="Socket to open, for plow-twin call SOCKET acknowledge_alarms."
 )
 @click.option("--metrics", type=click.IntRange(1, 65535), help="Port of a page for Prometheus, on this machine.")
+@telemetry_options
 @dashboard_option
 @access_options
 @json_option
@@ -109,6 +112,7 @@ def _live(
     try:
         settings = _settings(options)
         access = access_of(options) if options["dashboard"] else None
+        ways = ways_of(options)
         bridge = _bridge(source, options, settings.expected_rate)
         for refused in apply_realtime(settings):
             say_error(f"plow-twin: refused by the system: {refused}")
@@ -123,9 +127,12 @@ def _live(
         with _control(options["control"]) as control, ExitStack() as opened:
             say = _also_metrics(report.say, options["metrics"], opened)
             front = BridgeFront(bridge, options["mapping"], settings, prepared, say, on_error, options["units"])
+            _say_what_differs(front, settings)
             if control is not None:
                 _answer_on(control, front)
             screen = opened.enter_context(_screen(front, access, source)) if access is not None else None
+            for way in ways:
+                opened.enter_context(_open_way(front, way, options["out_rate"], source))
             if bridge.ends:
                 _show_progress(front, bridge, opened.enter_context(progress_bar("reading", quiet or lines)))
             stop.interrupt = False
@@ -138,14 +145,27 @@ def _live(
     facts = {name: values for name, (_, _, values) in parts.items()}
     if report.lost:
         lost = [*lost, f"standard output took {report.lost} lines not, or in part"]
-    for text in lost:
+    for text in (*lost, *front.causes()):
         on_error(text)
     if as_json:
         click.echo(json.dumps(facts, indent=2))
     elif not quiet and not lines:
         show_facts(output_console(), {"input": {key: facts["input"][key] for key in _shown(facts["input"])}})
+        _show_estimate(front)
     unused = any(int(facts["input"][key]) for key in facts["input"] if _LOST.fullmatch(key))
     return leave(DONE_WITH_LOSS if lost or unused or facts["recorder"]["lost"] else DONE)
+
+
+def _say_what_differs(front: BridgeFront, settings: Settings) -> None:
+    """Say where the recording goes if its folder was taken, and which thresholds look wrong."""
+    from plow_twin.record.unit_check import small_thresholds
+
+    recording = front.runtime.recording
+    if recording is not None and recording.path.parent != Path(settings.record_path):
+        say_error(f"plow-twin: {settings.record_path} is not empty: the recording goes to {recording.path.parent}")
+    doubt = small_thresholds(settings.alarm_force, front.runtime.scene)
+    if doubt:
+        say_error(f"plow-twin: {doubt}")
 
 
 def _also_metrics(say: Say, port: int | None, opened: ExitStack) -> Say:
@@ -182,6 +202,13 @@ def _screen(front: BridgeFront, access: PageAccess, source: str) -> Screen:
     return screen
 
 
+def _open_way(front: BridgeFront, way: WayOut, rate_hz: float, source: str) -> AbstractContextManager[object]:
+    """Open a way out of a twin."""
+    from plow_twin.telemetry.live import open_way
+
+    return open_way(front, way, rate_hz, source)
+
+
 def _show_progress(front: BridgeFront, bridge: Bridge, update: OnProgress) -> None:
     """Show how much of a source that ends has been read."""
     from plow_twin.live.bridge.files import Files
@@ -198,6 +225,17 @@ def _control(path: Path | None) -> AbstractContextManager[Control | None]:
     from plow_twin.live.control import Control
 
     return Control(path)
+
+
+def _show_estimate(front: BridgeFront) -> None:
+    """Print the newest estimate, if there is one."""
+    estimation = front.runtime.estimation
+    if estimation is None or estimation.entry is None:
+        return
+    from plow_twin.cli.estimate import show_estimate
+    from plow_twin.estimate.result import Estimate
+
+    show_estimate(Estimate.from_dict(json.loads(estimation.entry.result)), front.runtime.scene)
 
 
 def _shown(values: dict[str, str]) -> list[str]:
@@ -223,8 +261,6 @@ def _settings(options: dict[str, Any]) -> Settings:
         raise click.UsageError(str(error)) from error
     if not options["scene"] and "scene" not in values:
         say_error(f"plow-twin: no --scene: the preset {settings.scene} is used, which is not your machine")
-    if settings.estimate and not (options["follow"] or "://" in options["source"] or options["source"] == "-"):
-        say_error("plow-twin: estimate: files that end are read faster than estimates come: plow-twin estimate RUN")
     scene, record = options["scene"] or settings.scene, options["record"] or settings.record_path
     return replace(settings, scene=scene, record_path=str(record))
 

@@ -53,17 +53,30 @@ if TYPE_CHECKING:
 @click.option("--tol", type=POSITIVE, help="Tolerance; the target file's, or 1e-8 with --recording.")
 @click.option("--excess", type=POSITIVE, help="Objective above the best that still counts as near optimal; 10 % of it.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), required=True, help="Folder of the results.")
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Picture of the fit: measured, fitted, residuals, ranges. PNG, or with --recording .rrd for rerun.",
+)
 @set_option
 @click.option("--workers", type=click.IntRange(1), help="Threads; all cores by default.")
 @quiet_option
 def calibrate(
-    scene: str, out: Path, quiet: bool, settings: tuple[str, ...], unknowns: tuple[str, ...], **options: Any
+    scene: str,
+    out: Path,
+    plot: Path | None,
+    quiet: bool,
+    settings: tuple[str, ...],
+    unknowns: tuple[str, ...],
+    **options: Any,
 ) -> int:
     """Fit unknowns of SCENE to published figures or to a recorded motion; writes fit.yaml and calibration.json."""
     from plow_twin.study.calibration.calibrate import Search
     from plow_twin.study.calibration.fit import write_fit
     from plow_twin.study.calibration.unknowns import Space, check_usable, parse_unknown
 
+    if plot is not None:
+        _check_plot(plot, options)
     with usage_errors():
         model, objective, source, proposed = _objective(scene, settings, options)
         texts = _merged(proposed, unknowns)
@@ -77,6 +90,8 @@ def calibrate(
     arguments = {"scene": scene, "settings": settings, "unknowns": texts, **options, "simplex": simplex}
     plain = {key: str(value) if isinstance(value, Path) else value for key, value in arguments.items()}
     write_fit(fit, space, plain, out)
+    if plot is not None:
+        _plot(fit, space, objective, f"Calibration of {scene} to {source}, drawn {_today()}", plot)
     if not quiet:
         _show(fit, space, out)
     return DONE
@@ -92,6 +107,31 @@ def _merged(proposed: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
         paths |= {"contact.damping", "contact.restitution"}
     kept = [text for text in proposed if text.partition("=")[0] not in paths]
     return (*kept, *(text for text in given if text.partition("=")[2] != "fixed"))
+
+
+def _check_plot(plot: Path, options: dict[str, Any]) -> None:
+    from plow_twin.study.report import require
+
+    if plot.suffix == ".rrd" and options["recording"] is None:
+        raise click.UsageError(f"--plot: got {plot.name} with --target, expected a PNG: figures are no motion")
+    require("rerun" if plot.suffix == ".rrd" else "matplotlib")
+
+
+def _plot(fit: Fit, space: Space, objective: Objective, title: str, path: Path) -> None:
+    """Draw the fit."""
+    from plow_twin.study.calibration.objective import RecordingObjective
+    from plow_twin.study.calibration.picture import draw_motion, draw_targets
+
+    if isinstance(objective, RecordingObjective):
+        draw_motion(fit, space, objective, title, path)
+    else:
+        draw_targets(fit, space, title, path)
+
+
+def _today() -> str:
+    from datetime import UTC, datetime
+
+    return f"{datetime.now(UTC):%Y-%m-%d}"
 
 
 def _check_options(options: dict[str, Any]) -> None:

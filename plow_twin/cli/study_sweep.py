@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -76,7 +77,7 @@ def sweep(
         store = Store(out, question, chunk or max(16, 2 * (os.cpu_count() or 1)), fresh=not resume)
     result = _computed(store, workers, dask, quiet)
     write_parquet(result, out / "sweep.parquet")
-    draw(result, out / "sweep.png")
+    draw(result, out / "sweep.png", f"Sweep of {scene}: {t_end:g} s each, drawn {datetime.now(UTC):%Y-%m-%d}")
     if not quiet:
         _show(result, out)
     _list_failed(result)

@@ -5,15 +5,25 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from plow_twin.cli.console import DONE, DONE_WITH_LOSS, POSITIVE, counts, progress, quiet_option, say_error
+from plow_twin.cli.console import (
+    DONE,
+    DONE_WITH_LOSS,
+    POSITIVE,
+    busy,
+    counts,
+    progress,
+    quiet_option,
+    say_error,
+    unit_option,
+)
 
 if TYPE_CHECKING:
     from plow_twin.model.scene import Scene
@@ -45,7 +55,20 @@ _MOST_EXAGGERATED = 1e4
     metavar="SCENE",
     help="A further scene, whose forces under the run's load are drawn too; may be repeated.",
 )
+@click.option("--scene", help="Scene file or preset of a recording that is no run of ours.")
+@click.option(
+    "--map",
+    "mapping",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    help="YAML that says where load, travel and pose stand in a recording of another program.",
+)
+@unit_option
 @click.option("--png", type=click.Path(path_type=Path, dir_okay=False), help="A picture instead; needs no viewer.")
+@click.option(
+    "--html",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="One page instead, with picture, curves and tables; needs neither viewer nor network.",
+)
 @click.option("--web", is_flag=True, help="Serve rerun's own web viewer on this machine until interrupted.")
 @click.option(
     "--web-port", type=click.IntRange(0, 65535), default=9090, show_default=True, help="Its port; 0: a free one."
@@ -60,50 +83,105 @@ def view(
     out: Path | None,
     exaggerate: float | None,
     others: tuple[str, ...],
+    scene: str | None,
+    mapping: Path | None,
+    units: dict[str, str],
     png: Path | None,
+    html: Path | None,
     web: bool,
     web_port: int,
     follow: bool,
     wait: float,
     quiet: bool,
 ) -> int:
-    """Make a .rrd of RECORDING: the cross-section in motion, force and clearance curves, the event log."""
+    """Make a .rrd of RECORDING: the cross-section in motion, force and clearance curves, the event log.
+
+    A recording of another program (--scene, --map) is drawn with what the model computes of its load, as by analyse.
+    """
     from plow_twin.record.reader import mcap_path
 
+    foreign = scene is not None or mapping is not None or bool(units)
+    if foreign and follow:
+        raise click.UsageError("--follow cannot be combined with --scene, --map or --unit: it shows a run of ours")
     if not follow and not recording.exists():
         raise click.BadParameter(f"{recording}: does not exist", param_hint="RECORDING")
     if exaggerate is not None and exaggerate > _MOST_EXAGGERATED:
         raise click.BadParameter(
             f"got {exaggerate:g}, expected at most {_MOST_EXAGGERATED:g}", param_hint="--exaggerate"
         )
-    if png is not None and (out is not None or web or follow):
-        raise click.UsageError("--png cannot be combined with --out, --web or --follow: it is a picture of a whole run")
+    if png is not None and html is not None:
+        raise click.UsageError("--png cannot be combined with --html: the page has the picture")
+    for option, file in (("--png", png), ("--html", html)):
+        if file is not None:
+            _check_still(option, moving=out is not None or web or follow, exaggerate=exaggerate, others=others)
     if follow and out is not None and web:
         raise click.UsageError("--follow goes into --out or to --web, not both")
-    if png is not None and exaggerate is not None:
-        raise click.UsageError("--exaggerate cannot be combined with --png: a picture shows the gaps as numbers")
-    if png is not None and others:
-        raise click.UsageError("--with cannot be combined with --png: a picture shows the run alone")
     if follow:
         return _follow(recording, out, exaggerate, _scenes(others), web_port if web else None, wait, quiet)
-    if png is not None:
-        from plow_twin.view.picture import to_png
+    with ExitStack() as opened:
+        run, lossy = recording, False
+        if foreign:
+            run, lossy = opened.enter_context(_made_run(recording, scene, mapping, units, quiet))
+        if png is not None or html is not None:
+            lossy |= _tell_loss(recording, *_still(run, png, html))
+            if not quiet:
+                click.echo(f"{png or html}")
+            return DONE_WITH_LOSS if lossy else DONE
+        from plow_twin.view import to_rrd
 
-        lossy = _tell_loss(recording, *to_png(recording, png))
-        if not quiet:
-            click.echo(f"{png}")
-        return DONE_WITH_LOSS if lossy else DONE
-    from plow_twin.view import to_rrd
-
-    out = out or mcap_path(recording).with_suffix(".rrd")
-    with progress(f"writing {out.name}", quiet) as on_progress:
-        summary = to_rrd(recording, out, exaggerate=exaggerate, others=_scenes(others), on_progress=on_progress)
+        out = out or (recording.with_suffix(".rrd") if foreign else mcap_path(recording).with_suffix(".rrd"))
+        with progress(f"writing {out.name}", quiet) as on_progress:
+            summary = to_rrd(run, out, exaggerate=exaggerate, others=_scenes(others), on_progress=on_progress)
     code = _show(recording, out, summary, quiet)
     if web:
         return _serve(out, web_port)
     if not quiet:
         click.echo(f"look at it with: rerun {out}")
-    return code
+    return DONE_WITH_LOSS if lossy else code
+
+
+def _check_still(option: str, *, moving: bool, exaggerate: float | None, others: tuple[str, ...]) -> None:
+    """Refuse what a picture of a whole run does not have."""
+    if moving:
+        raise click.UsageError(
+            f"{option} cannot be combined with --out, --web or --follow: it is a picture of a whole run"
+        )
+    if exaggerate is not None:
+        raise click.UsageError(f"--exaggerate cannot be combined with {option}: a picture shows the gaps as numbers")
+    if others:
+        raise click.UsageError(f"--with cannot be combined with {option}: a picture shows the run alone")
+
+
+def _still(run: Path, png: Path | None, html: Path | None) -> tuple[FileStatus, dict[str, int], int]:
+    """Write the picture or the page of a run; return how it ended, its losses, and its failed advances."""
+    if png is not None:
+        from plow_twin.view.picture import to_png
+
+        return to_png(run, png)
+    from plow_twin.study.run_page import write_run_page
+
+    assert html is not None
+    return write_run_page(run, html)
+
+
+@contextmanager
+def _made_run(
+    recording: Path, scene: str | None, mapping: Path | None, units: dict[str, str], quiet: bool
+) -> Iterator[tuple[Path, bool]]:
+    """Give the run that the model makes of another recording, and whether something of it could not be used."""
+    from tempfile import TemporaryDirectory
+
+    from plow_twin.study.analysis.analyse import analyse
+
+    with TemporaryDirectory() as folder:
+        place = Path(folder) / recording.resolve().name
+        with busy("computing", quiet):
+            found = analyse(recording, scene=Path(scene) if scene else None, mapping=mapping, units=units, out=place)
+        if found.kind != "other":
+            raise click.UsageError("--scene, --map, --unit: got a run of ours, expected another recording")
+        if found.lost:
+            say_error(f"plow-twin: {recording}: lost {counts(found.lost)}")
+        yield place / "run", found.lossy
 
 
 def _scenes(files: tuple[str, ...]) -> dict[str, Scene]:

@@ -51,10 +51,10 @@ class Envelope:
         self._segment += 1
 
     @property
-    def is_binned(self) -> bool:
-        """Whether bins stand for the rows."""
+    def bin_s(self) -> float:
+        """Width of a bin [s]; 0 where every row is kept."""
         self._merge()
-        return self._bin_s > 0.0
+        return self._bin_s
 
     def bands(self, column: int) -> tuple[Array, Array, Array]:
         """Return times [s], least and largest values of a column, shape (n,) each, with NaN between two segments.

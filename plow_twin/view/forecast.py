@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plow_twin.record.durable import whole_file
+from plow_twin.view.figures import legend_beside, write_png
 
 if TYPE_CHECKING:
     from plow_twin.estimate.forecast import Forecast
@@ -17,13 +17,12 @@ _MOMENTS = 120
 _COLOURS = ("#1f4e9c", "#d62728")
 
 
-def draw_forecast(found: Forecast, path: FilePath) -> None:
+def draw_forecast(found: Forecast, path: FilePath, title: str) -> None:
     """Write a PNG: P10, P50 and P90 of both clearances over time, and the probability that a limit is reached."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(13.0, 4.8), layout="constrained", dpi=110)
+    figure.suptitle(title, fontsize=11)
     left, right = figure.subplots(1, 2)
     plan = found.plan
     reached = found.hours[np.isfinite(found.hours)]
@@ -38,26 +37,28 @@ def draw_forecast(found: Forecast, path: FilePath) -> None:
         low, middle, high = np.minimum(growing[:, :, axis], 1e3 * limit)
         middle[~np.isfinite(growing[1, :, axis])] = np.nan
         left.fill_between(hours, low, high, color=colour, alpha=0.2, linewidth=0.0)
-        left.plot(hours, middle, color=colour, label=f"{name}, P10 to P90")
-        left.axhline(1e3 * limit, color=colour, linestyle="--", linewidth=1.0)
-    left.set(
-        xlabel="hours of operation", ylabel="clearance [mm]", title="Clearances; their limits dashed", xlim=(0.0, end)
-    )
-    left.legend(loc="lower right")
+        left.plot(hours, middle, color=colour, label=f"{name}: P50,\nshaded P10 to P90")
+        left.axhline(1e3 * limit, color=colour, linestyle="--", linewidth=1.0, label=f"its limit, {1e3 * limit:g} mm")
+    left.set(xlabel="hours of operation", ylabel="clearance [mm]", title="Until a limit is reached", xlim=(0.0, end))
+    legend_beside(left)
     share = np.searchsorted(np.sort(found.hours), hours, side="right") / len(found.hours)
     right.plot(hours, 100.0 * share, color="black")
     for name, quantile in (("P10", 0.1), ("P50", 0.5), ("P90", 0.9)):
         at = found.quantile(quantile)
         if at is not None and at <= end:
             right.plot([at, at], [0.0, 100.0 * quantile], color="grey", linewidth=1.0)
+            side, offset = ("right", -4.0) if at > 0.8 * end else ("left", 4.0)
             right.annotate(
-                f"{name} {at:.0f} h", (at, 100.0 * quantile), xytext=(4.0, -10.0), textcoords="offset points"
+                f"{name} {at:.0f} h",
+                (at, 100.0 * quantile),
+                xytext=(offset, -10.0),
+                textcoords="offset points",
+                ha=side,
             )
     if plan.stop_h is not None and plan.stop_h <= end:
         right.axvline(plan.stop_h, color="#1b7837", linestyle=":", label="planned stop")
-        right.legend(loc="upper left")
+        legend_beside(right)
     missed = 100.0 * float(np.mean(~np.isfinite(found.hours)))
     right.set(xlabel="hours of operation", ylabel="probability that a limit is reached [%]", xlim=(0.0, end))
     right.set(ylim=(0.0, 102.0), title=f"Not reached in {plan.horizon_h:g} h: {missed:.0f} %")
-    with whole_file(path) as stream:
-        figure.savefig(stream, dpi=110, format="png")
+    write_png(figure, path)

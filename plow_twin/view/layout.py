@@ -105,7 +105,7 @@ def blueprint(section: Section, exaggerate: float, what_if: bool = False, follow
             _plot("clearance", "Clearance [mm]", contents=_WITHOUT_BOUNDS),
             _plot("pose", "Pose, measured and of the twin"),
             _plot("residual", "Residual"),
-            *([_plot("force_interval", "Force and its 5..95 % interval [kN]", contents=_FOLLOWED)] if followed else []),
+            *([_plot("force_interval", "Force and its 90 % interval [kN]", contents=_FOLLOWED)] if followed else []),
             _plot("penetration", "Penetration [mm]"),
             _plot("wear", "Wear [mm]", rrb.Corner2D.LeftTop, _WITHOUT_BOUNDS),
             active_tab=0,
@@ -150,7 +150,7 @@ def style_curves(stream: rr.RecordingStream) -> None:
     for entity, name, color in zip(RESIDUAL, _RESIDUAL_NAMES, _LOAD_COLORS, strict=True):
         _style(stream, entity, name, color, AggregationPolicy.MinMax)
     for entity in BAND:
-        _style(stream, entity, "5..95 %", None, AggregationPolicy.MinMax, _BAND_WIDTH)
+        _style(stream, entity, "90 % interval", None, AggregationPolicy.MinMax, _BAND_WIDTH)
     for entity in (*TOTAL, *GROWTH, *WEAR):  # bounds of an interval are thinner than their value
         base, _, bound = entity.partition("/")[2].partition("/")
         base = base.removeprefix("pad_")
@@ -214,13 +214,13 @@ Where a corner of the frame meets a wall of the cavity, an arrow shows the force
 - grey: frame, with its corners; white: the cavity and, schematically, the body of the head; violet: the load on it
 - force curves: the largest force between two messages, no peak is left out (`force_at_stamp`: the force at the stamp)
 - the cross-section is thinned in time; curves keep every row
-- growth of the clearance: over the clearance without wear, in micrometres, with the band of its 5..95 % interval
+- growth of the clearance: over the clearance without wear, in micrometres, with the band of its 90 % interval
 - head's outline and corners that carry force: blue stops a counter-clockwise swing, orange a clockwise one, violet both
 - force along the face: the largest in each piece, the newest pass bright; residual: measured pose less the model's
-- a twin that follows its machine (`follow: full`): its forces at the stamps with their 5..95 % interval
+- a twin that follows its machine (`follow: full`): its forces at the stamps with their 90 % interval
 - timelines: `{ROS_TIME}` is the stamp, `{RUN_TIME}` the time since the first one, `{STEP}` counts the advances
-- beside it the same with the clearance drawn several times as wide; walls that touch are orange; bars inside the frame
-  are the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each µm
+- beside it the same with the clearance drawn several times as wide, which slants the walls more than they are; walls
+  that touch are orange; bars inside the frame are the wear of its pads, {1e-3 * PAD_MM_PER_MM:g} mm for each µm
 
 | | |
 |---|---|

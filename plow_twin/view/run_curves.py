@@ -31,8 +31,9 @@ _MOST_MARKS: Final = 40
 
 
 class Instant(NamedTuple):
-    """Pose x, y [m], theta [rad] of the head at a stamp, forces [N] and penetrations [m] of the pairs."""
+    """Pose x, y [m], theta [rad] of the head at a stamp [ns], forces [N] and penetrations [m] of the pairs."""
 
+    stamp_ns: int
     pose: tuple[float, float, float]
     force: Array
     penetration: Array
@@ -78,6 +79,11 @@ class RunCurves:
                 curves._messages(rows_by_topic(part.outputs, topics, templates))
         curves._end_of_held(curves._newest_ns)
         return curves
+
+    @property
+    def instant_s(self) -> float | None:
+        """Time of the instant [s]."""
+        return None if self.instant is None else (self.instant.stamp_ns - (self.first_ns or 0)) * _NS
 
     def __bool__(self) -> bool:
         return bool(self.force or self.load or self.clearance)
@@ -168,4 +174,4 @@ def _largest(contact: Rows, head: Rows) -> Iterator[Instant]:
     row = int(force.max(axis=1).argmax())
     x, y, *turn = head.numbers[both[row], :4].tolist()
     penetration = contact.numbers[at[both[row]], :PAIR_COUNT]
-    yield Instant((x, y, 2.0 * math.atan2(turn[0], turn[1])), force[row], penetration)
+    yield Instant(int(head.stamp_ns[both[row]]), (x, y, 2.0 * math.atan2(turn[0], turn[1])), force[row], penetration)

@@ -102,12 +102,12 @@ class Section:
     def exaggerated(self, penetration: Array, factor: float) -> tuple[Array, NDArray[np.bool_]]:
         """Return the four walls with gaps `factor` times as wide, shape (4, 2, 2), and which of them touch.
 
-        Walls in the order top, right, bottom, left; each passes through its two points at the frame's corners, wear
-        included.
+        Walls in the order top, right, bottom, left. Each passes through its two points at the frame's corners, wear
+        included, and ends where it meets the next wall.
         """
         places = (0.5 * self.frame * _SIGNS - _OUTWARDS * (_MM * factor * penetration)[:, None]) * _FLIP
         walls = np.array([(0, 2), (3, 5), (4, 6), (7, 1)])
-        return places[walls], (penetration[walls] > 0.0).any(axis=1)
+        return _closed(places[walls]), (penetration[walls] > 0.0).any(axis=1)
 
     def pads(self, wear_depth_mm: Array) -> tuple[Array, Array, Array]:
         """Return centres, half sizes and places of labels of the bars inside the frame that show the wear of its pads.
@@ -145,6 +145,23 @@ class Section:
         """Radius of each corner's mark [mm]: larger where the corner carries force, shape (4,)."""
         total = force.reshape(PAIR_COUNT // 2, 2).sum(axis=1)
         return np.where(total >= FAINT_N, 7.0, 3.0)
+
+
+def _closed(walls: Array) -> Array:
+    """Return walls (4, 2, 2), each drawn from the wall before to the next one; as they are where these are parallel."""
+    along = walls[:, 1] - walls[:, 0]
+    before, along_before = np.roll(walls, 1, axis=0), np.roll(along, 1, axis=0)
+    across = _cross(along_before, along)
+    if not np.abs(across).min() > 1e-9:  # [mm^2]
+        return walls
+    share = _cross(walls[:, 0] - before[:, 0], along) / across
+    corners = before[:, 0] + share[:, None] * along_before
+    return np.stack((corners, np.roll(corners, -1, axis=0)), axis=1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    product: Array = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return product
 
 
 def _placed(points: Array, pose: Iterable[float]) -> Array:

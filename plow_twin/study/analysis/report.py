@@ -13,6 +13,7 @@ from plow_twin.model.pairs import PAIR_NAMES
 from plow_twin.record.durable import naming, whole_file, write_whole
 from plow_twin.study.analysis.signals import signal_unit
 from plow_twin.study.report import embedded_figure
+from plow_twin.view.figures import date_text, legend_beside
 
 if TYPE_CHECKING:
     from plow_twin.study.analysis.analyse import Analysis, Prediction
@@ -147,7 +148,7 @@ def _picture(found: Analysis) -> str:
     """Return measured and predicted pose and the largest force as an embedded PNG."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 9), layout="constrained")
+    figure = Figure(figsize=(12, 9), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     start = None
     for number, prediction in enumerate(found.predictions):
@@ -159,7 +160,7 @@ def _picture(found: Analysis) -> str:
         times = (stamps - start) * 1e-9
         label = "predicted" if not number else f"with {Path(prediction.name).name}"
         for axis, name in zip(axes, ("x", "y", "theta"), strict=False):
-            axis.plot(times[::thin], columns[name][::thin], lw=0.9, label=label)
+            axis.plot(times[::thin], 1e3 * columns[name][::thin], lw=0.9, label=label)
         count = len(stamps) // thin * thin
         force = np.max([columns[f"force_{pair}"][:count] for pair in PAIR_NAMES], axis=0).reshape(-1, thin).max(axis=1)
         axes[3].plot(times[:count:thin], force / 1e3, lw=0.7, label=label)
@@ -167,11 +168,16 @@ def _picture(found: Analysis) -> str:
         if name in found.measured.signals and start is not None:
             stamps, values = found.measured.signals[name].series()
             at, thin = (stamps - start) * 1e-9, max(1, len(stamps) // _MOST_POINTS)
-            axis.plot(at[::thin], values[::thin], ".", ms=1.5, color="0.3", label="measured")
-    for axis, text in zip(axes, ("x [m]", "y [m]", "theta [rad]", "largest force [kN]"), strict=True):
+            axis.plot(at[::thin], 1e3 * values[::thin], ".", ms=1.5, color="0.3", label="measured")
+    for axis, text in zip(axes, ("x [mm]", "y [mm]", "θ [mrad]", "largest force [kN]"), strict=True):
         axis.set_ylabel(text)
-        axis.legend(loc="upper right", fontsize=8)
+        if axis.get_legend_handles_labels()[0]:
+            legend_beside(axis)
     axes[3].set_xlabel("time since the first stamp [s]")
+    axes[3].set_ylim(bottom=0.0)
+    date = date_text(start)
+    scene = Path(found.predictions[0].name).name
+    figure.suptitle(f"{found.path.name}, scene {scene}" + (f", {date}" if date else ""))
     return embedded_figure(figure)
 
 

@@ -122,6 +122,12 @@ class RecordingObjective:
     def __post_init__(self) -> None:
         self.scene = replace(self.scene, marks={})
 
+    def motion(self, candidate: Values) -> Array:
+        """Return the poses of a candidate at the recorded times, shape (n, 3)."""
+        scene, recording = with_parameters(self.scene, candidate), self.recording
+        members = run_members([scene], float(recording.t[-1]), self.tol, recording.output_dt, self.workers)
+        return np.asarray(recording.sampled(members)[0])
+
     def residuals(self, candidates: Sequence[Values], cut: float = np.inf) -> Array:
         """Return the residuals of m candidates, shape (m, 3 rows)."""
         del cut

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.errors import ExcessError
 from plow_twin.model.scene import Table
+from plow_twin.scene_file.csv_rows import csv_rows, open_csv
 from plow_twin.study.members import Members
 from plow_twin.study.parameters import StudyError
 
 Array = NDArray[np.float64]
 
 COLUMNS: Final = ("t", "x", "y", "theta")
+#: Most bytes that an archive unpacks to.
+_LARGEST_ARCHIVE: Final = 2**28
 #: Most rows of a simulated motion between which recorded times are interpolated.
 _MOST_ROWS: Final = 20_000
 
@@ -74,9 +80,11 @@ def load_poses(path: Path) -> PoseRecording:
         raise StudyError(f"recording: got {path.name!r}, expected .csv, .npz or .mcap")
     try:
         t, q, load = readers[path.suffix](path)
+    except ExcessError:
+        raise
     except OSError as error:
         raise StudyError(f"{path}: {error.strerror or error}") from None
-    except ValueError as error:
+    except (ValueError, AttributeError, MemoryError, BadZipFile, EOFError) as error:  # of np.load
         raise StudyError(f"{path}: {error}") from None
     if t.ndim != 1 or q.shape != (len(t), 3) or len(t) < 2:
         raise StudyError(f"{path}: got t {t.shape} and q {q.shape}, expected (n,) and (n, 3) with n >= 2")
@@ -89,16 +97,24 @@ def load_poses(path: Path) -> PoseRecording:
 
 
 def _read_csv(path: Path) -> tuple[Array, Array, None]:
-    with path.open(encoding="utf-8") as file:
-        names = [name.strip() for name in file.readline().split(",")]
-    _require([name for name in COLUMNS if name not in names], names)
-    columns = [names.index(name) for name in COLUMNS]
-    table = np.loadtxt(path, delimiter=",", skiprows=1, usecols=columns, ndmin=2)
+    with open_csv(path) as file:
+        rows = csv_rows(file)
+        names = [name.strip() for name in next(rows, (0, []))[1]]
+        _require([name for name in COLUMNS if name not in names], names)
+        columns = [names.index(name) for name in COLUMNS]
+        try:
+            table = np.array([[float(cells[column]) for column in columns] for _, cells in rows])
+        except (csv.Error, IndexError) as error:
+            raise ValueError(f"{error}, expected a number in each of the columns {', '.join(COLUMNS)}") from None
+    table = table.reshape(-1, len(columns))
     return table[:, 0], table[:, 1:], None
 
 
 def _read_npz(path: Path) -> tuple[Array, Array, None]:
-    with np.load(path) as archive:
+    with np.load(path, allow_pickle=False) as archive:
+        size = sum(member.file_size for member in archive.zip.infolist())
+        if size > _LARGEST_ARCHIVE:
+            raise ExcessError(f"{path}: unpacks to {size >> 20} MiB, expected at most {_LARGEST_ARCHIVE >> 20} MiB")
         names = list(archive.files)
         if "q" in names and "t" in names:
             return np.asarray(archive["t"], float), np.asarray(archive["q"], float), None

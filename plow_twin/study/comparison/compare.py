@@ -189,5 +189,6 @@ class WindowsTask:
         RecordingError
             The run cannot be used.
         """
-        windows = windows_of(self.path, self.window_s)
-        return {"run": str(self.path), "windows": windows, "lost": read_recording(self.path).losses()}
+        recording = read_recording(self.path)
+        windows = windows_of(recording, self.window_s)
+        return {"run": str(self.path), "windows": windows, "lost": recording.losses()}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from plow_twin.errors import RecordingError
 from plow_twin.estimate.measurements import Load
 from plow_twin.model.pairs import PAIR_COUNT
-from plow_twin.record.recording import Batched, Recording, read_recording
+from plow_twin.record.recording import Batched, Recording
 from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
 
 Array = NDArray[np.float64]
@@ -81,12 +80,12 @@ class _Sums:
         return np.array([self.rows.get(number, np.zeros(self.width)) for number in numbers]).reshape(-1, self.width)
 
 
-def windows_of(path: Path, window_s: float | None = None) -> Windows:
+def windows_of(recording: Recording, window_s: float | None = None) -> Windows:
     """Return the windows of a run of plow_twin whose outputs were recorded.
 
     Parameters
     ----------
-    path
+    recording
         The run.
     window_s
         Length of a window [s]; by default the period of the load, or 10 s where it has none.
@@ -96,7 +95,6 @@ def windows_of(path: Path, window_s: float | None = None) -> Windows:
     RecordingError
         It is no run of plow_twin, or has no outputs.
     """
-    recording = read_recording(path)
     window_ns = round(1e9 * (window_s or _load_period(recording)))
     peak, moved, contact, load = _Sums(PAIR_COUNT), _Sums(2 * PAIR_COUNT), _Sums(2 * PAIR_COUNT + 1), _Sums(3)
     slow, slow_count = _Sums(2 + PAIR_COUNT), _Sums(1)
@@ -136,7 +134,9 @@ def windows_of(path: Path, window_s: float | None = None) -> Windows:
                     rows = part.values[window == number][:, _PADS]
                     pads[number] = (pads[number][0] if number in pads else rows[0], rows[-1])
     if not messages.rows:
-        raise RecordingError(f"{path}: got no contact_peaks, expected a run with outputs: plow-twin replay --write")
+        raise RecordingError(
+            f"{recording.path}: got no contact_peaks, expected a run with outputs: plow-twin replay --write"
+        )
     full = _FULL * float(np.median([row[0] for row in messages.rows.values()]))
     numbers = sorted(number for number, row in messages.rows.items() if row[0] >= full)
     seconds = window_ns * 1e-9

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -12,12 +13,16 @@ from plow_twin.build import package_version
 from plow_twin.record.durable import whole_file
 from plow_twin.study.statistics import unit_of
 from plow_twin.study.sweep.table import Axis, Table
+from plow_twin.study.words import parameter_words, statistic_words
+from plow_twin.view.figures import write_png
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 #: Key of the Parquet file's metadata.
 METADATA_KEY: Final = "plow_twin"
+#: Statistics that are whole numbers.
+_COUNTS: Final = ("makes", "events", "steps")
 
 
 def write_parquet(table: Table, path: Path) -> None:
@@ -47,39 +52,35 @@ def write_parquet(table: Table, path: Path) -> None:
         pq.write_table(arrow, stream)
 
 
-def draw(table: Table, path: Path) -> None:
+def draw(table: Table, path: Path, title: str) -> None:
     """Draw a curve (one parameter) or a heat map (two) for each statistic; members that failed are crosses."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     count = len(table.sweep.statistics)
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(4.6 * columns + 0.4, 3.8 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(4.6 * columns + 0.8, 3.8 * rows + 0.4), layout="constrained", dpi=150)
+    figure.suptitle(title, fontsize=11)
     for index, name in enumerate(table.sweep.statistics):
         axes = figure.add_subplot(rows, columns, index + 1)
         if len(table.sweep.axes) == 1:
             _curve(axes, table, index)
         else:
             _heat_map(axes, table, index)
-        unit = _scaled(table, index)[1]
-        axes.set_title(name if unit == "1" else f"{name} [{unit}]", fontsize=10)
-    with whole_file(path) as stream:
-        figure.savefig(stream, dpi=150, format="png")
+        axes.set_title("\n".join(wrap(statistic_words(name)[0], 52)), fontsize=10)
+    write_png(figure, path)
 
 
-def _scaled(table: Table, index: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:
-    """Return a statistic in the unit in which it is drawn, and that unit."""
-    unit = unit_of(table.sweep.statistics[index])
-    numbers = table.numbers[:, index]
-    return (numbers / 1e3, f"k{unit}") if unit in ("N", "N s") else (numbers, unit)
+def _scaled(table: Table, index: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return a statistic in the unit in which it is drawn."""
+    return np.asarray(table.numbers[:, index] * statistic_words(table.sweep.statistics[index])[1])
 
 
 def _curve(axes: Axes, table: Table, index: int) -> None:
+    from matplotlib.ticker import MaxNLocator
+
     (axis,) = table.sweep.axes
-    numbers, unit = _scaled(table, index)
-    places = _places(axis)
+    numbers, places = _scaled(table, index), _places(axis)
     # between words there is nothing
     style = "none" if isinstance(axis.values[0], str) else "-"
     axes.plot(places, numbers, marker="o", markersize=3 if style == "-" else 6, linestyle=style)
@@ -88,23 +89,36 @@ def _curve(axes: Axes, table: Table, index: int) -> None:
             places[member], color="tab:red", linestyle=":", label="failed" if member == table.failed[0] else ""
         )
     if table.failed:
-        axes.legend(fontsize=8)
+        _legend(axes)
     _label(axes, axis, "x")
-    axes.set_ylabel("" if unit == "1" else unit)
+    name = table.sweep.statistics[index]
+    axes.set_ylabel(statistic_words(name)[0].split(",")[0] + _bracketed(name))
+    if name.split(".")[0] in _COUNTS:
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
+
+
+def _bracketed(name: str) -> str:
+    """Return the unit of a statistic in brackets, where its words do not end before it."""
+    words = statistic_words(name)[0]
+    return words[words.index(" [") :] if "," in words and " [" in words else ""
+
+
+def _legend(axes: Axes) -> None:
+    """Put the legend below the axes: over the data it would hide some."""
+    axes.legend(fontsize=8, loc="upper right", bbox_to_anchor=(1.0, -0.16))
 
 
 def _heat_map(axes: Axes, table: Table, index: int) -> None:
     first, second = table.sweep.axes
-    numbers, _ = _scaled(table, index)
-    grid = numbers.reshape(table.sweep.shape).T
+    grid = _scaled(table, index).reshape(table.sweep.shape).T
     mesh = axes.pcolormesh(_edges(first), _edges(second), np.ma.masked_invalid(grid), shading="flat")
     for axis, which in ((first, "x"), (second, "y")):
         _label(axes, axis, which)
     if table.failed:
         x, y = np.unravel_index(table.failed, table.sweep.shape)
         axes.plot(_places(first)[x], _places(second)[y], "x", color="tab:red", label="failed")
-        axes.legend(fontsize=8)
+        _legend(axes)
     figure = axes.figure
     figure.colorbar(mesh, ax=axes)
 
@@ -112,7 +126,7 @@ def _heat_map(axes: Axes, table: Table, index: int) -> None:
 def _places(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
     if isinstance(axis.values[0], str):
         return np.arange(len(axis.values), dtype=np.float64)
-    return np.array(axis.values, dtype=np.float64)
+    return np.array(axis.values, dtype=np.float64) * parameter_words(axis.path)[1]
 
 
 def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -128,7 +142,7 @@ def _edges(axis: Axis) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _label(axes: Axes, axis: Axis, which: str) -> None:
-    getattr(axes, f"set_{which}label")(axis.path)
+    getattr(axes, f"set_{which}label")(parameter_words(axis.path)[0])
     if axis.log:
         getattr(axes, f"set_{which}scale")("log")
     if isinstance(axis.values[0], str):

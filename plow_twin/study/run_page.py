@@ -1,0 +1,229 @@
+"""A run as one HTML file that needs no other file and no network: summary, picture, curves, tables.
+
+rerun's own viewer is not in it: its program for browsers alone is larger than a page should be (`docs/recording.md`).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
+from plow_twin.record.alarms import ALARMS, alarm_texts, alarms_of
+from plow_twin.record.messages import DiagnosticStatus
+from plow_twin.record.reader import FileStatus, RunReader
+from plow_twin.record.recording import Recording, read_recording
+from plow_twin.record.times import time_text
+from plow_twin.stream.journal import Estimated, Failed, Mark, Reset
+from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES
+from plow_twin.study.report import embedded_figure, write_html
+from plow_twin.view.envelope import Envelope
+from plow_twin.view.picture import run_figure
+from plow_twin.view.run_curves import RunCurves
+
+Array = NDArray[np.float64]
+
+#: Rows of a table of the page; further ones are counted.
+_MOST_ROWS: Final = 200
+_PADS: Final = np.array([CLEARANCE_NAMES.index(name) for name in PAD_NAMES])
+_LOADS: Final = ("Fx", "Fy", "M")
+
+
+def write_run_page(path: Path, out: Path) -> tuple[FileStatus, dict[str, int], int]:
+    """Write the page of a run; return how the recording ended, counts of its losses, and failed advances.
+
+    Raises
+    ------
+    RecordingError
+        The file is no recording, or has no row to draw.
+    ModuleNotFoundError
+        jinja2 or matplotlib (extra `study`) is not installed.
+    """
+    reader = RunReader(path)
+    curves = RunCurves.of(reader)
+    picture = embedded_figure(run_figure(reader, curves))
+    lost = {**reader.lost, **reader.lost_parts}
+    log = _Log.of(RunReader(path))
+    context = {
+        "title": "/".join(reader.path.absolute().parent.parts[-2:]),
+        "summary": _summary(reader, curves, log),
+        "picture": picture,
+        "pads": _by_pad(read_recording(path)),
+        "lost": lost,
+        "log": log,
+        "most_rows": _MOST_ROWS,
+        "plots": _plots(reader, curves),
+        "uplot": _uplot("uPlot.iife.min.js"),
+        "uplot_style": _uplot("uPlot.min.css"),
+    }
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_html(out, "run.html.j2", context)
+    return reader.status, lost, curves.failed
+
+
+def _uplot(name: str) -> str:
+    """Return a file of the plotting library that the operator's screen uses too."""
+    return files("plow_twin").joinpath("dashboard", "page", name).read_text(encoding="utf-8")
+
+
+@dataclass
+class _Log:
+    """What happened in a run, with its times as texts."""
+
+    samples: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+    alarms: list[str] = field(default_factory=list)
+    estimates: list[dict[str, str]] = field(default_factory=list)
+    events: list[tuple[str, str]] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, reader: RunReader) -> _Log:
+        """Read a whole recording."""
+        log, alarms = cls(), reader.header.topic(ALARMS)
+        for batch in reader.batches():
+            stamps = batch.entries.samples()[0]
+            log.samples += len(stamps)
+            if len(stamps):
+                log.first_ns = int(stamps[0]) if log.first_ns is None else log.first_ns
+                log.last_ns = int(stamps[-1])
+            for _, entry in sorted(batch.entries.others.items()):
+                log._entry(entry)
+            for part in batch.outputs:
+                for channel in [number for number, (name, _) in part.topics.items() if name == alarms]:
+                    for index in np.flatnonzero(part.messages.channel == channel).tolist():
+                        message = part.record(index).message()
+                        if isinstance(message, DiagnosticStatus):
+                            log.alarms += [text for text in alarm_texts(dict(message.values)) if text not in log.alarms]
+        return log
+
+    def _entry(self, entry: Any) -> None:
+        match entry:
+            case Estimated(end_ns=end_ns, result=result):
+                self.estimates.append(_estimate_row(end_ns, json.loads(result)))
+            case Mark(stamp_ns, text):
+                self.events.append((time_text(stamp_ns), f"mark: {text}"))
+            case Reset(stamp_ns, reason):
+                self.events.append((time_text(stamp_ns), f"reset: {reason}"))
+            case Failed(stamp_ns, _, advances, reason):
+                self.events.append((time_text(stamp_ns), f"{advances} advances failed: {reason}"))
+
+
+def _estimate_row(end_ns: int, facts: dict[str, Any]) -> dict[str, str]:
+    """Return an estimate as texts by column."""
+    row = {"until": time_text(end_ns)}
+    for name in ("horizontal", "vertical"):
+        found = facts[name]
+        low, high = 1e3 * found["p05_m"], 1e3 * found["p95_m"]
+        state = found["state"].replace("_", " ")
+        row[f"{name} [mm]"] = f"{1e3 * found['mean_m']:.2f} ({low:.2f} to {high:.2f}), {state}"
+    reasons = "; ".join(facts["reasons"])
+    row["trust"] = f"model {facts['model']}, sensor {facts['sensor']}" + (f": {reasons}" if reasons else "")
+    return row
+
+
+def _summary(reader: RunReader, curves: RunCurves, log: _Log) -> dict[str, str]:
+    """Return the facts of a run in words."""
+    header, scene = reader.header, reader.header.scene(reader.path)
+    span = "" if log.first_ns is None or log.last_ns is None else f"{(log.last_ns - log.first_ns) * 1e-9:.3f} s"
+    clearance, contact = scene.clearance, scene.contact
+    return {
+        "recording": str(reader.path.name),
+        "ended": reader.status.value,
+        "first sample": "none" if log.first_ns is None else time_text(log.first_ns),
+        "span of the samples": span or "none",
+        "samples used": str(log.samples),
+        "advances that failed": str(curves.failed),
+        "load": header.excitation_source,
+        "scene": str(header.parameters.get("scene") or "that of the recording"),
+        "head": f"{scene.head.mass_kg:g} kg",
+        "horizontal clearance of the scene": f"{1e3 * clearance.horizontal_m:g} mm",
+        "vertical clearance of the scene": f"{1e3 * clearance.vertical_m:g} mm",
+        "contact": f"{contact.law.replace('_', ' ')}, stiffness {contact.stiffness:.4g}, exponent {contact.exponent:g}",
+        "plow_twin": header.package_version,
+        "run": header.run_id,
+    }
+
+
+def _by_pad(recording: Recording) -> list[dict[str, str]]:
+    """Return statistics of each pad over the whole run, as texts by column."""
+    largest, impulse, touches = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
+    in_contact, rows, before = np.zeros(PAIR_COUNT), 0, None
+    wear: Array | None = None
+    for found in recording.batches("contact_forces", "contact_peaks", "clearance"):
+        if "contact_peaks" in found:
+            total, moved, peak = np.split(found["contact_peaks"].values, 3, axis=1)
+            first = total[:1] if before is None else before
+            touches += np.clip(np.diff(np.concatenate((first, total)), axis=0), 0.0, None).sum(axis=0)
+            impulse += moved.sum(axis=0)
+            largest, before = np.maximum(largest, peak.max(axis=0)), total[-1:]
+        if "contact_forces" in found:
+            force = found["contact_forces"].values[:, 2 * PAIR_COUNT :]
+            in_contact += (force > 0.0).sum(axis=0)
+            rows += len(force)
+        if "clearance" in found:
+            wear = found["clearance"].values[-1, _PADS]
+    return [
+        {
+            "pad": name,
+            "largest force [kN]": f"{largest[pair] / 1e3:.1f}",
+            "touches": f"{touches[pair]:.0f}",
+            "impulse [kN s]": f"{impulse[pair] / 1e3:.2f}",
+            "share of time in contact [%]": f"{100.0 * in_contact[pair] / rows:.1f}" if rows else "",
+            "wear at the end [µm]": "" if wear is None else f"{1e6 * wear[pair]:.2f}",
+        }
+        for pair, name in enumerate(PAIR_NAMES)
+    ]
+
+
+def _plots(reader: RunReader, curves: RunCurves) -> list[dict[str, Any]]:
+    """Return title, curves, bands, thresholds and columns of each plot that can be zoomed."""
+    alarms = alarms_of(reader.header.parameters).alarms
+    force, clearance = alarms["force"].thresholds, alarms["clearance"].thresholds
+    ways = ("horizontal", "vertical")
+    found: list[dict[str, Any]] = [
+        {
+            "title": "Largest force of each pad [kN]",
+            "names": list(PAIR_NAMES),
+            "bands": [],
+            "limits": [value / 1e3 for value in (force.warn, force.error)],
+            "data": _columns(curves.force, [(pair, 1) for pair in range(PAIR_COUNT)]),
+        },
+        {
+            "title": "Load, least and largest [kN, kN m]",
+            "names": [f"{name} {side}" for name in _LOADS for side in ("least", "largest")],
+            "bands": [[2 * load + 2, 2 * load + 1] for load in range(3)],
+            "limits": [],
+            "data": _columns(curves.load, [(load, side) for load in range(3) for side in (0, 1)]),
+        },
+        {
+            "title": "Clearance with its 90 % interval [mm]",
+            "names": [f"{way}{point}" for way in ways for point in ("", " 5 %", " 95 %")],
+            "bands": [[3, 2], [6, 5]],
+            "limits": [value * 1e3 for value in (clearance.warn, clearance.error)],
+            "data": _columns(curves.clearance, [(column, int(column % 3 != 1)) for column in range(6)]),
+        },
+    ]
+    return [plot for plot in found if plot["data"][0]]
+
+
+def _columns(rows: Envelope, chosen: list[tuple[int, int]]) -> list[list[float | None]]:
+    """Return times and the least (0) or largest (1) values of some columns, null where a line ends."""
+    times: Array | None = None
+    columns: list[list[float | None]] = []
+    order = np.zeros(0, np.int64)
+    for column, side in chosen:
+        at, *sides = rows.bands(column)
+        if times is None:
+            gaps = np.flatnonzero(np.isnan(at))
+            at[gaps] = 0.5 * (at[gaps - 1] + at[gaps + 1])
+            times, order = at, np.argsort(at, kind="stable")
+        columns.append([None if np.isnan(value) else round(value, 6) for value in sides[side][order].tolist()])
+    assert times is not None
+    return [[round(value, 6) for value in times[order].tolist()], *columns]

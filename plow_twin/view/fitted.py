@@ -1,0 +1,160 @@
+"""A fit that can be looked at: measured against fitted motion, residuals, and values with intervals beside the prior.
+
+`plow_twin.view.fitted_file` writes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from textwrap import wrap
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plow_twin.estimate.result import Motion
+from plow_twin.view.figures import legend_beside, signed
+
+Array = NDArray[np.float64]
+
+#: Millimetres and milliradians.
+_SCALE: Final = 1e3
+_COMPONENTS: Final = (("x", "mm"), ("y", "mm"), ("θ", "mrad"))
+#: Characters in a line of the title.
+_LINE: Final = 150
+#: Time between two rows, in that of most, from which on it is a gap.
+_GAP: Final = 10.0
+#: Largest distance from the prior's middle that is drawn, in half widths of the prior; values beyond it lie there.
+_FARTHEST: Final = 2.0
+
+
+@dataclass(frozen=True)
+class FittedValue:
+    """A value with its interval, and what was known before, each as middle, low, high in the unit of the label.
+
+    `prior` is None where there is nothing to hold it against; `note` is its state, or another short word; `is_log` says
+    whether its place in the prior is that of its logarithm.
+    """
+
+    label: str
+    value: tuple[float, float, float]
+    prior: tuple[float, float, float] | None
+    digits: str = ".4g"
+    note: str = ""
+    is_log: bool = False
+
+    @property
+    def text(self) -> str:
+        """The value and its interval."""
+        middle, low, high = (signed(number, self.digits) for number in self.value)
+        interval = "" if low == middle == high else f" ({low} to {high})"
+        return f"{middle}{interval}{', ' if self.note else ''}{self.note}"
+
+    @property
+    def prior_text(self) -> str:
+        """The prior's interval, or nothing."""
+        if self.prior is None:
+            return ""
+        return " to ".join(signed(number, self.digits) for number in self.prior[1:])
+
+    def places(self) -> Array:
+        """Return value, low and high on a scale on which the prior's low, middle and high are -1, 0 and 1."""
+        if self.prior is None:
+            return np.full(3, np.nan)
+        scale = np.log if self.is_log else np.asarray
+        middle, low, high = scale(self.prior)
+        off = scale(self.value) - middle
+        return np.asarray(np.where(off < 0.0, off / max(middle - low, 1e-300), off / max(high - middle, 1e-300)))
+
+
+@dataclass(frozen=True)
+class FittedPicture:
+    """Everything in the picture of a fit.
+
+    `noise` is the standard deviation of the measured x, y [m], theta [rad] where it is known. The prior is named by
+    `prior_name` beside each value, `prior_meaning` explains it.
+    """
+
+    title: str
+    motion: Motion
+    values: Sequence[FittedValue]
+    prior_name: str
+    prior_meaning: str
+    noise: tuple[float, float, float] | None = None
+    notes: Sequence[str] = ()
+
+    def figure(self) -> Any:
+        """Return the figure of matplotlib."""
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(16, 9.5), layout="constrained")
+        grid = figure.add_gridspec(6, 2, width_ratios=(5, 3), height_ratios=(2, 1) * 3)
+        above = None
+        for number in range(len(_COMPONENTS)):
+            above = figure.add_subplot(grid[2 * number, 0], sharex=above)
+            below = figure.add_subplot(grid[2 * number + 1, 0], sharex=above)
+            self._component(number, above, below)
+            above.tick_params(labelbottom=False)
+            below.tick_params(labelbottom=number == len(_COMPONENTS) - 1)
+        below.set_xlabel("time [s]")
+        self._values(figure.add_subplot(grid[:, 1]))
+        lines = (line for note in (self.title, *self.notes) for line in wrap(note, _LINE))
+        figure.suptitle("\n".join(lines), fontsize=11)
+        figure.align_ylabels()
+        return figure
+
+    def _component(self, number: int, above: Any, below: Any) -> None:
+        name, unit = _COMPONENTS[number]
+        motion = self.motion
+        measured, model, residual = (
+            _SCALE * rows[:, number] for rows in (motion.measured, motion.model, motion.residual)
+        )
+        above.plot(motion.t, measured, ".", ms=2.5, color="0.55", label="measured")
+        if np.isfinite(model).any():
+            above.plot(*_broken(motion.t, model), lw=1.0, color="tab:blue", label="fitted")
+        else:
+            above.plot([], [], color="tab:blue", label="no fitted motion")
+        above.set_ylabel(f"{name} [{unit}]")
+        below.plot(motion.t, residual, ".", ms=1.5, color="tab:red", label="measured − fitted")
+        below.axhline(0.0, color="0.4", lw=0.6)
+        if self.noise is not None:
+            half = 1.645 * _SCALE * self.noise[number]
+            below.axhspan(-half, half, color="0.88", lw=0.0, zorder=0, label="90 % of the\nsensor's noise")
+        below.set_ylabel(f"residual\n[{unit}]")
+        for axis in (above, below):
+            legend_beside(axis)
+
+    def _values(self, axis: Any) -> None:
+        """Draw each value on the scale of its prior, its numbers beside it."""
+        rows = range(len(self.values))
+        axis.axvspan(-1.0, 1.0, color="0.9", lw=0.0, zorder=0)
+        for row, value in zip(rows, self.values, strict=True):
+            middle, low, high = np.clip(value.places(), -_FARTHEST, _FARTHEST)
+            axis.plot([low, high], [row, row], color="tab:blue", lw=2.5, solid_capstyle="butt")
+            axis.plot(middle, row, "o", ms=5, color="tab:blue")
+            words = value.text + (f"\n{self.prior_name} {value.prior_text}" if value.prior_text else "")
+            axis.annotate(words, (1.02, row), xycoords=axis.get_yaxis_transform(), va="center", fontsize=8,
+                          annotation_clip=False)  # fmt: skip
+        axis.set_yticks(list(rows), [value.label for value in self.values])
+        axis.set(ylim=(len(self.values) - 0.5, -0.5), xlim=(-_FARTHEST - 0.2, _FARTHEST + 0.2))
+        axis.set_xticks([-1.0, 0.0, 1.0], ["low", "middle", "high"])
+        axis.set_xlabel(f"grey: {self.prior_meaning}")
+        axis.grid(axis="y", color="0.93")
+        axis.set_title("Values with their intervals", fontsize=10)
+
+
+def _broken(t: Array, values: Array) -> tuple[Array, Array]:
+    """Return a curve with NaN where far more time passes than between two rows: no line crosses a gap."""
+    there = np.isfinite(values)
+    t, values = t[there], values[there]
+    steps = np.diff(t)
+    gaps = np.flatnonzero(steps > _GAP * np.median(steps)) + 1 if len(steps) else np.zeros(0, np.int64)
+    return np.insert(t, gaps, np.nan), np.insert(values, gaps, np.nan)
+
+
+def markdown(picture: FittedPicture) -> str:
+    """Return title, notes and values as Markdown."""
+    rows = [f"| {value.label} | {value.text} | {value.prior_text} |" for value in picture.values]
+    heads = f"| | fitted | {picture.prior_name} |", "|---|---|---|"
+    return "\n".join((f"# {picture.title}", "", "\n\n".join(picture.notes), "", *heads, *rows, ""))

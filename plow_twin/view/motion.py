@@ -1,0 +1,50 @@
+"""Picture of a simulated motion, as `Result.plot` returns it."""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING, Any
+
+from matplotlib.figure import Figure
+
+from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.view.figures import legend_beside
+from plow_twin.view.section import PAIR_COLORS
+
+if TYPE_CHECKING:
+    from plow_twin.run.simulate import Result
+
+
+class NotebookFigure(Figure):
+    """A figure that a notebook shows by itself, without pyplot and its global state."""
+
+    def _repr_png_(self) -> bytes:
+        stream = io.BytesIO()
+        self.savefig(stream, format="png")
+        return stream.getvalue()
+
+
+def plot_motion(result: Result, title: str = "") -> Figure:
+    """Return a figure of the pose and the contact forces over time."""
+    figure = NotebookFigure(figsize=(11.0, 7.5), layout="constrained")
+    position, angle, force = (axes := figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 2)))
+    for place, name in enumerate(("x", "y")):
+        position.plot(result.t, 1e3 * result.q[:, place], lw=0.9, label=name)
+    position.set_ylabel("position [mm]")
+    angle.plot(result.t, 1e3 * result.q[:, 2], lw=0.9, color="tab:green", label="θ")
+    angle.set_ylabel("angle [mrad]")
+    _forces(force, result)
+    for axis in axes:
+        legend_beside(axis)
+    force.set_xlabel("time [s]")
+    duration = float(result.t[-1]) if len(result.t) else 0.0
+    figure.suptitle(title or f"{duration:g} s of motion, {len(result.events)} changes of contact")
+    return figure
+
+
+def _forces(axis: Any, result: Result) -> None:
+    for pair, name in enumerate(PAIR_NAMES):
+        color = tuple(part / 255 for part in PAIR_COLORS[pair])
+        axis.plot(result.t, result.force[:, pair] / 1e3, lw=0.9, color=color, label=name)
+    axis.set_ylim(bottom=0.0)
+    axis.set_ylabel("contact force [kN]")

@@ -1,0 +1,54 @@
+"""What a reader of a figure objects to: legends over the data, texts over each other, axes without words."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends import backend_agg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+
+def kept_figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Return a list that receives the figures drawn from now on."""
+    figures: list[Figure] = []
+
+    class Kept(backend_agg.FigureCanvasAgg):
+        def __init__(self, figure: Figure) -> None:
+            figures.append(figure)
+            super().__init__(figure)
+
+    monkeypatch.setattr(backend_agg, "FigureCanvasAgg", Kept)
+    return figures
+
+
+def check_figure(figure: Figure) -> None:
+    """Raise an AssertionError where a legend covers its axes, tick labels collide, or a shown axis has no words."""
+    backend_agg.FigureCanvasAgg(figure).draw()
+    assert figure.get_suptitle()
+    for axis in figure.axes:
+        legend, place = axis.get_legend(), axis.get_window_extent()
+        if legend is not None:
+            its = legend.get_window_extent()
+            assert its.x0 >= place.x1 - 1.0 or its.y1 <= place.y0 + 1.0, axis.get_ylabel()
+        _check_ticks(axis)
+    for text in _texts(figure):
+        assert "um" not in text.split() and "[um]" not in text
+        assert not (text[:1] == "-" and text[1:2].isdigit()), f"{text}: a hyphen for a minus sign"
+
+
+def _check_ticks(axis: Axes) -> None:
+    for labels, low, high in (
+        (axis.get_xticklabels(), "x0", "x1"),
+        (axis.get_yticklabels(), "y0", "y1"),
+    ):
+        shown = [label.get_window_extent() for label in labels if label.get_visible() and label.get_text()]
+        for one, other in pairwise(shown):
+            first, second = sorted((one, other), key=lambda box: getattr(box, low))
+            assert getattr(first, high) <= getattr(second, low) + 1.0, [label.get_text() for label in labels]
+
+
+def _texts(figure: Figure) -> list[str]:
+    return [text.get_text() for text in figure.findobj(Text) if text.get_visible()]

@@ -1,0 +1,89 @@
+"""A fit that can be looked at: measured against fitted motion, residuals, values beside what was known before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from estimate_support import known
+from figure_checks import check_figure
+from rerun.chunk import RrdReader
+from scenes import preset
+
+from plow_twin import simulate
+from plow_twin.estimate.estimate import priors
+from plow_twin.estimate.unknowns import QUANTITIES
+from plow_twin.view.estimate import estimate_picture
+from plow_twin.view.fitted import FittedPicture, FittedValue
+from plow_twin.view.fitted_file import write_fit_picture
+
+
+@pytest.fixture(scope="module")
+def picture() -> FittedPicture:
+    truth, result = known()[0]
+    labels = {one.name: one.label for one in QUANTITIES}
+    prior = priors(truth.nominal, truth.load, truth.poses)
+    return estimate_picture(result, prior, truth.poses, labels, "Estimate of a truth")
+
+
+def test_the_fitted_motion_leaves_the_sensor_s_noise_alone(picture: FittedPicture) -> None:
+    assert picture.noise is not None
+    residual = picture.motion.residual
+    assert np.isfinite(residual).mean() > 0.5
+    np.testing.assert_allclose(np.nanstd(residual, axis=0), picture.noise, rtol=0.1)
+    assert (np.nanstd(picture.motion.measured, axis=0) > 3.0 * np.array(picture.noise)).all()  # not the noise alone
+
+
+def test_each_value_stands_with_its_interval_in_that_of_the_prior(picture: FittedPicture) -> None:
+    values = {value.label: value for value in picture.values}
+    horizontal = values["horizontal clearance [mm]"]
+    assert horizontal.prior is not None and horizontal.note == "estimated"
+    middle, low, high = horizontal.places()
+    assert -1.0 < low < middle < high < 1.0 and high - low < 0.1  # the motion tells far more than was known before
+    assert FittedValue("", (2.0, 1.0, 3.0), (2.0, 1.0, 3.0)).places() == pytest.approx([0.0, -1.0, 1.0])
+    assert FittedValue("", (-1.5, -2.0, -1.0), None, ".1f").text == "−1.5 (−2.0 to −1.0)"
+
+
+def test_its_picture_has_words_and_units_and_nothing_over_the_data(picture: FittedPicture) -> None:
+    figure = picture.figure()
+    check_figure(figure)
+    labels = {axis.get_ylabel() for axis in figure.axes}
+    assert {"x [mm]", "y [mm]", "θ [mrad]", "residual\n[mm]", "residual\n[mrad]"} <= labels
+    assert "model ok, sensor ok" in figure.get_suptitle()
+
+
+def test_its_rerun_file_has_the_same_numbers(picture: FittedPicture, tmp_path: Path) -> None:
+    write_fit_picture(picture, tmp_path / "fit.rrd")
+    rows, table = {}, ""
+    for chunk in RrdReader(str(tmp_path / "fit.rrd")).stream():
+        batch = chunk.to_record_batch()
+        if "Scalars:scalars" in batch.schema.names:
+            rows[chunk.entity_path] = np.array(batch["Scalars:scalars"].to_pylist()).ravel()
+        elif chunk.entity_path == "/values":
+            table = batch["TextDocument:text"].to_pylist()[0][0]
+    residual = picture.motion.residual[:, 2]
+    np.testing.assert_allclose(rows["/residual/theta"], 1e3 * residual[np.isfinite(residual)])
+    assert len(rows["/pose/x/fitted"]) > 100
+    assert picture.values[0].text in table and "prior" in table
+
+
+def test_a_notebook_shows_an_estimate_with_intervals_and_states() -> None:
+    result = known()[0][1]
+    shown = result._repr_html_()
+    assert f"<td>{1e3 * result.horizontal.p05:.3f}</td>" in shown and "<td>estimated</td>" in shown
+    assert "model ok, sensor ok" in shown
+
+
+def test_a_notebook_shows_a_motion_and_scripts_write_it(tmp_path: Path) -> None:
+    result = simulate(preset("paper"), 1.0)
+    figure = result.plot()
+    check_figure(figure)
+    position, angle, force = figure.axes
+    np.testing.assert_array_equal(position.lines[1].get_ydata(), 1e3 * result.q[:, 1])
+    np.testing.assert_array_equal(angle.lines[0].get_ydata(), 1e3 * result.q[:, 2])
+    largest = max(float(np.max(line.get_ydata())) for line in force.lines)
+    assert largest == result.force.max() / 1e3 and force.get_ylabel() == "contact force [kN]"
+    assert figure._repr_png_()[:4] == b"\x89PNG"  # a notebook needs no pyplot
+    figure.savefig(tmp_path / "motion.png")
+    assert result.plot("of mine").get_suptitle() == "of mine"
