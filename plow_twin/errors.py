@@ -129,6 +129,10 @@ class RecordingError(PlowTwinError, ValueError):
     """A recording cannot be written or read; the message names the file and the record."""
 
 
+class ExcessError(RecordingError):
+    """A file is larger, deeper or wider than what is read; the message names the bound."""
+
+
 class UnitError(RecordingError):
     """Measured numbers look as if they were in another unit; the message names them and how to state the unit."""
 

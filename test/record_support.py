@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -68,11 +68,12 @@ def record_run(
     pause_every: int = 100,
     wear: Wear | None = None,
     rollback_span_s: float = 0.0,
+    parameters: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Run:
     """Drive a twin of the paper's head by entries and record it as the node does."""
     scene = replace(load_scene(scene_path("paper")), wear=wear)
-    header = RunHeader(dump_scene(scene), parameters={"hold": "hold"})
+    header = RunHeader(dump_scene(scene), parameters={"hold": "hold", **(parameters or {})})
     recorder = Recorder(folder, header, **options)
     run = Run(folder, recorder.path, LossReport({}, False, None))
 
@@ -84,7 +85,7 @@ def record_run(
     session.start()
     for index, entry in enumerate(entries):
         session.apply(entry)
-        published = session.outputs.take() if index % frame_every == 0 else NOTHING
+        published = session.outputs.pop() if index % frame_every == 0 else NOTHING
         messages = publication_messages(published, header.frame_id, header.child_frame_id)
         run.outputs += [(header.topic(name), message) for name, message in messages.items()]
         if len(published.rows):

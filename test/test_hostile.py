@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import subprocess
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hostile_files import MADE
 
 from plow_twin.scene_file.validation import MOST_PROBLEMS
 from plow_twin.scene_file.yaml_text import (
@@ -156,6 +158,94 @@ def test_thousands_of_unknown_keys_are_listed_up_to_a_number(tmp_path: Path) -> 
     with pytest.raises(SceneError) as caught:
         loads_scene("version: " + "x" * 1_000_000)
     assert len(str(caught.value)) < 2000 and "(1000000 characters)" in str(caught.value)
+
+
+MAP = "excitation: {topic: /load, fields: {fx: x, fy: x, m: x}, stamp: log}"
+#: Commands that read recordings, by the ending of their files.
+COMMANDS = {
+    "run": [["info", "FILE"], ["replay", "FILE", "-q"], ["export", "FILE", "-q", "--to", "npz", "--out", "OUT.npz"]],
+    "foreign": [["analyse", "FILE", "--scene", "paper", "--map", "map.yaml", "--json"]],
+    ".db3": [["analyse", "FILE", "--scene", "paper", "--json"]],
+    ".csv": [["setup", "FILE"], ["analyse", "FILE", "--scene", "paper", "--json"]],
+    ".npz": [
+        ["study", "calibrate", "paper", "-q", "--unknown", "clearance.horizontal_m=0.01:0.05", "--recording", "FILE"],
+    ],
+}
+FOREIGN = {"array", "texts", "nothing", "itself", "tree", "chain", "empty_lines", "topics"}
+#: Files above a bound, and files of which the rest is used.
+ABOVE = {"channels", "many_chunks", "topics", "columns", "line", "row", "unpacked"}
+WITH_LOSS = {"large_chunks", "lying_zstd", "lying_lz4", "lying_length"}
+#: Most memory of a command [MB]: compiled code and libraries take 200.
+MOST_MB = 700
+#: Runs each command in a process of its own, which may take 20 s of processor time and 6 GB of addresses.
+RUNNER = """
+import json, os, resource, sys
+from plow_twin.cli.app import run
+for name, words in json.load(sys.stdin):
+    read, write = os.pipe()
+    pid = os.fork()
+    if not pid:
+        resource.setrlimit(resource.RLIMIT_CPU, (20, 20))
+        resource.setrlimit(resource.RLIMIT_AS, (6 * 2**30,) * 2)
+        os.dup2(write, 2)
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        os.close(write)
+        code = 99
+        try:
+            code = run(words)
+        except BaseException as error:
+            print(repr(error), file=sys.stderr)
+        os._exit(code)
+    os.close(write)
+    with open(read) as said:
+        text = said.read()
+    _, status, used = os.wait4(pid, 0)
+    print(json.dumps([name, words, os.waitstatus_to_exitcode(status), text, used.ru_maxrss >> 10]), flush=True)
+"""
+
+
+@pytest.mark.parametrize("kind", COMMANDS)
+def test_recordings_that_nobody_writes_by_accident_end_in_a_line(kind: str, tmp_path: Path) -> None:
+    """No signal, no traceback, one line at most for an error, and bounded processor time and memory."""
+    asked = []
+    for file, make in MADE.items():
+        name, _, ending = file.partition(".")
+        own = kind in ("run", "foreign") and ending == "mcap" and (name in FOREIGN) == (kind == "foreign")
+        if not own and f".{ending}" != kind:
+            continue
+        folder = tmp_path / name
+        folder.mkdir()
+        make(folder / file)
+        (folder / "map.yaml").write_text(MAP)
+        for words in COMMANDS[kind]:
+            places = {"FILE": file, "map.yaml": "map.yaml"}
+            words = [*words, "--out", "OUT"] if words[0] in ("setup", "study") else words
+            asked.append(
+                (
+                    name,
+                    [
+                        str(folder / places[word]) if word in places else word.replace("OUT", f"{folder}/out")
+                        for word in words
+                    ],
+                )
+            )
+    done = subprocess.run(
+        [sys.executable, "-c", RUNNER],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "10000"},
+        input=json.dumps(asked),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(answers) == len(asked), done.stderr[-2000:]
+    for name, words, code, text, memory_mb in answers:
+        where = (name, words[0], code, memory_mb, text[-500:])
+        unread = name == "header_file" and words[0] != "replay"  # the scene is not needed
+        assert code in ((3,) if name in WITH_LOSS else (2,) if name in ABOVE else (0,) if unread else (1, 2)), where
+        assert memory_mb < MOST_MB and "Traceback" not in text, where
+        assert code == 3 or len(text.strip().splitlines()) <= 2, where
 
 
 SCENE = """

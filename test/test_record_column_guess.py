@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
+import os
+import pty
+import subprocess
+import sys
+import termios
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from plow_twin.cli.app import run as cli
-from plow_twin.errors import RecordingError
+from plow_twin.errors import RecordingError, UnitError
 from plow_twin.record.column_guess import guess_columns
 from plow_twin.scene_file import load_scene
 
@@ -90,3 +97,58 @@ def test_what_cannot_be_told_is_asked_for_by_the_option_that_states_it(
     for columns, units, wrong in (({"fx": "z"}, {}, "got 'z'"), ({"fz": "a"}, {}, "fz"), ({}, {"fx": "lbf"}, "lbf")):
         with pytest.raises(RecordingError, match=wrong):
             guess_columns(file, PAPER, stated | columns, units)
+
+
+def _in_terminal(folder: Path, *said: bytes) -> tuple[int, str]:
+    """Run `setup own.csv` in a terminal of its own and type something at each prompt; return exit code and screen."""
+    command = [sys.executable, "-m", "plow_twin", "setup", "own.csv", "--out", "out"]
+    near, far = pty.openpty()
+
+    def own_terminal() -> None:
+        fcntl.ioctl(far, termios.TIOCSCTTY, 0)
+
+    process = subprocess.Popen(
+        command, cwd=folder, stdin=far, stdout=far, stderr=far, start_new_session=True, preexec_fn=own_terminal
+    )
+    os.close(far)
+    screen, answers, seen = b"", list(said), 0
+    with suppress(OSError):  # the other side is gone
+        while found := os.read(near, 4096):
+            screen += found
+            if answers and screen[seen:].rstrip().endswith(b":"):
+                seen = len(screen)
+                os.write(near, answers.pop(0))
+    os.close(near)
+    return process.wait(60.0), screen.decode()
+
+
+def test_prompts_in_a_terminal_take_corrections_and_write_what_was_chosen(tmp_path: Path) -> None:
+    _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
+    code, screen = _in_terminal(tmp_path, b"z\n", b"a\n", b"\n", b"b\n", b"c\n")
+    assert code == 0, screen
+    assert "'z' is not one of" in screen and screen.count("Column of") == 5
+    written = (tmp_path / "out" / "map.yaml").read_text()
+    assert all(f"{name}: {column}" in written for name, column in (("fx", "a"), ("fy", "b"), ("m", "c")))
+    assert "next: plow-twin live own.csv --map out/map.yaml --scene out/scene.yaml" in screen
+    # what is there already is not written over
+    code, screen = _in_terminal(tmp_path, b"a\n", b"b\n", b"c\n")
+    assert code == 2 and "is there already" in screen and (tmp_path / "out" / "map.yaml").read_text() == written
+
+
+@pytest.mark.parametrize("last", [b"\x03", b"\x04"], ids=["Ctrl-C", "Ctrl-D"])
+def test_a_prompt_that_is_broken_off_leaves_nothing(last: bytes, tmp_path: Path) -> None:
+    _file(tmp_path / "own.csv", "t;a;b;c;d", step=1e-3, size=1.0)
+    code, screen = _in_terminal(tmp_path, b"a\n", last)
+    assert code == 1 and "interrupted" in screen and "Traceback" not in screen
+    assert [item.name for item in tmp_path.iterdir()] == ["own.csv"]
+
+
+def test_dates_that_cannot_be_read_and_stamps_that_fall_are_named(tmp_path: Path) -> None:
+    rows = "".join(f"25.10.2026 02:59:{index % 60:02d},{index},1,2\n" for index in range(100))
+    (tmp_path / "own.csv").write_text(f"time,fx,fy,m\n{rows}")
+    with pytest.raises(RecordingError, match=r"t: got '25\.10\.2026 02:59:00' in the column time, expected a number"):
+        guess_columns(tmp_path / "own.csv", PAPER, {}, {})
+    rows = "".join(f"{100 - index},{index},1,2\n" for index in range(100))
+    (tmp_path / "own.csv").write_text(f"t,fx,fy,m\n{rows}")
+    with pytest.raises(UnitError, match="rows from the newest to the oldest: sort the rows by time"):
+        guess_columns(tmp_path / "own.csv", PAPER, {}, {})

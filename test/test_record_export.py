@@ -44,6 +44,18 @@ def test_tables_hold_the_numbers_of_the_messages(run: Run) -> None:
         recording["forces"]
 
 
+def test_what_a_recording_lacks_is_known_after_its_tables_have_been_read_once(run: Run, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    whole = next(run.folder.glob("*.mcap")).read_bytes()
+    cut.write_bytes(whole[: len(whole) * 3 // 4])
+    alone, read = plow_twin.read_recording(cut), plow_twin.read_recording(cut)
+    read["contact_peaks"].numpy()
+    cut.unlink()  # nothing is read a second time
+    assert read.losses()
+    cut.write_bytes(whole[: len(whole) * 3 // 4])
+    assert alone.losses() == read.losses()
+
+
 def test_numpy_pandas_and_arrow_are_the_same_numbers(run: Run) -> None:
     table = plow_twin.read_recording(run.folder)["head_state"]
     stamps, values = table.numpy()

@@ -303,7 +303,7 @@ def test_a_decimated_recording_keeps_every_peak(tmp_path: Path) -> None:
     decimation, sent, kept = Decimation("decimated", 20.0), [], []
     for index in range(COUNT):
         session.apply(paper_sample(index))
-        publication = session.outputs.take()
+        publication = session.outputs.pop()
         assert len(publication.rows)
         sent.append(publication)
         wanted = decimation.take(publication)

@@ -260,7 +260,7 @@ def record_around_a_pause(folder: Path, stop: Callable[[], object], go_on: Calla
         deadline, index = time.monotonic() + 30, begin
         while not until() and time.monotonic() < deadline:
             session.apply(paper_sample(index))
-            publication = session.outputs.take()
+            publication = session.outputs.pop()
             assert len(publication.rows)
             recorder.publication(publication)
             if recorder.snapshot_wanted:
@@ -342,7 +342,7 @@ def test_a_ring_keeps_the_last_seconds_and_writes_them_at_a_mark(
         end = time.monotonic() + 1.0
         while time.monotonic() < end or recorder.counters.marks < marks:
             session.apply(paper_sample(index))
-            publication = session.outputs.take()
+            publication = session.outputs.pop()
             assert len(publication.rows)
             recorder.publication(publication)
             if recorder.snapshot_wanted:

@@ -109,7 +109,7 @@ class AlarmCheck:
 
     def pose(self, sequence: int, step: int, pose: Pose) -> None:
         """Update the alarms with a measured pose of the journal."""
-        if self.possible and self._alarms.take_pose(pose.stamp_ns, pose.pose):
+        if self.possible and self._alarms.feed_pose(pose.stamp_ns, pose.pose):
             self._say(sequence, step)
 
     def parameter(self, sequence: int, step: int, parameter: Parameter) -> None:
@@ -142,7 +142,7 @@ class AlarmCheck:
     def _take(self, sequence: NDArray[np.int64], step: NDArray[np.int64], published: Published) -> None:
         if len(published.rows) == 1 and not published.finite:
             return  # it was not sent
-        for index in self._alarms.take(published):
+        for index in self._alarms.feed(published):
             self._say(int(sequence[index]), int(step[index]))
 
     def recorded(self, record: OutputRecord) -> None:

@@ -16,7 +16,7 @@ from typing import IO, Any, Final
 import numpy as np
 from numba.core import types
 
-from plow_twin.errors import ForeignRecordingError, RecordingError
+from plow_twin.errors import ExcessError, ForeignRecordingError, RecordingError
 from plow_twin.record.compression import RECORD_LIMIT, decompress
 from plow_twin.record.template import Bytes, Indexes, compiled
 from plow_twin.record.words import word
@@ -35,6 +35,10 @@ _HEAD: Final = struct.Struct("<BQ")
 _HEAD_SIZE: Final = _HEAD.size
 #: A head and the number that an index record begins with [B].
 _INDEX_HEAD: Final = _HEAD.size + 2
+#: Most bytes that the chunks of a file unpack to for each byte of the file, beside the first chunk.
+UNPACKED_RATIO: Final = 200
+#: Most schemas and channels of a file.
+_MOST_DECLARED: Final = 10_000
 #: Channels with a bit of their own.
 _CHANNEL_BITS: Final = 63
 #: Heads of records looked up at once.
@@ -126,10 +130,15 @@ class ChunkReader:
     _answers: dict[int, bool] = field(default_factory=dict, init=False)
     #: rows of the first table of messages
     _room: int = field(default=256, init=False)
+    #: bytes that chunks have unpacked to
+    _unpacked: int = field(default=0, init=False)
+    #: the records of schemas and channels, by opcode and number: chunks may repeat them
+    _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict, init=False)
     _others: Indexes = field(default_factory=lambda: np.empty(256, np.int64), init=False)
 
     def __iter__(self) -> Iterator[Messages]:
         self.finished, self.damaged, self.left_out, self.position = False, 0, 0, 0
+        self._unpacked, self._declared = 0, {}
         schemas: dict[int, tuple[str, bytes]] = {}
         waiting = _Waiting()
         small = _SMALL if self.wanted is None else _SMALL_ALONE
@@ -166,6 +175,7 @@ class ChunkReader:
                     if content is None or len(content) > small:
                         yield from self._scan(waiting.taken(), schemas)
                     if content is not None:
+                        self._count_unpacked(len(content), size)
                         waiting.add(content)
                     else:
                         self._note_damage(schemas)
@@ -209,6 +219,15 @@ class ChunkReader:
             return None
         return np.frombuffer(content, np.uint8)
 
+    def _count_unpacked(self, count: int, size: int) -> None:
+        """Add to the bytes that the chunks of a file of `size` bytes have unpacked to."""
+        self._unpacked += count
+        most = RECORD_LIMIT + UNPACKED_RATIO * size
+        if self._unpacked > most:
+            raise ExcessError(
+                f"{self.path}: unpacks to more than {most >> 20} MiB, expected at most {UNPACKED_RATIO} times its size"
+            )
+
     def _scan(self, contents: list[Bytes], schemas: dict[int, tuple[str, bytes]]) -> Iterator[Messages]:
         """Yield the messages of some chunks, together unless one is damaged."""
         if not contents:
@@ -236,6 +255,12 @@ class ChunkReader:
         from mcap import records
         from mcap.data_stream import ReadDataStream
 
+        number = opcode, record[:2]
+        if self._declared.get(number) == record:
+            return
+        self._declared[number] = record
+        if len(self._declared) > _MOST_DECLARED:
+            raise ExcessError(f"{self.path}: got more schemas and channels, expected at most {_MOST_DECLARED}")
         stream = ReadDataStream(BytesIO(record))
         try:
             if opcode == _SCHEMA:

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.errors import RecordingError
+from plow_twin.errors import RecordingError, UnitError
 from plow_twin.model.scene import Scene
 from plow_twin.record.map_file import QUANTITIES, ROLES, UNITS
 from plow_twin.record.sources import columns_of
@@ -39,6 +39,8 @@ _UNIT: Final = re.compile(
 )
 #: Times beyond these [unit of the file] count from 1970: the year 2001 in s, ms, us and ns.
 _DATES: Final = (("ns", 1e18), ("us", 1e15), ("ms", 1e12), ("s", 1e9))
+#: Most cells that are looked at: fewer rows of a wide file.
+_MOST_CELLS: Final = 2_000_000
 #: Numbers that a load needs.
 _NEEDED: Final = tuple(("excitation", name) for name in ROLES["excitation"])
 
@@ -89,7 +91,7 @@ class Guess:
 
 
 def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: Mapping[str, str]) -> Guess:
-    """Guess what the columns of a CSV file are, from its first 20,000 rows.
+    """Guess what the columns of a CSV file are, from its first 20,000 rows, or two million cells.
 
     Parameters
     ----------
@@ -139,7 +141,9 @@ def guess_columns(path: Path, scene: Scene, columns: Mapping[str, str], units: M
 def _read(path: Path) -> tuple[Guess, list[list[str]]]:
     try:
         with open_csv(path) as stream:
-            rows = [cells for _, cells in islice(csv_rows(stream, "#"), CHECKED + 1)]
+            read = csv_rows(stream, "#")
+            header = next(read, (0, []))[1]
+            rows = [header, *(cells for _, cells in islice(read, min(CHECKED, _MOST_CELLS // max(1, len(header)))))]
         with open_csv(path) as stream:
             first = [line for line in islice(stream, 100) if line.strip() and not line.startswith("#")]
     except (OSError, csv.Error) as error:
@@ -169,6 +173,9 @@ def _find_time(
         index = guess.names.index(guess.time)
         stamps = [time_ns(row[index]) for row in rows]
         guess.stamps_s = np.array([np.nan if stamp is None else stamp * 1e-9 for stamp in stamps])
+        if stamps and np.isnan(guess.stamps_s).all():
+            got = f"{rows[0][index]!r} in the column {guess.time}"
+            raise RecordingError(f"{guess.path}: t: got {got}, expected a number or a date as 2026-01-02T03:04:05.678Z")
         return
     header = _unit_of(guess.time)
     newest = float(np.nanmax(np.abs(found)))
@@ -192,6 +199,8 @@ def _find_units(guess: Guess, numbers: Mapping[str, Array], scene: Scene, given:
         guess.values[key] = numbers[column] * known.get(unit or "", 1.0)
     stated = set(guess.units)
     for doubt in unit_doubts(guess.values, guess.stamps_s[np.isfinite(guess.stamps_s)], scene):
+        if doubt.advice:
+            raise UnitError(f"{guess.path}: {doubt}: {doubt.advice}")
         for name in set(doubt.names) - stated:
             if name == "t":
                 if "its unit by" in guess.because.get("t", ""):

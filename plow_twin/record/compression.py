@@ -14,8 +14,8 @@ import numpy as np
 from plow_twin.errors import RecordingError
 from plow_twin.record.template import Bytes
 
-#: Largest record and largest content of a chunk [B]; beyond it a length is damage.
-RECORD_LIMIT: Final = 256 * 1024 * 1024
+#: Largest record and largest content of a chunk [B]; beyond it a length is damage. Writers close a chunk at some MiB.
+RECORD_LIMIT: Final = 64 * 1024 * 1024
 _of_thread: Final = threading.local()
 #: An LZ4 frame: its head, the flags in it, and the length before each block.
 _LZ4_HEAD: Final = struct.Struct("<IBB")

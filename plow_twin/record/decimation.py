@@ -27,6 +27,11 @@ class Decimation:
         self._impulse = np.zeros(PAIR_COUNT)
         self._peak = np.zeros(PAIR_COUNT)
 
+    @property
+    def keeps_all(self) -> bool:
+        """Whether every publication is recorded."""
+        return self._outputs == "all"
+
     def take(self, published: Published) -> Published | None:
         """Return the publication to record after one of one row, or None."""
         if self._outputs == "all":

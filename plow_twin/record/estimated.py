@@ -51,24 +51,24 @@ def live_estimates(reader: RunReader) -> Iterator[LiveEstimate]:
         stamps, wrenches = entries.stamp_ns.tolist(), entries.wrench.tolist()
         for index, is_sample in enumerate(entries.sample.tolist()):
             if is_sample:
-                window = windows.take_load(stamps[index], tuple(wrenches[index]))
+                window = windows.add_load(stamps[index], tuple(wrenches[index]))
                 if window is not None:
                     formed[window.end_ns] = window
                 continue
             match entries.others[index]:
                 case Pose(stamp_ns, pose, deviation):
-                    windows.take_pose(stamp_ns, pose, deviation)
+                    windows.add_pose(stamp_ns, pose, deviation)
                 case PartOfPose(stamp_ns) as part:
-                    windows.take_pose(stamp_ns, whole_pose(part))
+                    windows.add_pose(stamp_ns, whole_pose(part))
                 case Gaps(stamp_ns, pairs, gaps):
-                    windows.take_gaps(stamp_ns, pairs, gaps)
+                    windows.add_gaps(stamp_ns, pairs, gaps)
                 case Spread(_, deviation):
-                    windows.take_spread(deviation)
+                    windows.set_load_deviation(deviation)
                 case Reset() | SetWear() | SetModel():
                     windows.restart()
                     formed.clear()
                 case Estimated(end_ns=end_ns) as entry:
-                    yield LiveEstimate(entry, _whole(formed.get(end_ns), entry))
+                    yield LiveEstimate(entry, _whole(formed.get(end_ns) or windows.last(), entry))
                     formed = {end: window for end, window in formed.items() if end > end_ns}
 
 
@@ -99,9 +99,9 @@ def stated(parameters: Mapping[str, Any]) -> tuple[Deviation, Deviation]:
     return tuple(map(float, poses)), tuple(map(float, load))
 
 
-def _whole(window: Window | None, entry: Estimated) -> Window | None:
-    """Return the window if its counts are those that the node journalled."""
-    if window is None:
+def _whole(window: Window | str, entry: Estimated) -> Window | None:
+    """Return the window if its bounds and counts are those that the node journalled."""
+    if isinstance(window, str):
         return None
-    same = (window.start_ns, window.samples, window.poses) == (entry.start_ns, entry.samples, entry.poses)
-    return window if same else None
+    formed = window.start_ns, window.end_ns, window.samples, window.poses
+    return window if formed == (entry.start_ns, entry.end_ns, entry.samples, entry.poses) else None

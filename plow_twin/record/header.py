@@ -84,7 +84,7 @@ class RunHeader:
         from plow_twin.scene_file import loads_scene
 
         try:
-            return loads_scene(self.scene_yaml, source=f"scene in {source}")
+            return loads_scene(self.scene_yaml, None, source=f"scene in {source}")
         except SceneError as error:
             raise RecordingError(str(error)) from error
 
@@ -116,9 +116,21 @@ class RunHeader:
                 raise RecordingError(f"{source}: metadata {HEADER_RECORD!r}: {spec.name} is missing")
             try:
                 values[spec.name] = text if spec.type == "str" else json.loads(text)
-            except json.JSONDecodeError as error:
-                raise RecordingError(f"{source}: {spec.name}: got {text!r}, expected JSON ({error})") from error
+            except (ValueError, RecursionError) as error:
+                raise RecordingError(f"{source}: {spec.name}: got {text[:120]!r}, expected JSON ({error})") from error
+            if not _fits(values[spec.name], str(spec.type)):
+                raise RecordingError(f"{source}: {spec.name}: got {text[:120]!r}, expected {spec.type}")
         low, high = TOLERANCE_RANGE
         if not isinstance(values["tol"], float) or not low <= values["tol"] <= high:
             raise RecordingError(f"{source}: tol: got {record['tol']}, expected a number from {low:g} to {high:g}")
         return cls(**values)
+
+
+def _fits(value: Any, kind: str) -> bool:
+    """Return whether a value of the header is of its type; integers have 64 bits."""
+    if kind.startswith("Mapping"):
+        kinds = str | bool | int | float | list if "ParameterValue" in kind else str
+        return isinstance(value, dict) and all(isinstance(item, kinds) for item in value.values())
+    if kind.startswith("int"):
+        return (value is None and "None" in kind) or (type(value) is int and abs(value) < 2**63)
+    return isinstance(value, float if kind == "float" else str)

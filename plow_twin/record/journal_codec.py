@@ -140,11 +140,11 @@ def read_digests(
 
 def _from_json(text: str, source: str) -> Entry | Dropped:
     try:
-        values = json.loads(text)
+        values = json.loads(text, parse_constant=_no_number)
         kind = values["kind"]
         given = [read(values[name]) for name, read in _FIELDS[kind] if name in values or name not in _OPTIONAL]
         entry: Entry | Dropped = _KINDS[kind](*given)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(f"{source}: got {text[:120]!r}, expected an entry of the journal ({error!r})") from error
     return entry
 
@@ -160,6 +160,17 @@ def _exactly(*kinds: type) -> Callable[[Any], Any]:
     return read
 
 
+def _no_number(text: str) -> Any:
+    raise ValueError(f"{text} is not a number of JSON")
+
+
+def _integer(value: Any) -> int:
+    found: int = _exactly(int)(value)
+    if not -_SIGN <= found < _SIGN:
+        raise ValueError(f"an integer of {found.bit_length()} bits")
+    return found
+
+
 def _bytes(value: Any) -> bytes:
     return base64.b64decode(value, validate=True)
 
@@ -170,8 +181,7 @@ def _floats(value: Any) -> tuple[float, ...]:
 
 
 def _ints(value: Any) -> tuple[int, ...]:
-    read = _exactly(int)
-    return tuple(read(item) for item in value)
+    return tuple(map(_integer, value))
 
 
 def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
@@ -182,7 +192,7 @@ def _rows(value: Any) -> tuple[tuple[float, ...], ...]:
 
 
 _READERS: Final[dict[str, Callable[[Any], Any]]] = {
-    "int": _exactly(int),
+    "int": _integer,
     "float": _exactly(float, int),
     "str": _exactly(str),
     "bytes": _bytes,

@@ -8,7 +8,10 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
 from plow_twin.model.pairs import PAIR_NAMES
@@ -27,6 +30,7 @@ from plow_twin.record.merging import StampOf
 from plow_twin.record.sources import Arrived, Columns, Source, TopicType
 from plow_twin.record.times import NO_TIME, NUMBER, STAMP_UNITS, TIMES, time_ns
 
+Number = TypeVar("Number", float, NDArray[np.float64])
 #: Begin of the reasons under which messages are counted that do not fit their role.
 UNFIT: Final = "unfit, "
 _WRENCH: Final = {"fx": "wrench.force.x", "fy": "wrench.force.y", "m": "wrench.torque.z"}
@@ -94,27 +98,57 @@ class Role:
             value = _follow(arrived.content, path)
             if value is None:
                 return None
-            value = value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)
-            values[name] = value * self.factor.get(name, 1.0)
+            values[name] = self.in_si(name, value)
         stamp_ns = self.stamp_ns(arrived)
         return None if stamp_ns is None else (stamp_ns, values)
+
+    def in_si(self, name: str, value: Number) -> Number:
+        """Return a number of that name, or an array of them, in SI."""
+        return (value * self.scale.get(name, 1.0) + self.offset.get(name, 0.0)) * self.factor.get(name, 1.0)
 
     def stamp_ns(self, arrived: Arrived) -> int | None:
         """Return the stamp of a message [ns], or None without one."""
         stamp_ns = self._sent_ns(arrived)
         return None if stamp_ns is None else stamp_ns + self.clock_offset_ns
 
-    def why_unfit(self, arrived: Arrived) -> str:
-        """Return why a message does not fit: the topic, and the field or stamp that is no number."""
+    def why_unfit(self, arrived: Arrived, *, with_value: bool = False) -> str:
+        """Return why a message does not fit: the topic, and the field or stamp that is no number, with what it is."""
+        content = arrived.content
+        if with_value and content is None:
+            count = len(self.message_type.names) if isinstance(self.message_type, Columns) else 0
+            if not count:
+                return f"{self.topic} has a message that is no JSON object"
+            return (
+                f"{self.topic} has a line without the {count} cells of its header (where commas are decimal signs, "
+                "semicolons or tabs must stand between the columns)"
+            )
+
+        def got(path: str) -> str:
+            value = _at(content, path) if isinstance(content, Mapping) else None
+            return f": got {value!r:.60}" if with_value and value is not None else ""
+
         for name, path in self.fields.items():
-            if _follow(arrived.content, path) is None:
-                return f"{self.topic} has no number at {path!r} for {name}"
-        return f"{self.topic} has no time at {self.stamp!r}"
+            if _follow(content, path) is None:
+                return f"{self.topic} has no number at {path!r} for {name}{got(path)}"
+        stamp = self.stamp
+        if stamp == "header" and isinstance(content, Mapping):
+            stamp = next((name for name in TIMES if name in content), stamp)
+        expected = f"{got(stamp)}, expected a number or a date as 2026-01-02T03:04:05.678Z" if with_value else ""
+        return f"{self.topic} has no time at {stamp!r}{expected}"
 
     def plausible(self, values: Mapping[str, float]) -> bool:
         """Return whether all numbers are within their limits; a missing number is."""
         return not any(
             values[name] < low or values[name] > high for name, (low, high) in self.limits.items() if name in values
+        )
+
+    def all_plausible(self, values: NDArray[np.float64]) -> bool:
+        """Return whether all numbers (n, k) of messages, in the order of `fields`, are within their limits."""
+        places = {name: place for place, name in enumerate(self.fields)}
+        return not any(
+            bool(((values[:, places[name]] < low) | (values[:, places[name]] > high)).any())
+            for name, (low, high) in self.limits.items()
+            if name in places
         )
 
     def empty(self, arrived: Arrived) -> bool:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import RecordingError
-from plow_twin.estimate.measurements import LONGEST_GAP, UNSTATED, Deviation, believed, own_deviations
+from plow_twin.estimate import tuning
+from plow_twin.estimate.measurements import UNSTATED, Deviation, believed, own_deviations
 from plow_twin.model.pairs import PAIR_COUNT, PAIR_NAMES
 from plow_twin.model.scene import Scene
 from plow_twin.record.bag import readable_beside
@@ -195,7 +196,7 @@ def _longest(rows: Array, begins: list[int]) -> Array:
     if len(rows) < 2:
         return rows
     apart = np.diff(rows[:, 0])
-    longest = LONGEST_GAP * float(np.median(apart))
+    longest = tuning.LONGEST_GAP[1] * float(np.median(apart))
     bounds = [0, *(row for row in begins if 0 < row < len(rows) and apart[row - 1] > longest), len(rows)]
     first, end = max(pairwise(bounds), key=lambda ends: rows[ends[1] - 1, 0] - rows[ends[0], 0])
     return rows[first:end]

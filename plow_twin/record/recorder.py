@@ -12,12 +12,12 @@ import errno
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,9 @@ from plow_twin.errors import RecordingError, TakenError
 from plow_twin.record.header import RunHeader
 from plow_twin.record.journal_codec import Dropped
 from plow_twin.record.messages import Message
-from plow_twin.stream.journal import Entry, Loss, Sample, Snapshot
+from plow_twin.stream.journal import Digest, Entry, Loss, Sample, Snapshot
 from plow_twin.stream.outputs import Published
+from plow_twin.stream.session import Series
 from plow_twin.stream.topics import Cadence, names_of
 
 if TYPE_CHECKING:
@@ -159,7 +160,9 @@ class Recorder:
         self._limits = (part_bytes, part_s, keep_bytes)
         self._split_due = False
         self._part_since = time.monotonic()
-        self._queue: deque[_EntryItem | _OutputItem | _PublicationItem] = deque()
+        self._queue: deque[_Item] = deque()
+        #: by how much the entries and publications that wait are more than the items of the queue
+        self._more = 0
         self._queue_size = queue_size
         self._flush_period_s = flush_period_s
         self._now_ns = now_ns
@@ -186,7 +189,7 @@ class Recorder:
         """Whether the caller should journal a `Snapshot` now: after a loss, or at the end of a part."""
         if not (self._snapshot_due or self._split_due):
             return False
-        return self._accepting and not self._paused and len(self._queue) < self._queue_size // 2
+        return self._accepting and not self._paused and self._queued < self._queue_size // 2
 
     @property
     def counters(self) -> RecorderCounters:
@@ -195,7 +198,7 @@ class Recorder:
             lost = dict(self._lost)
             error = self._error or self._mark_error
         marks = self._marks, self._marks_lost
-        return RecorderCounters(self._written, len(self._queue), self._writer.bytes_written, lost, error, *marks)
+        return RecorderCounters(self._written, self._queued, self._writer.bytes_written, lost, error, *marks)
 
     def mark(self) -> Path | None:
         """Write the ring, once the next `Snapshot` is journalled or the recorder is closed.
@@ -276,8 +279,56 @@ class Recorder:
             self._lost.update(topics)
             return False
 
+    def series(self, series: Series) -> NDArray[np.int64]:
+        """Queue the samples and digests of a series as entries of the journal, or lose all of them.
+
+        Returns the number of the entry before the publication after each sample, shape (n,).
+        """
+        now, samples = self._now_ns(), len(series.stamps)
+        count = samples + len(series.digests)
+        with self._lock:
+            item = _SeriesItem(self._sequence + 1, now, series)
+            if self._journal_gap == 0 and self._room(count, self._queue_size):
+                self._push_many(item, count)
+            else:
+                self._snapshot_due = True
+                self._journal_gap += count
+                self._lost[JOURNAL] += count
+            self._sequence += count
+        ends = np.zeros(samples, np.int64)
+        ends[series.digest_after - 1] = 1
+        return item.sequence + np.arange(samples) + np.cumsum(ends)
+
+    def publications(self, published: Published, sequence: NDArray[np.int64]) -> bool:
+        """Take publications that no messages were sent of, each after the entry of that number; False when lost."""
+        now, count = self._now_ns(), len(published.rows)
+        topics = Counter(dict.fromkeys(self._topics_of[False, False], count))
+        topics.update(dict.fromkeys(set(self._topics_of[True, False]) - topics.keys(), len(published.slow)))
+        with self._lock:
+            if self._room(count + len(topics), self._queue_size * 3 // 4):
+                for topic in topics if self._output_gaps else ():
+                    gap = self._output_gaps.pop(topic, 0)
+                    if gap:
+                        self._push_entry(now, Dropped(topic, gap))
+                self._push_many(_PublicationsItem(sequence, now, published, topics), count)
+                return True
+            self._snapshot_due = True
+            self._output_gaps.update(topics)
+            self._lost.update(topics)
+            return False
+
     def _room(self, items: int, limit: int) -> bool:
-        return self._accepting and not self._paused and len(self._queue) + items <= limit
+        return self._accepting and not self._paused and self._queued + items <= limit
+
+    @property
+    def _queued(self) -> int:
+        """Number of items that wait, each entry and publication of a series counted."""
+        return len(self._queue) + self._more
+
+    def _push_many(self, item: _SeriesItem | _PublicationsItem, count: int) -> None:
+        """Queue an item that stands for some."""
+        self._more += count - 1
+        self._queue.append(item)
 
     def _push_entry(self, now: int, entry: Entry | Dropped) -> None:
         self._sequence += 1
@@ -306,7 +357,7 @@ class Recorder:
         with self._lock:
             error = self._error or self._mark_error
             if error is None and not self._closed:
-                error = f"{self.path}: not closed within {timeout_s:g} s, {len(self._queue)} item(s) unwritten"
+                error = f"{self.path}: not closed within {timeout_s:g} s, {self._queued} item(s) unwritten"
             return LossReport(dict(self._lost), self._closed, error)
 
     def __enter__(self) -> Self:
@@ -350,13 +401,17 @@ class Recorder:
         while backlog > 0:
             items = [self._queue.popleft() for _ in range(min(backlog, _BURST))]
             backlog -= len(items)
-            self._unflushed.update(chain.from_iterable(item.keys for item in items))
+            _add_keys(self._unflushed, items)
             self._write(items)
-            self._written += len(items)
+            count = sum(map(_count, items))
+            self._written += count
+            if count > len(items):
+                with self._lock:
+                    self._more -= count - len(items)
             if backlog:
                 time.sleep(1e-6)
 
-    def _write(self, items: list[_EntryItem | _OutputItem | _PublicationItem]) -> None:
+    def _write(self, items: list[_Item]) -> None:
         """Write items in order, runs of one kind at once; journal and outputs each keep their order."""
         samples: list[_EntryItem] = []
         publications: list[_PublicationItem] = []
@@ -365,6 +420,9 @@ class Recorder:
                 publications.append(item)
             elif isinstance(item, _EntryItem) and isinstance(item.entry, Sample):
                 samples.append(item)
+            elif isinstance(item, _SeriesItem | _PublicationsItem):
+                samples, publications = self._write_samples(samples), self._write_publications(publications)
+                item.write(self._writer)
             elif isinstance(item, _EntryItem):
                 samples = self._write_samples(samples)
                 if isinstance(item.entry, Snapshot) and (self._mark is not None or self._part_is_full()):
@@ -447,9 +505,9 @@ class Recorder:
             first = not self._paused
             self._paused = reason
             self._error = f"{self.path}: recording stopped: {reason}"
-            unwritten, self._queue = self._queue, deque()
+            unwritten, self._queue, self._more = self._queue, deque(), 0
             lost = Counter(self._unflushed)
-            lost.update(chain.from_iterable(item.keys for item in unwritten))
+            _add_keys(lost, unwritten)
             self._lost.update(lost)
             self._journal_gap += lost.pop(JOURNAL, 0)
             self._output_gaps.update(lost)
@@ -465,11 +523,51 @@ class Recorder:
         with self._lock:
             self._accepting, self._paused = False, None
             self._error = self._error or f"{self.path}: recording stopped: {reason}"
-            unwritten, self._queue = self._queue, deque()
+            unwritten, self._queue, self._more = self._queue, deque(), 0
             self._lost.update(unsafe)
-            self._lost.update(chain.from_iterable(item.keys for item in unwritten))
+            _add_keys(self._lost, unwritten)
         if first and self._on_error is not None:
             self._on_error(self._error)
+
+
+class _SeriesItem(NamedTuple):
+    """Samples and digests of the journal on their way to the file; `sequence` is the number of the first."""
+
+    sequence: int
+    log_time_ns: int
+    series: Series
+
+    @property
+    def keys(self) -> Mapping[str, int]:
+        """What is lost with it."""
+        return {JOURNAL: len(self.series.stamps) + len(self.series.digests)}
+
+    def write(self, writer: RunWriter) -> None:
+        stamps, wrench, sequence, begin = self.series.stamps, self.series.wrench, self.sequence, 0
+        digests = dict(zip(self.series.digest_after.tolist(), self.series.digests, strict=True))
+        for end in sorted({*digests, len(stamps)}):
+            here = slice(begin, end)
+            numbers = np.arange(sequence, sequence + end - begin)
+            log_times = np.full(end - begin, self.log_time_ns, np.int64)
+            writer.write_samples(numbers, log_times, stamps[here], wrench[here])
+            sequence += end - begin
+            if end in digests:
+                writer.write_entry(sequence, self.log_time_ns, Digest(stamps.item(end - 1), digests[end]))
+                sequence += 1
+            begin = end
+
+
+class _PublicationsItem(NamedTuple):
+    """Publications on their way to the file, each after the entry of its number; `keys` are lost with them."""
+
+    sequence: NDArray[np.int64]
+    log_time_ns: int
+    published: Published
+    keys: Mapping[str, int]
+
+    def write(self, writer: RunWriter) -> None:
+        log_times = np.full(len(self.sequence), self.log_time_ns, np.int64)
+        writer.write_publications(self.sequence, log_times, self.published)
 
 
 def _numbers(items: Sequence[_EntryItem | _PublicationItem]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -521,3 +619,23 @@ class _PublicationItem(NamedTuple):
     published: Published
     sent: Mapping[str, bytes]
     keys: tuple[str, ...]
+
+
+_Item: TypeAlias = _EntryItem | _OutputItem | _PublicationItem | _SeriesItem | _PublicationsItem
+
+
+def _count(item: _Item) -> int:
+    """Return how many entries or publications an item stands for."""
+    if isinstance(item, _SeriesItem):
+        return item.keys[JOURNAL]
+    return len(item.sequence) if isinstance(item, _PublicationsItem) else 1
+
+
+def _add_keys(counts: Counter[str], items: Iterable[_Item]) -> None:
+    """Count what is lost with some items."""
+    several = [item for item in items if isinstance(item, _SeriesItem | _PublicationsItem)]
+    if not several:
+        counts.update(chain.from_iterable(item.keys for item in items))
+        return
+    for item in items:
+        counts.update(item.keys)

@@ -89,6 +89,7 @@ class Recording:
         self.path = path
         self.header: RunHeader = reader.header
         self.scene: Scene = reader.header.scene(reader.path)
+        self._losses: dict[str, int] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -101,12 +102,22 @@ class Recording:
         return Table(self, name, COLUMNS[name])
 
     def losses(self) -> dict[str, int]:
-        """Return the counts of missing messages by topic; the whole recording is read."""
+        """Return the counts of missing messages by topic.
+
+        The recording is read for them, unless `batches` or a table has read it to its end already.
+        """
+        if self._losses is None:
+            for _ in self._read(outputs=False):
+                pass
+        assert self._losses is not None
+        return dict(self._losses)
+
+    def _read(self, *, outputs: bool) -> Iterator[Batch]:
+        """Yield the batches of the recording, and keep at the end what it lacks."""
         reader = RunReader(self.path)
-        for _ in reader.batches(outputs=False):
-            pass
+        yield from reader.batches(outputs=outputs)
         whole = reader.status is FileStatus.COMPLETE
-        return {**reader.lost, **reader.lost_parts, **({} if whole else {reader.status.value: 1})}
+        self._losses = {**reader.lost, **reader.lost_parts, **({} if whole else {reader.status.value: 1})}
 
     def batches(self, *names: str) -> Iterator[dict[str, Batched]]:
         """Return an iterator over the rows of some tables in one pass over the recording.
@@ -125,7 +136,7 @@ class Recording:
         templates = publication_templates(self.header.frame_id, self.header.child_frame_id)
         sent = [name for name in wanted if name in templates]
         topics = {self.header.topic(name): name for name in sent}
-        for batch in RunReader(self.path).batches(outputs=bool(sent)):
+        for batch in self._read(outputs=bool(sent)):
             found: dict[str, Batched] = {}
             if "excitation" in wanted and batch.entries.sample.any():
                 found["excitation"] = Batched(*batch.entries.samples())

@@ -312,9 +312,7 @@ class _Replay:
         if isinstance(entry, Snapshot) and self.synced:
             entry = self.session.snapshot()  # with the windows of the publications that are written
         self.sink.write_entry(record.sequence, record.log_time_ns, entry)
-        published = (
-            self.session.outputs.take() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
-        )
+        published = self.session.outputs.pop() if self.synced and isinstance(entry, Sample | Hold | Unload) else NOTHING
         if len(published.rows) and published.finite:
             self.sink.write_publications(np.array([record.sequence]), np.array([record.log_time_ns]), published)
 
@@ -450,7 +448,7 @@ class _Replay:
             if self.published is not None:
                 published = self.published.at(len(self.published.rows) - 1)
             else:
-                published = self.session.outputs.take()
+                published = self.session.outputs.pop()
                 if len(published.rows):
                     self.alarms.published(np.array([here]), np.array([self.report.steps - 1]), published)
             self.published = None

@@ -30,6 +30,13 @@ _ROWS: Final = 1000
 _ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 #: Largest message that is unpacked [B].
 _LARGEST_MESSAGE: Final = 2**26
+#: Whether topics or messages are a view or a virtual table, or have computed columns: these may have no end.
+_COMPUTED: Final = """
+    SELECT 1 FROM sqlite_master
+    WHERE name COLLATE NOCASE IN ('topics', 'messages') AND (type != 'table' OR rootpage = 0)
+    UNION ALL SELECT 1 FROM pragma_table_xinfo('messages') WHERE hidden
+    UNION ALL SELECT 1 FROM pragma_table_xinfo('topics') WHERE hidden LIMIT 1
+"""
 #: Errors of sqlite3 with a damaged file: its own, messages that are not UTF-8, cells of impossible length.
 _SQLITE_ERRORS: Final = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 
@@ -153,13 +160,13 @@ class Decoder:
 
     def knows(self, topic: str, message_type: str, schema: str = "") -> bool:
         """Return whether a type can be decoded; other types are noted as unknown."""
-        from rosbags.typesys import get_types_from_msg
+        from plow_twin.record.foreign_types import parsed_types
 
         if message_type not in self._store.types and schema:
             try:
-                types = get_types_from_msg(schema, message_type)
+                types = parsed_types(schema, message_type)
                 self._store.register({name: type_ for name, type_ in types.items() if name not in self._store.types})
-            except Exception:  # a schema in another language, or a damaged one
+            except Exception:  # a schema in another language, a damaged one, or one without end
                 self._losses.unknown_types[topic] = message_type
         if message_type in self._store.types:
             return True
@@ -273,6 +280,10 @@ class SqliteSource:
                 self._unread.add(path)
                 self.losses.counts["unread_logs"] = len(self._unread)
         connection.text_factory = lambda data: data.decode(errors="replace")
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST_MESSAGE)
+        if connection.execute(_COMPUTED).fetchone() is not None:
+            connection.close()
+            raise sqlite3.DatabaseError("its tables are computed, expected stored ones")
         return connection
 
     def topics(self) -> dict[str, str]:
@@ -358,12 +369,15 @@ class CsvSource:
         Raises
         ------
         RecordingError
-            A column's name stands twice.
+            A file has no header, or a column's name stands twice.
         """
         found: dict[str, TopicType] = {}
         for part in self.parts:
-            with open_csv(part) as stream:
-                names = [name.strip() for name in next(csv_rows(stream), (0, []))[1]]
+            try:
+                with open_csv(part) as stream:
+                    names = [name.strip() for name in next(csv_rows(stream), (0, []))[1]]
+            except csv.Error as error:
+                raise RecordingError(f"{part}: {error}") from None
             found[part.stem] = columns_of(part, names)
         return found
 

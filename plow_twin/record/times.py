@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 #: Columns and keys that hold the time unless the mapping names others.
 TIMES: Final = ("t", "time")
@@ -16,7 +20,10 @@ NUMBER: Final = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|inf|nan)", r
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 #: Times below this [s] count from some start and are moved away from 0, which stands for a missing stamp.
 EPOCH_S: Final = 1e9
-_ORIGIN_NS: Final = 1_000_000_000
+#: A time of 0 is at this stamp [ns].
+START_NS: Final = 1_000_000_000
+#: What plain decimal numbers are written with.
+OF_NUMBERS: Final = b"0123456789+-.eE "
 #: Dates beyond this are placeholders: many databases write 9999-12-31 for no date.
 _FARTHEST_NS: Final = 4_000_000_000_000_000_000
 
@@ -40,13 +47,33 @@ def time_ns(value: Any, unit: str = "s") -> int | None:
     scale = STAMP_UNITS[unit]
     # integers keep their nanoseconds; a float resolves today's date to 0.2 us
     stamp_ns = _within(value * scale if isinstance(value, int) else round(value * scale))
-    return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + _ORIGIN_NS
+    return stamp_ns if stamp_ns is None or stamp_ns >= EPOCH_S * 1e9 else stamp_ns + START_NS
+
+
+def times_ns(texts: Sequence[bytes], unit: str) -> NDArray[np.int64] | None:
+    """Return the stamps [ns] of texts, shape (n,), each as of `time_ns`; None where one has none."""
+    try:
+        numbers = np.array(list(map(float, texts))) * STAMP_UNITS[unit]
+    except ValueError:
+        numbers = None
+    if numbers is None or not (np.abs(numbers) < _FARTHEST_NS).all() or b"".join(texts).translate(None, OF_NUMBERS):
+        found = [time_ns(text.decode(errors="replace"), unit) for text in texts]
+        return None if None in found else np.array(found, np.int64)
+    stamps: NDArray[np.int64] = np.rint(numbers).astype(np.int64)
+    stamps[stamps < EPOCH_S * 1e9] += START_NS
+    for place, text in enumerate(texts):
+        if b"." not in text:  # an integer keeps its nanoseconds
+            stamp_ns = time_ns(text.decode(), unit)
+            if stamp_ns is None:
+                return None
+            stamps[place] = stamp_ns
+    return stamps
 
 
 def time_text(stamp_ns: int, *, own_start: bool = False) -> str:
     """Return a stamp as a date, or below `EPOCH_S` in seconds; `own_start`: as it stood there, before `time_ns`."""
     if stamp_ns < EPOCH_S * 1e9:
-        return f"{(stamp_ns - (_ORIGIN_NS if own_start else 0)) * 1e-9:.3f} s"
+        return f"{(stamp_ns - (START_NS if own_start else 0)) * 1e-9:.3f} s"
     date = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
     return f"{date:%Y-%m-%d %H:%M:%S}.{stamp_ns // 10**6 % 1000:03d} UTC"
 

@@ -15,9 +15,11 @@ from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 from plow_twin.record.mapping import Role, readings
 from plow_twin.record.sources import Arrived
+from plow_twin.record.times import START_NS
 from plow_twin.stream.limits import largest_displacement
 
 Array = NDArray[np.float64]
+_START_S: Final = START_NS * 1e-9
 
 #: Messages that are looked at: 20 s at 1 kHz hold several periods of a load.
 CHECKED: Final = 20_000
@@ -31,8 +33,19 @@ _LARGEST_ANGLE_RAD: Final = 0.25 * np.pi
 _SLOW_S: Final = 0.5
 #: A load is smooth when it changes by less than this share of its range between two samples, in the median.
 _SMOOTH: Final = 0.05
+#: Ploughs travel at 3.6 m/s at most (Caterpillar's GH1600); beyond this [m/s] a speed is in another unit.
+_FASTEST_M_S: Final = 5.0
+#: Stamps of which so many fall are no times; where nearly all do, the newest row stands first.
+_FALLING, _REVERSED = 0.2, 0.9
+#: Spreadsheets count days since 1900: dates of this century lie between these numbers.
+_SHEET_DAYS: Final = (36_525.0, 73_050.0)
 #: Fewer samples tell nothing of their spacing.
 _FEW: Final = 20
+_SORT: Final = "sort the rows by time"
+_NAME_TIME: Final = "name the column of the time in a mapping (stamp: NAME)"
+_WRITE_SECONDS: Final = "write seconds, or dates such as 2026-01-02T03:04:05.678Z"
+#: Load cells send at 10 kHz at most: stamps closer together [s] are in another unit.
+_SHORTEST_SPACING_S: Final = 1e-4
 #: Stamps beyond this are dates: 1e9 s is in the year 2001.
 _DATES_S: Final = 1e9
 
@@ -42,6 +55,7 @@ class UnitDoubt:
     """Numbers of a role that look as if they were in another unit; the stamps of the load are `t`.
 
     `found` and `expected` say why, `likely` is the unit that they look like. `is_impossible`: no head can move so.
+    `advice` says what to do where no unit helps.
     """
 
     role: str
@@ -50,6 +64,7 @@ class UnitDoubt:
     expected: str
     likely: str
     is_impossible: bool = False
+    advice: str = ""
 
     def __str__(self) -> str:
         return f"{', '.join(self.names)}: got {self.found}, expected {self.expected}; they look like {self.likely}"
@@ -57,7 +72,7 @@ class UnitDoubt:
     @property
     def remedy(self) -> str:
         """How to state the unit."""
-        return "state the unit: " + " ".join(f"--unit {name}={self.likely}" for name in self.names)
+        return self.advice or "state the unit: " + " ".join(f"--unit {name}={self.likely}" for name in self.names)
 
 
 def unit_doubts(
@@ -77,7 +92,16 @@ def unit_doubts(
     magnitudes = {key: _usual_magnitude(np.asarray(found, float)) for key, found in values.items()}
     load = [values["excitation", name] for name in ("fx", "fy", "m") if ("excitation", name) in values]
     spacing = _spacing(np.asarray(load_stamps_s, float), np.array(load, float).T) if load else []
-    return [*_load(magnitudes, scene), *_pose(magnitudes, scene), *spacing]
+    return [*_load(magnitudes, scene), *_pose(magnitudes, scene), *_travel(values), *spacing]
+
+
+def small_thresholds(thresholds: Sequence[float], scene: Scene) -> str:
+    """Return that thresholds of a force in N look as if they were in kN; empty where they do not."""
+    usual = _largest_force(scene)
+    small = [found for found in thresholds if 0.0 < found < _IDLE_SHARE * usual]
+    if not small:
+        return ""
+    return f"alarm_force: got {small[0]:g} N, expected some {usual:.2g} N as in the scene; is it in kN?"
 
 
 def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: Scene, source: object) -> None:
@@ -102,7 +126,7 @@ def check_units(messages: Iterable[Arrived], roles: Mapping[str, Role], scene: S
     doubts = [
         doubt
         for doubt in unit_doubts(values, stamps, scene)
-        if not (load and load.stamp_unit_is_stated if doubt.names == ("t",) else _stated(doubt, roles))
+        if doubt.advice or not (load and load.stamp_unit_is_stated if doubt.names == ("t",) else _stated(doubt, roles))
     ]
     if doubts:
         raise UnitError(f"{source}: " + "; ".join(f"{doubt}: {doubt.remedy}" for doubt in doubts))
@@ -114,10 +138,10 @@ def _stated(doubt: UnitDoubt, roles: Mapping[str, Role]) -> bool:
     return set(doubt.names) <= {*role.factor, *role.scale, *role.limits}
 
 
-def _usual_magnitude(values: Array) -> float:
+def _usual_magnitude(values: Array, percent: float = 99.0) -> float:
     """Return the magnitude that one value in a hundred exceeds: an outlier tells nothing of the unit."""
     known = np.abs(values)[np.isfinite(values)]
-    return float(np.percentile(known, 99.0)) if known.size else 0.0
+    return float(np.percentile(known, percent)) if known.size else 0.0
 
 
 def _load(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[UnitDoubt]:
@@ -145,6 +169,15 @@ def _pose(magnitudes: Mapping[tuple[str, str], float], scene: Scene) -> list[Uni
     return doubts
 
 
+def _travel(values: Mapping[tuple[str, str], Sequence[float] | Array]) -> list[UnitDoubt]:
+    """Doubt speeds along the face that no plough reaches, where they are more than single wrong ones."""
+    speed = _usual_magnitude(np.asarray(values.get(("travel", "speed"), ()), float), 90.0)
+    if speed <= _FASTEST_M_S:
+        return []
+    likely = "km/h" if speed <= 3.6 * _FASTEST_M_S else "m/min"
+    return [UnitDoubt("travel", ("speed",), f"{speed:.3g}", f"at most {_FASTEST_M_S:g} m/s, as ploughs reach", likely)]
+
+
 def _largest_force(scene: Scene) -> float:
     """Return the largest force [N] of the scene's loads, or the head's weight where that is larger."""
     amplitude = compile_loads(scene.loads).largest()
@@ -153,9 +186,25 @@ def _largest_force(scene: Scene) -> float:
 
 def _spacing(stamps_s: Array, load: Array) -> list[UnitDoubt]:
     """Doubt stamps that are far apart for a load (n, k) that changes smoothly from one to the next."""
-    if len(stamps_s) < _FEW or stamps_s.max() > _DATES_S:
+    if len(stamps_s) < _FEW:
         return []
-    spacing = float(np.median(np.abs(np.diff(stamps_s))))
+    steps = np.diff(stamps_s)
+    falling = float((steps < 0.0).mean())
+    if falling > _FALLING:
+        found, expected = f"stamps of which {falling:.0%} fall", "times that rise"
+        if falling > _REVERSED:
+            return [
+                UnitDoubt("excitation", ("t",), found, expected, "rows from the newest to the oldest", False, _SORT)
+            ]
+        return [UnitDoubt("excitation", ("t",), found, expected, "another column", False, _NAME_TIME)]
+    if stamps_s.max() > _DATES_S:
+        return []
+    spacing = float(np.median(np.abs(steps)))
+    # a number from some start is a second later as a stamp
+    low, high = (days + _START_S for days in _SHEET_DAYS)
+    if low <= stamps_s[0] <= high and np.ptp(stamps_s) < 1.0 and spacing < _SHORTEST_SPACING_S:
+        found = f"{stamps_s[0] - _START_S:.6g} and stamps {spacing:.2g} s apart"
+        return [UnitDoubt("excitation", ("t",), found, "seconds", "days of a spreadsheet", False, _WRITE_SECONDS)]
     span = np.ptp(load, axis=0)
     if spacing < _SLOW_S or not span.any():
         return []

@@ -7,12 +7,23 @@ import re
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
-from typing import IO
+from typing import IO, Final
+
+from plow_twin.errors import ExcessError
+
+#: Longest row [characters] and most columns; a historian's export has some hundred.
+LONGEST_ROW: Final = 2**20
+MOST_COLUMNS: Final = 10_000
 
 
 def open_csv(path: Path) -> IO[str]:
     """Open a text file without the byte order mark that spreadsheets write."""
     return path.open(newline="", encoding="utf-8-sig", errors="replace")
+
+
+def is_utf16(begin: bytes) -> bool:
+    """Return whether a file that begins so is UTF-16, as spreadsheets write "Unicode text"."""
+    return begin[:2] in (b"\xff\xfe", b"\xfe\xff")
 
 
 def delimiter_of(header: str) -> str:
@@ -30,20 +41,34 @@ def csv_rows(stream: IO[str], comment: str = "") -> Iterator[tuple[int, list[str
     ------
     csv.Error
         A line is no row.
+    ExcessError
+        A row is longer than `LONGEST_ROW`, or there are more than `MOST_COLUMNS`.
     """
-    number = 0
+    number = length = 0
 
     def lines() -> Iterator[str]:
-        nonlocal number
-        for number, line in enumerate(stream, 1):  # noqa: B007 - of the row that is yielded
-            if not comment or not line.startswith(comment):
+        nonlocal number, length
+        while line := stream.readline(LONGEST_ROW + 1):
+            number += 1
+            is_comment = bool(comment) and line.startswith(comment)
+            length += 0 if is_comment or line.isspace() else len(line)
+            if max(length, len(line)) > LONGEST_ROW:
+                raise _excess(stream, number, "a longer row", f"at most {LONGEST_ROW >> 20} MiB")
+            if not is_comment:
                 yield line
 
     kept = lines()
     first = next((line for line in kept if line.strip()), "")
     delimiter, is_header = delimiter_of(first), True
     for cells in csv.reader(chain([first], kept), delimiter=delimiter):
+        length = 0
+        if len(cells) > MOST_COLUMNS:
+            raise _excess(stream, number, f"{len(cells)} columns", f"at most {MOST_COLUMNS}")
         if not any(cells):
             continue
         yield number, cells if is_header or delimiter == "," else [cell.replace(",", ".") for cell in cells]
         is_header = False
+
+
+def _excess(stream: IO[str], line: int, got: str, expected: str) -> ExcessError:
+    return ExcessError(f"{getattr(stream, 'name', 'csv')}: line {line}: got {got}, expected {expected}")

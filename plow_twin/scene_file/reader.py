@@ -63,7 +63,7 @@ def load_scene(path: str | Path) -> Scene:
     return _scene(*read_yaml(path, "scene", _SECTIONS), path.parent, str(path))
 
 
-def loads_scene(text: str, base: str | Path | None = None, *, source: str = "scene") -> Scene:
+def loads_scene(text: str, base: str | Path | None = ".", *, source: str = "scene") -> Scene:
     """Read a scene from YAML text.
 
     Parameters
@@ -71,7 +71,8 @@ def loads_scene(text: str, base: str | Path | None = None, *, source: str = "sce
     text : str
         The scene as YAML.
     base : str or Path, optional
-        Folder against which load tables are looked up; the working directory by default.
+        Folder against which load tables are looked up; the working directory by default. None: tables in files are
+        refused.
     source : str
         What messages call the scene.
 
@@ -80,7 +81,7 @@ def loads_scene(text: str, base: str | Path | None = None, *, source: str = "sce
     SceneError
         When the scene cannot be used; it lists every problem.
     """
-    return _scene(*load_yaml(text, "scene", _SECTIONS), Path(base or "."), source)
+    return _scene(*load_yaml(text, "scene", _SECTIONS), None if base is None else Path(base), source)
 
 
 @cache
@@ -88,7 +89,7 @@ def _schema() -> Schema:
     return scene_schema()
 
 
-def _scene(raw: Any, problems: list[Problem], base: Path, source: str) -> Scene:
+def _scene(raw: Any, problems: list[Problem], base: Path | None, source: str) -> Scene:
     """Return the scene in a document that was read with these problems."""
     if raw is None and problems:
         raise SceneError(problems, source)
@@ -105,7 +106,7 @@ def _scene(raw: Any, problems: list[Problem], base: Path, source: str) -> Scene:
 
 
 def _read_parts(
-    raw: Mapping[str, Any], bad: set[str], marks: dict[str, Provenance], base: Path, problems: list[Problem]
+    raw: Mapping[str, Any], bad: set[str], marks: dict[str, Provenance], base: Path | None, problems: list[Problem]
 ) -> dict[str, Any]:
     """Build the parts of a scene without problems."""
     parts: dict[str, Any] = {}
@@ -148,7 +149,7 @@ def _deviation(raw: Mapping[str, Any]) -> float | None:
 
 
 def _read_loads(
-    raw: list[dict[str, Any]], bad: set[str], marks: dict[str, Provenance], base: Path, problems: list[Problem]
+    raw: list[dict[str, Any]], bad: set[str], marks: dict[str, Provenance], base: Path | None, problems: list[Problem]
 ) -> Iterator[Load]:
     for index, item in enumerate(raw):
         path = f"loads[{index}]"
@@ -171,8 +172,10 @@ def _read_loads(
             yield Table(**shared, t=t, wrench=wrench, **hold)
 
 
-def _samples(raw: Mapping[str, Any], path: str, base: Path) -> tuple[Any, Any]:
+def _samples(raw: Mapping[str, Any], path: str, base: Path | None) -> tuple[Any, Any]:
     if "file" in raw:
+        if base is None:
+            raise SceneError([Problem(f"{path}.file", raw["file"], "the rows of the table")])
         return read_table(base / raw["file"], raw.get("columns"), f"{path}.file")
     return sample_table(raw["t"], raw["wrench"], path)
 
