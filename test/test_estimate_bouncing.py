@@ -11,7 +11,7 @@ from estimate_support import GROUPS, draw, known
 from numpy.typing import NDArray
 from scenes import preset
 
-from plow_twin.estimate import estimate as estimating
+from plow_twin.estimate import tuning
 from plow_twin.estimate.bouncing import (
     Bounced,
     MotionFeatures,
@@ -21,7 +21,7 @@ from plow_twin.estimate.bouncing import (
     path_deviate,
     regress_near,
 )
-from plow_twin.estimate.estimate import estimate, summarise_bounced, with_bounced
+from plow_twin.estimate.estimate import MOST_OTHER_LAW, estimate, summarise_bounced, with_bounced
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
 from plow_twin.estimate.measurements import Poses
@@ -62,9 +62,9 @@ def test_the_deviate_of_a_path_is_normal_for_a_right_model_and_large_for_a_wrong
         (measured,), (path,) = run(1, 0.5)
         right.append(path_deviate(np.tile(path, (11, 1)), features, drawn, measured))
         wrong.append(path_deviate(np.tile(path + 2.5 * across, (11, 1)), features, drawn, measured))
-    assert np.mean(np.array(right) > estimating.MOST_PATH) < 0.06
+    assert np.mean(np.array(right) > tuning.MOST_PATH) < 0.06
     assert abs(np.mean(right)) < 0.8 and np.std(right) < 1.6
-    assert np.mean(np.array(wrong) > estimating.MOST_PATH) > 0.9
+    assert np.mean(np.array(wrong) > tuning.MOST_PATH) > 0.9
 
 
 def test_a_method_that_disagrees_widens_the_interval() -> None:
@@ -77,7 +77,7 @@ def test_a_method_that_disagrees_widens_the_interval() -> None:
     # 8 deviations apart: both are held
     assert both.vertical.p05 < 0.0201 and both.vertical.p95 > 0.0202
     assert both.vertical.deviation == pytest.approx(8.0 * 2.4e-5)
-    unlike = with_bounced(fitted, replace(bounced, distance=2.0 * estimating.MOST_DISTANCE), 0)
+    unlike = with_bounced(fitted, replace(bounced, distance=2.0 * tuning.MOST_DISTANCE), 0)
     assert (unlike.horizontal, unlike.vertical) == (fitted.horizontal, fitted.vertical)
 
 
@@ -130,8 +130,8 @@ def test_a_classifier_of_drawn_motions_finds_another_law() -> None:
     wrong = np.array([class_deviate(believed, other, row) for row in like(100, 1.0)])
     assert abs(right.mean()) < 0.4
     assert right.std() == pytest.approx(1.0, abs=0.3)
-    assert (right > estimating.MOST_OTHER_LAW).mean() < 0.05
-    assert (wrong > estimating.MOST_OTHER_LAW).mean() > 0.8
+    assert (right > MOST_OTHER_LAW).mean() < 0.05
+    assert (wrong > MOST_OTHER_LAW).mean() > 0.8
 
 
 def test_log_odds_find_another_law_among_motions_whose_drawn_numbers_matter_more() -> None:
@@ -148,8 +148,8 @@ def test_log_odds_find_another_law_among_motions_whose_drawn_numbers_matter_more
     right, wrong = (
         np.array([log_odds(believed, other, row) for row in motions(100, law, 0.6).like]) for law in (0.0, 1.0)
     )
-    assert (right > estimating.MOST_ODDS).mean() < 0.03
-    assert (wrong > estimating.MOST_ODDS).mean() > 0.97
+    assert (right > tuning.MOST_ODDS[0]).mean() < 0.03
+    assert (wrong > tuning.MOST_ODDS[0]).mean() > 0.97
 
 
 @pytest.mark.stress

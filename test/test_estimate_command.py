@@ -27,6 +27,7 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     with (tmp_path / "pose.csv").open("a") as file:
         file.write("99,what,0,0\n")
     command = [sys.executable, "-m", "plow_twin", "estimate", str(tmp_path), "--json", "--out", str(tmp_path / "out")]
+    command += ["--plot", str(tmp_path / "fit.png")]
     done = subprocess.run([*command, "--forces", "20"], capture_output=True, text=True, timeout=280)
     assert done.returncode == 3, done.stderr
     facts = json.loads(done.stdout)
@@ -41,6 +42,7 @@ def test_the_command_keeps_the_contract(tmp_path: Path) -> None:
     assert facts["t_end"] > 18.0 and facts["wall_s"] > 0.0
     header = (tmp_path / "out" / "forces.csv").read_text().splitlines()[0].split(",")
     assert header[:2] == ["t", "force_top_left_top/p05"] and len(header) == 25
+    assert (tmp_path / "fit.png").read_bytes()[:4] == b"\x89PNG"
     assert facts["forces"]["members"] == 20 and facts["forces"]["pairs"]["top_left_top"]["peak_n"]["p50"] > 0.0
 
 

@@ -262,8 +262,8 @@ def test_early_windows_grow_until_there_are_whole_ones() -> None:
     ends = []
     for index in range(4500):
         stamp = 10_000_000 * index
-        windows.take_pose(stamp, (0.0, 0.0, 0.0))
-        window = windows.take_load(stamp, (float(index % 7), 0.0, 0.0))
+        windows.add_pose(stamp, (0.0, 0.0, 0.0))
+        window = windows.add_load(stamp, (float(index % 7), 0.0, 0.0))
         if window is not None:
             ends.append(window.end_ns * 1e-9)
     assert np.allclose(ends, [3.2, 4.8, 7.2, 10.0, 10.8, 20.0, 30.0, 40.0])

@@ -16,7 +16,8 @@ from scenes import preset
 
 from plow_twin import Clearance, Table, Twin, Wear, simulate
 from plow_twin.cli.app import run as cli
-from plow_twin.estimate.coefficient import PATH_DEVIATION, History, coefficient
+from plow_twin.estimate import tuning
+from plow_twin.estimate.coefficient import History, coefficient
 from plow_twin.estimate.forecast import Plan, Scenario, forecast, with_clearances, with_estimate
 from plow_twin.estimate.life import LifeError, mean_forces, period_of, wear_path
 from plow_twin.model.loads import compile_loads
@@ -199,7 +200,7 @@ def test_a_history_of_clearances_tells_the_coefficient(tmp_path: Path, capsys: p
     assert found.p05 < true_k < found.p95 and found.p95 / found.p05 < 1.3**2
     # clearances without noise would not make the path certain that tells it
     sure = replace(known, weight=np.eye(len(known.value))[len(known.value) // 2]).interval()
-    assert sure.p95 / sure.p05 > math.exp(3.2 * PATH_DEVIATION)
+    assert sure.p95 / sure.p05 > math.exp(3.2 * tuning.PATH_DEVIATION)
     assert np.abs(known.clearance - [0.025, 0.030] - grown[-1]).max() < 4.0 * noise
     # the forecast goes on along the path, whose pads are not worn alike
     assert known.depth == pytest.approx(depth[-1], rel=0.1, abs=5e-5)

@@ -22,13 +22,16 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
 from plow_twin import Twin, Wear
+from plow_twin.cli.app import run as run_cli
 from plow_twin.estimate.result import Estimate, Interval, State
 from plow_twin.estimate.window import Window, Windows
 from plow_twin.estimate.worker import Found, Worker
 from plow_twin.live.estimation import Estimation, entry_of, message_of
 from plow_twin.live.parameters import settings
 from plow_twin.model.pairs import PAIR_NAMES
+from plow_twin.record.estimated import live_estimates
 from plow_twin.record.messages import JointState as JointStateMessage
+from plow_twin.record.reader import RunReader
 from plow_twin.record.replay import replay
 from plow_twin.ros.messages import set_stamp
 from plow_twin.scene_file import dump_scene
@@ -49,9 +52,9 @@ def _windows(loads: list[tuple[int, tuple[float, ...]]], poses: list[tuple[int, 
     windows, found = Windows(4.0, 1.0, 0.5), []
     for index, load in enumerate(loads):
         if index < len(poses):
-            windows.take_pose(*poses[index])
-            windows.take_gaps(poses[index][0], (1, 3), poses[index][1][:2])
-        formed = windows.take_load(*load)
+            windows.add_pose(*poses[index])
+            windows.add_gaps(poses[index][0], (1, 3), poses[index][1][:2])
+        formed = windows.add_load(*load)
         if formed is not None:
             found.append(formed)
     return found
@@ -84,12 +87,12 @@ def test_what_comes_without_a_load_does_not_pile_up(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("plow_twin.estimate.window.MOST_KEPT", 100)
     windows = Windows(4.0, 1.0, 0.5)
     for index in range(300):
-        windows.take_pose(START_NS + index, (0.0, 0.0, 0.0))
-        windows.take_gaps(START_NS + index, (1,), (0.0,))
+        windows.add_pose(START_NS + index, (0.0, 0.0, 0.0))
+        windows.add_gaps(START_NS + index, (1,), (0.0,))
     assert len(windows._poses) == len(windows._gaps) == 100
-    windows.take_load(START_NS, (0.0, 0.0, 0.0))
-    windows.take_load(START_NS + 3_000_000_000, (0.0, 0.0, 0.0))
-    windows.take_pose(START_NS + 10, (0.0, 0.0, 0.0))
+    windows.add_load(START_NS, (0.0, 0.0, 0.0))
+    windows.add_load(START_NS + 3_000_000_000, (0.0, 0.0, 0.0))
+    windows.add_pose(START_NS + 10, (0.0, 0.0, 0.0))
     assert len(windows._poses) <= 100
 
 
@@ -214,7 +217,7 @@ def test_what_is_estimated_stays_until_it_is_withdrawn_or_the_pads_are_changed()
 
     def clearance(stamp_s: float) -> dict[str, float]:
         session.apply(Sample(START_NS + round(stamp_s * 1e9), (5e4, -1e4, 0.0)))
-        publication = session.outputs.take()
+        publication = session.outputs.pop()
         return dict(zip(CLEARANCE_NAMES, publication.slow["clearance"][0].tolist(), strict=True))
 
     assert clearance(0.0)["horizontal"] == 0.025
@@ -247,7 +250,7 @@ class _Finished:
     def poll(self) -> Found | None:
         return self.found.pop() if self.found else None
 
-    def take_load(self, *_: Any) -> None:
+    def add_load(self, *_: Any) -> None:
         pass
 
     def restart(self) -> None:
@@ -296,12 +299,12 @@ def test_a_worker_that_reads_nothing_is_told_and_nothing_more_is_kept_for_it(mon
     give_up = time.monotonic() + 20.0
     while not worker.error and time.monotonic() < give_up:
         for _ in range(1000):
-            worker.take_load(START_NS, (0.0, 0.0, 0.0))
+            worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
         # so slow that it is waited for with less than that in hand
         time.sleep(0.1)
     assert worker.error == "the estimator did not read for 20000 samples"
-    worker.take_load(START_NS, (0.0, 0.0, 0.0))
+    worker.add_load(START_NS, (0.0, 0.0, 0.0))
     assert not worker._waiting
     worker.close()
     assert not worker._thread.is_alive()
@@ -315,7 +318,7 @@ def test_a_worker_that_died_is_told_and_stops_nothing() -> None:
     worker._process.kill()
     give_up = time.monotonic() + 20.0
     while not worker.error and time.monotonic() < give_up:
-        worker.take_load(START_NS, (0.0, 0.0, 0.0))
+        worker.add_load(START_NS, (0.0, 0.0, 0.0))
         assert worker.poll() is None
         time.sleep(0.01)
     assert worker.error == "the estimator ended with code -9"
@@ -343,3 +346,37 @@ context.try_shutdown()
         [sys.executable, "-c", program], cwd=ROOT / "test", capture_output=True, text=True, timeout=110
     )
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("rows", "code"), [(None, 0), (100, 3)])
+def test_of_a_file_that_ends_the_last_window_is_estimated_or_too_few_data_are_named(
+    rows: int | None, code: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = draw(replace(GROUPS["plain"], periods=5.0, rate_hz=50.0), 3)
+    names = ("t", "fx", "fy", "m", "x", "y", "theta")
+    measured = dict(zip(truth.poses.t.tolist(), truth.poses.q.tolist(), strict=True))
+    lines = [
+        ",".join(map(repr, (t, *load, *measured[t])) if t in measured else [*map(repr, (t, *load)), "", "", ""])
+        for t, load in zip(truth.load.t.tolist(), truth.load.wrench.tolist(), strict=True)
+    ]
+    (tmp_path / "own.csv").write_text("\n".join([",".join(names), *lines[:rows]]) + "\n")
+    (tmp_path / "own.yaml").write_text("excitation: {topic: own}\nhead_pose: {topic: own}\n")
+    (tmp_path / "scene.yaml").write_text(dump_scene(truth.scene), encoding="utf-8")
+    options = ["--map", tmp_path / "own.yaml", "--scene", tmp_path / "scene.yaml", "--record", tmp_path / "run"]
+    given = ["estimate=true", "follow=off", f"estimate_window={WINDOW_S}", f"estimate_interval={INTERVAL_S}"]
+    words = ["live", tmp_path / "own.csv", *options, *(word for text in given for word in ("--set", text))]
+    assert run_cli(list(map(str, words))) == code
+    shown = capsys.readouterr()
+    found = list(live_estimates(RunReader(tmp_path / "run")))
+    if rows is not None:
+        span_s = truth.load.t[rows - 1] - truth.load.t[0]
+        assert (
+            f"estimate: got {span_s:.3g} s of load without a gap" in shown.err and "expected at least 5 s" in shown.err
+        )
+        assert found == []
+        return
+    last_s = truth.load.t[-1] + 1.0  # stamps of such files are a second later
+    window = found[-1].window
+    assert window is not None and window.end_ns == pytest.approx(last_s * 1e9 + 1, abs=1.0)
+    assert "Estimate of the window" in shown.out and "horizontal clearance" in shown.out.lower()
+    assert replay(tmp_path / "run").exit_code == 0

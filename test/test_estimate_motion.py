@@ -10,7 +10,7 @@ from estimate_support import GROUPS, KINDS, draw, known, mismatched
 from scenes import preset
 
 from plow_twin import Clearance, Scene, Table, simulate
-from plow_twin.estimate import estimate as estimating
+from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import Arrow
 from plow_twin.estimate.bouncing import bias_of_hard
 from plow_twin.estimate.estimate import estimate
@@ -146,11 +146,11 @@ def test_a_wall_never_touched_is_not_observable() -> None:
 
 def test_a_motion_that_can_hardly_be_predicted_is_no_evidence_of_a_clearance(monkeypatch: pytest.MonkeyPatch) -> None:
     truth, before = known()[0]
-    monkeypatch.setattr(estimating, "FORETOLD", 1.1)
+    monkeypatch.setattr(tuning, "PREDICTED", 1.1)
     result = estimate(truth.nominal, truth.load, truth.poses)
     assert result.horizontal_state is result.vertical_state is State.NOT_OBSERVABLE
     assert (result.model, result.sensor) == ("ok", "ok") and before.horizontal_state is State.ESTIMATED
-    assert all("% of it can be foretold, expected 110%" in reason for reason in result.reasons)
+    assert all("% of it is predicted, expected 110%" in reason for reason in result.reasons)
     assert [reason[:2] for reason in result.reasons] == ["x:", "y:"]
     assert result.horizontal.deviation > 10.0 * before.horizontal.deviation
 

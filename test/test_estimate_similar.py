@@ -24,6 +24,8 @@ def test_a_machine_of_another_size_is_estimated_as_one_of_the_paper_s_size() -> 
     # in units that are powers of two each number is the same one
     back = desk.in_si(found, truth.nominal)
     assert back == replace(result, lost=back.lost) and found.horizontal.mean == result.horizontal.mean / 8.0
+    assert back.motion is not None and result.motion is not None
+    np.testing.assert_array_equal(back.motion.model, result.motion.model)
     twins, gain = draw_scenes(scene, found, 20, np.random.default_rng(0))
     alike, same = draw_scenes(truth.nominal, result, 20, np.random.default_rng(0))
     assert gain == pytest.approx(same)

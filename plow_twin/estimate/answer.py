@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.estimate import Guess, estimate_window
 from plow_twin.estimate.forces import ForcesError, forces_of
 from plow_twin.estimate.forecast import Plan, forecast, with_estimate
@@ -15,18 +16,15 @@ from plow_twin.estimate.result import Estimate, State
 from plow_twin.estimate.window import Window
 from plow_twin.model.scene import Scene, Table
 
-#: Load periods in which the members of the forces forget where they began.
+#: Derived: load periods in which members forget their starts; a compared motion counts after as many.
 _SETTLE_PERIODS: Final = 1.0
-#: Share of its range within which the load is followed: the forces of all members take a fifth of the time then.
-_FOLLOWED: Final = 2e-4
-#: Where nearly every sample is another one, the lines over so many s, or this share of the period, take their place: in
-#: two broad-band loads no point of a force moved by more than a ninth of its interval (9 ms: by all of it).
-_KNOT_S, _KNOT_SHARE = 4e-3, 1.0 / 400.0
+#: Derived: `tuning.LOAD_KNOT` is half of a knot at 400 in the paper's period; shorter periods have as many knots.
+_KNOT_SHARE: Final = 1.0 / 400.0
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What is wanted beside the estimate.
+    """The answers to give beside the estimate.
 
     members : twins that the forces' intervals are drawn from; 0: no forces
     span_s : length of the end of a window for which forces are given [s]
@@ -83,16 +81,16 @@ def _forces(scene: Scene, result: Estimate, load: Load, asked: Asked) -> dict[st
 
 def followed(load: Load, period: float) -> Load:
     """Return the load thinned to the fewest samples that the members of the forces can follow."""
-    knots = int((load.t[-1] - load.t[0]) / min(_KNOT_S, _KNOT_SHARE * period))
-    thin = load.thinned(_FOLLOWED)
+    knots = int((load.t[-1] - load.t[0]) / min(tuning.LOAD_KNOT, _KNOT_SHARE * period))
+    thin = load.thinned(2.0 * tuning.TOLERANCE)
     return load.averaged(knots) if len(thin.t) > knots else thin
 
 
 def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dict[str, Any]:
     """Return the forecast from an estimate on, for JSON.
 
-    The load is expected to go on as in the window, with the gains that were estimated; as in the scene where the window
-    is too short to tell.
+    The load continues as in the window, with the estimated gains; as in the scene if the window is too short for a
+    period.
 
     Raises
     ------
@@ -104,9 +102,9 @@ def forecast_from(scene: Scene, result: Estimate, load: Load, plan: Plan) -> dic
 
 
 def under_load(scene: Scene, result: Estimate, load: Load) -> Scene:
-    """Return the scene with the load of a window, times the gains that were estimated, in place of its own.
+    """Return the scene with the load of a window, times the estimated gains, in place of its own.
 
-    Its own stays where the window is too short to tell a period.
+    Its own load stays where the window is too short for a period.
     """
     gains = [1.0 if gain is None else gain.mean for gain in (result.gain_fx, result.gain_fy, result.gain_m)]
     felt = load.thinned()

@@ -1,6 +1,6 @@
-"""Normal equations of swings: block tridiagonal beside a border of what all swings share, solved in linear time.
+"""Normal equations of swings: block tridiagonal with a border of the shared unknowns, solved in linear time.
 
-Each swing has six unknowns of its own and is linked to its neighbours at most, so the rest is factorised as a band
+Each swing has six unknowns and is linked at most to its neighbours, so the rest is factorised as a band
 matrix (Cholesky) and the border by its Schur complement.
 
 Reference: Golub and Van Loan, Matrix Computations, ch. 4.3 and 3.2.6.
@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_bande
 
 Array = NDArray[np.float64]
 
-#: Unknowns of one swing.
+#: Definition: unknowns of one swing, pose and rate at its start.
 OWN = 6
 
 
@@ -40,7 +40,7 @@ class Arrow:
         return Arrow(np.zeros((shared, shared)), np.zeros((size, shared)), np.zeros((2 * OWN, size)))
 
     def add(self, swing: int, block: Array) -> None:
-        """Add a block of the shared unknowns and those of some swings in a row, from `swing` on."""
+        """Add a block of the shared unknowns and of consecutive swings from `swing` on."""
         shared = len(self.border)
         self.border[:] += block[:shared, :shared]
         first = OWN * swing
@@ -50,7 +50,7 @@ class Arrow:
             self.bands[: len(rest) - column, first + column] += rest[column:, column]
 
     def diagonal(self) -> Array:
-        """Return the main diagonal, that of the shared unknowns first."""
+        """Return the main diagonal, the shared unknowns first."""
         return np.concatenate([np.diag(self.border), self.bands[0]])
 
     def plus(self, diagonal: Array) -> Arrow:

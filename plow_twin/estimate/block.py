@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.discrepancy import UNSTATED
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.priors import deviation_of
@@ -31,38 +32,21 @@ from plow_twin.solve.compiled_scene import inertias
 
 Array = NDArray[np.float64]
 
-#: Walls by name: the axis that they bound, and their outward normal.
+#: Definition: walls by name, the axis that they bound and their outward normal.
 WALLS: Final = {
     "right": (GX, np.array([1.0, 0.0])),
     "left": (GX, np.array([-1.0, 0.0])),
     "top": (GY, np.array([0.0, 1.0])),
     "bottom": (GY, np.array([0.0, -1.0])),
 }
-#: Acceleration beside that of the free flight, in standard deviations, from which on a row is in no flight: one row in
-#: half a million by noise alone.
-_KINK: Final = 5.0
-#: Least and most rows of a flight that are fitted: one more than a parabola has numbers, and few enough for one.
+#: Derived: fewest rows of a flight, four for the three coefficients of a parabola. Bound: most rows of a fit.
 _FLIGHT_ROWS: Final = (4, 9)
-#: Standard deviation of an unknown acceleration in flight (drag, errors of the load), as a share of gravity on earth.
-_UNKNOWN_SHARE = 0.1
-#: Flights meet at most so far outside of the rows between which they end, in rows.
-_BEYOND: Final = 0.25
-#: Degrees of freedom of the Student-t likelihood: robust against two impacts taken for one.
+#: Derived: degrees of freedom of the Student-t likelihood, the value that Lange et al. recommend.
 _FREEDOM: Final = 4.0
-#: Scales of it that are tried, and rounds of reweighting for each.
+#: Bound: scales of it on the grid, and rounds of reweighting for each.
 _SCALES, _ROUNDS = 40, 30
-#: Deviations of the prior from which on an impact is not on the wall: the block hit something else.
-_ELSEWHERE: Final = 5.0
-#: Largest deviation of an estimated clearance, as a share of the prior's.
-_OBSERVED_SHARE: Final = 0.5
-#: Largest kinetic energy after an impact over that before: the fit of flights by parabolas allows for so much. More is
-#: gained where rows are too far apart, and two impacts or a long contact are taken for one impact.
-_GAINED: Final = 1.25
-#: Largest share of such impacts, and least share of contacts that are impacts between two flights. Of the measured
-#: drops they are 0.01 and 0.5; of a block seen at 50 Hz the first is 0.5, behind a soft contact the second is 0.05.
-_MOST_GAINED, _LEAST_SEEN = 0.25, 0.25
-#: Places in the vector of the linear problem: clearances, bias of x, y and theta, lever arm, penetration over that with
-#: the scene's stiffness.
+#: Definition: places in the vector of the linear problem: clearances, bias of x, y and theta, lever arm, penetration
+#: over that with the scene's stiffness.
 _CLEARANCES, _BIAS, _LEVER, _DEPTH, _SIZE = slice(0, 2), slice(2, 5), slice(5, 7), 7, 8
 
 
@@ -128,20 +112,19 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
     why = _unfit(found, contacts)
     if why:
         return replace(known, horizontal_state=unseen, vertical_state=unseen, reasons=(why,))
-    met, reasons = _on_walls(scene, [one for one in found if one.gained < _GAINED], known)
+    met, reasons = _on_walls(scene, [one for one in found if one.gained < tuning.GAINED], known)
     value, deviation = _solve(scene, met, known, level)
     clearances, states = [], []
     for axis, (name, before) in enumerate((("horizontal", known.horizontal), ("vertical", known.vertical))):
         count = {wall: sum(one.wall == wall for one in met) for wall, (its, _) in WALLS.items() if its == axis}
         share = float(deviation[axis]) / max(before.deviation, 1e-300)
-        observed = share < _OBSERVED_SHARE
+        observed = share < tuning.OBSERVED_SHARE
         clearances.append(Interval.normal(value[axis], deviation[axis]).above(0.0) if observed else before)
         states.append(State.ESTIMATED if observed else unseen)
         counts = ", ".join(f"{number} impacts on the {wall} wall" for wall, number in count.items())
         if not observed:
-            reasons.append(
-                f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most {_OBSERVED_SHARE:.0%}"
-            )
+            most = f"{tuning.OBSERVED_SHARE:.0%}"
+            reasons.append(f"{name}: {counts} leave {share:.0%} of the prior's deviation, expected at most {most}")
         elif not all(count.values()):
             reasons.append(f"{name}: {counts}: the poses are taken to be measured from the middle")
     bias = [Interval.normal(*pair) for pair in zip(value[_BIAS], deviation[_BIAS], strict=True)]
@@ -162,14 +145,14 @@ def estimate_block(scene: Scene, load: Load, poses: Poses, known: Estimate) -> E
 
 
 def _unfit(found: list[Impact], contacts: int) -> str:
-    """Return why impacts do not tell where the walls are; empty: they do."""
-    gained = sum(one.gained >= _GAINED for one in found)
-    if gained > _MOST_GAINED * len(found):
+    """Return why impacts do not determine the walls; empty if they do."""
+    gained = sum(one.gained >= tuning.GAINED for one in found)
+    if gained > tuning.IMPACT_SHARE * len(found):
         return f"{gained} of {len(found)} impacts return more energy than they had: the poses are too far apart in time"
-    if len(found) < _LEAST_SEEN * contacts:
+    if len(found) < tuning.IMPACT_SHARE * contacts:
         return (
             f"{len(found)} of {contacts} contacts are impacts between two flights, expected at least "
-            f"{_LEAST_SEEN:.0%}: the contact lasts longer than two poses, or the block hardly flies"
+            f"{tuning.IMPACT_SHARE:.0%}: the contact lasts longer than two poses, or the block hardly flies"
         )
     return ""
 
@@ -181,7 +164,7 @@ def _on_walls(scene: Scene, every: list[Impact], known: Estimate) -> tuple[list[
     for wall, (axis, _) in WALLS.items():
         clearance = (known.horizontal, known.vertical)[axis]
         expected = 0.5 * ((scene.frame.width_m, scene.frame.height_m)[axis] + clearance.mean)
-        most = 0.5 * _ELSEWHERE * clearance.deviation
+        most = 0.5 * tuning.OUTLYING * clearance.deviation
         own = [one for one in every if one.wall == wall]
         near = [one for one in own if abs(one.distance - one.deeper - expected) < most]
         if len(near) < len(own):
@@ -203,7 +186,7 @@ def _solve(scene: Scene, met: list[Impact], known: Estimate, level: Array) -> tu
     prior[_BIAS] = np.array([quantity.deviation for quantity in QUANTITIES])[BIAS]
     # stated for a machine of the paper's size
     prior[_LEVER] = UNSTATED["lever_x"] * geometry.half_diagonal(scene) / PAPER_LENGTH
-    # penetration goes by a power of the stiffness, whose logarithm has the prior: the same 95 % point
+    # penetration is a power of the stiffness, whose logarithm has the prior: the 95 % points agree
     spread = deviation_of(scene, "contact.stiffness") / (scene.contact.exponent + 1.0)
     prior[_DEPTH] = math.expm1(NORMAL_P95 * spread) / NORMAL_P95
     for axis in (GX, GY):
@@ -271,7 +254,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
     t, q = poses.t, _of_mass(scene, poses.q)
     inertia = np.asarray(inertias(scene))
     free = _free_acceleration(scene, load, t) / inertia
-    unknown = _UNKNOWN_SHARE * Gravity().acceleration_m_s2 * np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
+    unknown = tuning.DRAG * Gravity().acceleration_m_s2 * np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
     ends = _kinks(t, q, free, level, unknown)
     found = []
     for index, (first, last) in enumerate(ends):
@@ -285,7 +268,7 @@ def impacts(scene: Scene, load: Load, poses: Poses, level: Array) -> tuple[list[
         flights = [
             _flight(t[rows] - middle, q[rows], free[rows].mean(axis=0), level, unknown) for rows in (before, after)
         ]
-        room = 0.5 * (t[last] - t[first]) + _BEYOND * float(np.median(np.diff(t)))
+        room = 0.5 * (t[last] - t[first]) + tuning.BEYOND * float(np.median(np.diff(t)))
         met = _meeting(scene, inertia, flights, room)
         if met is not None:
             found.append(replace(met, t=met.t + middle))
@@ -314,12 +297,12 @@ def _free_acceleration(scene: Scene, load: Load, t: Array) -> Array:
 
 
 def _kinks(t: Array, q: Array, free: Array, level: Array, unknown: Array) -> list[tuple[int, int]]:
-    """Return first and last row of each stretch of rows whose acceleration is not that of a free flight."""
+    """Return first and last row of each stretch of rows that do not accelerate as in free flight."""
     one, two = np.diff(t)[:-1, None], np.diff(t)[1:, None]
     way = np.diff(q, axis=0)
     acceleration = 2.0 * (way[1:] / two - way[:-1] / one) / (one + two)
     noise = 2.0 * level * np.sqrt(one**-2 + two**-2 + (1.0 / one + 1.0 / two) ** 2) / (one + two)
-    off: NDArray[np.bool_] = np.abs(acceleration - free[1:-1]) > _KINK * np.hypot(noise, unknown)
+    off: NDArray[np.bool_] = np.abs(acceleration - free[1:-1]) > tuning.OUTLYING * np.hypot(noise, unknown)
     return [(first + 1, last + 1) for first, last in _runs(np.asarray(off.any(axis=1)))]
 
 

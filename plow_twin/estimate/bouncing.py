@@ -1,10 +1,10 @@
 """Clearances of a hard guide: features of the whole motion are compared, not the pose at each moment.
 
-A hard contact returns the head many times before it rests, and which bounce it is at a moment cannot be foretold. How
-far the corners reach on the whole, and how much the pose scatters at each phase of the load, can. Motions with drawn
-stiffness, damping and load gains are simulated and seen through the sensor's noise and gaps; a regression among those
-that look like the measured one then tells by how much the clearance differs from the reach (approximate Bayesian
-computation with local-linear adjustment). What it leaves over is the interval.
+Behind a hard contact the head bounces many times before it rests, so its pose at a moment cannot be predicted. The
+reach of the corners and the scatter of the pose at each phase of the load can. Motions with drawn stiffness, damping
+and load gains are simulated and observed through the sensor's noise and gaps. A regression among those near the
+measured motion gives the difference between clearance and reach (approximate Bayesian computation with local-linear
+adjustment); its residuals give the interval.
 
 References: Beaumont, Zhang and Balding, Genetics 162 (2002) 2025; Fearnhead and Prangle, J. R. Stat. Soc. B 74 (2012)
 419; Wood, Nature 466 (2010) 1102; Blum and Francois, Stat. Comput. 20 (2010) 63.
@@ -19,108 +19,61 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.laws import Draws, log_odds
 from plow_twin.estimate.likely import Seen, likeliest
-from plow_twin.estimate.measurements import Poses
+from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, Poses
+from plow_twin.estimate.regression import ridge
 from plow_twin.estimate.start import filled, noise_level, range_of_motion, reaches, smooth_width
 from plow_twin.estimate.unknowns import DAMPING, GAIN, GX, GY, OTHER_LAW, SOFTNESS, Unknowns, with_other_law
 from plow_twin.model import geometry
 
 Array = NDArray[np.float64]
 
-#: Penetration in m under the reference force below which nothing else than the comparison tells where a contact is
-#: drawn, and noise of a reach in m above which a narrow reach is no sign of a hard wall.
-SURE, POSSIBLE = 3e-4, 1e-3
-#: Scatter of the largest reaches in units of the noise, and in m, below which they are all of one place: a hard wall.
-NARROW, NARROW_M = 1.58, 8e-4
-#: Biases of theta that are tried in rad, and about the best of them, by a parabola that reaches so far; quantiles of
-#: the reaches whose distance is to be least.
+#: Derived: tried biases of theta in rad, eight deviations of the prior to both sides, and the reach of the parabola
+#: about the best one, three quarters of their distance.
 _TURNS: Final = np.linspace(-0.16, 0.16, 81)
 _FINEST_TURN: Final = 3e-3
 _NEAR_TURNS: Final = np.linspace(-_FINEST_TURN, _FINEST_TURN, 5)
-_MIDDLE, _FARTHEST = (0.4, 0.7), (0.9, 0.99)
-#: Most rows that it is looked for in, and that its last part is.
+#: Bound: rows in which a bias is looked for, and its last part.
 _MOST_ROWS, _MOST_NEAR_ROWS = 2000, 1200
-#: Quantiles between which reaches are averaged, from the wall's middle to the farthest.
-_WINDOWS: Final = ((0.6, 0.8), (0.75, 0.95), (0.9, 0.99))
-#: Parts of a period in which the scatter is told.
-_PHASES = 20
-#: Span in s over which the pose is averaged for a second look at the reach; parts of a period over which it is averaged
-#: for a third, and the shares of them, the farthest, whose mean is taken.
-_AVERAGED_S, _REACH_PHASES, _FARTHEST_PARTS = 0.05, 40, (0.1, 0.2, 0.33)
-#: Parts of a period in which the path is told, and fewest measurements in one.
-_PATH_PHASES, _FEWEST_OF_PHASE = 40, 9
-#: Draws near the measured motion that are compared with the others as it is; share of the variance common to all
-#: parts of a path in what its parts scatter together by, which no eighty draws tell of 120 parts.
-_COMPARED, _COMMON = 50, 0.2
-#: Delays for which the measured path is compared, and drawn ones, in s; the scatter where a bounce begins is another
-#: one some milliseconds on.
+#: Derived: the mean of nine values has a third of their scatter.
+_FEWEST_OF_PHASE = 9
+#: Derived: delays in s of the measured path, two deviations of the prior to both sides, and of the drawn paths, a
+#: tenth as far; the place of no delay among the latter.
 _LAGS_S: Final = np.linspace(-0.1, 0.1, 81)
 _OF_DRAWN_S: Final = np.linspace(-0.01, 0.01, 9)
-_NO_LAG = 4
-#: Draws of each round, and deviation in m with which clearances are drawn.
-_DRAWS, _CLEARANCE = (30, 30, 40), (1.2e-3, 3e-4, 3e-4)
-#: The same of one round more for firm contacts.
-_MORE_DRAWS, _NEARER = 100, 2.5e-4
-#: Deviation in m below which clearances are known well enough without it for a fit that follows.
-_ENOUGH_FOR_FIT = 1.2e-4
-#: Distance of the first round from which on the contact is not hard (seeds 46100 to 46209: 0.8 at most in ten hard
-#: ones, 1.3 to 3 in eight of 4.7e8 to 9.2e8 N/m that were taken for hard until then).
-_NOT_HARD = 1.2
-#: Draws of another law, and the steps in ten load periods after which no further one is made; median share of the
-#: critical damping that they have, and the deviation of its logarithm.
-_OTHER_DRAWS, _OTHER_WORK = 60, 1_500_000
-_DAMPING_SHARE, _SHARE_DEVIATION = 0.2, 0.6
-#: Distances in rows over which the changes of pose and reaches are told, and what a coefficient is held to zero by in
-#: telling the law.
-_CHANGES, _LAW_RIDGE = (1, 2, 4, 8, 16, 32), 1.0
-#: The former by which the changes of the pose are told at each phase of the load.
+_NO_LAG = len(_OF_DRAWN_S) // 2
+#: Derived: powers of two, distances in rows over which pose and reaches change; the second for each phase of the load.
+_CHANGES: Final = (1, 2, 4, 8, 16, 32)
 _CHANGES_BY_PHASE: Final = (1, 4)
-#: Share of the draws that are regressed, the nearest, and what a feature's coefficient is held to zero by.
-_NEAR, _RIDGE = 0.7, 0.3
-#: The same for the regression of what is left over, and a square that counts as nothing.
-_SCATTER_RIDGE, _NO_SCATTER = 20.0, 1e-14
-#: Steps of the solver in ten load periods after which no further draw is made; most that a longer motion takes of it.
-_MOST_WORK, _LONGER = 3_500_000, 2.0
-#: Drawn of a hard contact: logarithm of the penetration under the reference force [m] and its bounds; deviations of
-#: the damping's logarithm and of the gains.
-_LN_PENETRATION, _BOUNDS = (math.log(1.2e-5), 1.6), (8e-7, 6e-4)
-_DAMPING, _GAIN = 0.7, 0.06
-#: A firm contact is drawn about what is known of it, both logarithms so far apart at first, then as the round before
-#: left them times a factor, and no nearer than the last. Set on seeds 43200 to 43215 of the benchmark.
-_FIRM_BOUNDS = (2e-6, 2e-2)
-_FIRM_SPREAD, _NARROWED, _NEAREST = 0.5, 1.5, 0.1
-#: Penetration in m from which on a fit moment by moment tells more, the law too.
-FITTED = 8e-4
-#: Correction of the last round in m from which on nothing has been found.
-_ASTRAY = 1.5e-4
-#: What the range of motion overrates a clearance by: noise, and bounces against it [m].
-_OVERRATED: Final = np.array([0.8e-3, 1.0e-3])
-#: Corrections of a draw's noise.
+#: Guard: a square that counts as zero, in m2 or rad2.
+_NO_SCATTER = 1e-14
+#: Bound: work of a longer motion, in that of ten load periods.
+_LONGER = 2.0
+#: Guard: bounds of the penetrations in m that are drawn for a hard and for a firm contact.
+_HARD_BOUNDS, _FIRM_BOUNDS = (8e-7, 6e-4), (2e-6, 2e-2)
+#: Bound: corrections of a draw's noise.
 _NOISE_ROUNDS = 3
-#: Widening of the softness: what a regression says of the logarithm has long tails (set as `BOUNCED_MOST` was).
-_WIDENED_SOFTNESS = 1.6
-#: Fewest whole poses with which those that lack a component are left out.
-_FEWEST_WHOLE = 100
-#: Fewest draws that are regressed.
-_FEWEST = 30
+#: Derived: fewest draws, more than the twenty features of a regression; fewest poses with a 99 % quantile.
+_FEWEST, _FEWEST_WHOLE = 30, 100
 
 
 @dataclass(frozen=True, eq=False)
 class Bounced:
-    """What the comparison tells.
+    """Result of a comparison.
 
     clearance, clearance_deviation : (2,) in m; infinite where it could not be found
     bias : (3,) of x, y in m and theta in rad with its deviation
     ln_penetration, ln_damping : mean and standard deviation (of m under the reference force; the latter as `Unknowns`)
     noise : (3,) standard deviation of the measurements
-    distance : of the measured motion from the drawn ones near it, over that of drawn ones among themselves
-    path : how far mean and scatter of the pose over the load's period are from what the drawn motions foretell, as a
-        normal deviate of how far the drawn ones are from what the others foretell
-    law : how much more the motion is like those of another law of the contact, as a normal deviate of how much those
-        of the law believed are; 0 where no other is known
-    odds : logarithm of how much likelier the motion is under the other law; minus infinity where no other is known
+    distance : of the measured motion from nearby drawn ones, over the distance of drawn ones from each other
+    path : distance of mean and scatter of the pose over the load's period from the prediction by the drawn motions, as
+        a normal deviate among the distances of the drawn ones
+    law : likeness of the motion to those of another contact law, as a normal deviate among motions of the law
+        believed; 0 if no other law is known
+    odds : log odds of the other law; minus infinity if no other law is known
     """
 
     clearance: Array
@@ -138,14 +91,14 @@ class Bounced:
 
 def bounces(unknowns: Unknowns, poses: Poses) -> bool:
     """Return whether the contact is seen to be so hard that this way is the right one."""
-    return _reach_noise(unknowns, _whole(poses)) < POSSIBLE and _is_narrow(unknowns, poses)
+    return _reach_noise(unknowns, _whole(poses)) < tuning.POSSIBLE and _is_narrow(unknowns, poses)
 
 
 def _is_narrow(unknowns: Unknowns, poses: Poses) -> bool:
     """Return whether the head stops at one place, within the noise: the walls do not give way."""
     q = _whole(poses)
     reach = _reach(unknowns, q)
-    return bool(np.median(reach[2] - reach[0]) < max(NARROW * _reach_noise(unknowns, q), NARROW_M))
+    return bool(np.median(reach[2] - reach[0]) < max(tuning.NARROW * _reach_noise(unknowns, q), tuning.FITTED))
 
 
 def _whole(poses: Poses) -> Array:
@@ -163,8 +116,8 @@ def _reach_noise(unknowns: Unknowns, q: Array) -> float:
 def bias_of_hard(unknowns: Unknowns, poses: Poses) -> Array:
     """Return the bias of a sensor behind a hard contact, x and y in m, theta in rad; zeros where the contact is soft.
 
-    A hard wall is at one place for both corners that touch it. Seen with a turn it is at two: the turn is the one with
-    which the farthest reaches lie closest together. A bias of y turns with the head into its reach along x.
+    Both corners that touch a hard wall find it at the same place; a biased theta shows two places. The bias is that
+    with which the farthest reaches lie closest together. A bias of y turns with the head into its reach along x.
     """
     q = _whole(poses)
     bias = np.zeros(3)
@@ -194,16 +147,16 @@ def _few(q: Array, most: int) -> Array:
 
 
 def _off_centre(reach: Array) -> Array:
-    """Return by how much the reaches toward right, left, top and bottom are off the middle, shape (2,), in m."""
+    """Return the offset of the middle between opposite reaches (right, left, top, bottom), shape (2,), in m."""
     right, left, top, bottom = reach
     return 0.5 * np.array([left - right, bottom - top])
 
 
 def _widths(unknowns: Unknowns, q: Array, turns: Array) -> Array:
-    """Return how far apart the farthest reaches lie with each bias of theta, all walls together, in m."""
+    """Return the spread of the farthest reaches for each bias of theta, summed over the walls, in m."""
     count = len(q)
     (low, middle), (far, farthest) = (
-        (int(start * count), max(int(end * count), int(start * count) + 1)) for start, end in (_MIDDLE, _FARTHEST)
+        (int(start * count), max(int(end * count), int(start * count) + 1)) for start, end in tuning.TURN_WINDOWS
     )
     widths = []
     for turn in turns:
@@ -218,20 +171,20 @@ def compare(
 ) -> Bounced | None:  # fmt: skip
     """Compare the measured motion with drawn ones; None where too few can be run, or a hard contact is excluded.
 
-    They are those of hard contacts, or have about the softness and damping of `near`, a vector of unknowns.
+    The drawn motions have hard contacts, or about the softness and damping of `near`, a vector of unknowns.
     """
     eye = MotionFeatures(unknowns, poses, period)
     measured = eye.features(eye.q)
     spread = _Spread.hard(unknowns) if near is None else _Spread.near(unknowns, near)
     drawn = _Drawn(forward, unknowns, eye, spread, np.random.default_rng(seed))
     longer = float(np.clip((poses.t[-1] - poses.t[0]) / (10.0 * period), 1.0, _LONGER))
-    most_work = forward.work + int(longer * _MOST_WORK)
-    centre = range_of_motion(unknowns.scene, poses)[0] - _OVERRATED
+    most_work = forward.work + int(longer * tuning.MOST_WORK[1])
+    centre = range_of_motion(unknowns.scene, poses)[0] - tuning.OVERRATED
     if near is not None:
         centre = centre - math.exp(spread.mean[0])
     found: _Regressed | None = None
     delay = 0.0
-    rounds = list(zip(_DRAWS, _CLEARANCE, strict=True))
+    rounds = list(zip(tuning.DRAWS[:3], tuning.DRAWN_CLEARANCE[:3], strict=True))
     for count, about in rounds:
         drawn.add(count, centre, about, delay, most_work)
         if len(drawn.features) < _FEWEST:
@@ -239,7 +192,7 @@ def compare(
         features = np.array(drawn.features)
         if found is None:
             delay = path_delay(eye, features[:, 5:], drawn.q, measured[5:])
-            # those of the first round were seen at other times: only their phase is set right
+            # the first round was drawn without a delay: shift the phase of its paths
             paths = [eye.paths(q, _OF_DRAWN_S - delay) for q in drawn.q]
             drawn.by_phase = [eye.changes_by_phase(q, -delay) for q in drawn.q]
         else:
@@ -254,24 +207,24 @@ def compare(
         centre = centre + moved
         # a clearance that still moves has not converged
         deviation = np.hypot(found.deviation[:2], moved)
-        if near is None and len(features) <= _DRAWS[0] and found.distance > _NOT_HARD:
+        if near is None and len(features) <= tuning.DRAWS[0] and found.distance > tuning.NOT_HARD:
             return None
         if near is not None:
             drawn.spread = drawn.spread.narrowed(found)
-            followed = found.value[5] > math.log(FITTED) and deviation.max() < _ENOUGH_FOR_FIT
-            if len(rounds) == len(_DRAWS) and count == _DRAWS[-1] and not followed:
-                rounds.append((_MORE_DRAWS, _NEARER))
+            followed = found.value[5] > math.log(tuning.FITTED) and deviation.max() < tuning.ENOUGH_FOR_FIT
+            if len(rounds) == 3 and count == tuning.DRAWS[2] and not followed:
+                rounds.append((tuning.DRAWS[3], tuning.DRAWN_CLEARANCE[3]))
     assert found is not None
-    deviation[np.abs(moved) > _ASTRAY] = np.inf
+    deviation[np.abs(moved) > tuning.ASTRAY] = np.inf
     law, odds = 0.0, -math.inf
-    if found.value[5] < math.log(FITTED):
-        law, odds = _of_other_law(drawn, centre, delay, int(longer * _OTHER_WORK))
+    if found.value[5] < math.log(tuning.FITTED):
+        law, odds = _of_other_law(drawn, centre, delay, int(longer * tuning.MOST_WORK[2]))
     return Bounced(
         centre,
         deviation,
         measured[2:5] + found.value[2:5],
         found.deviation[2:5],
-        (float(found.value[5]), _WIDENED_SOFTNESS * float(found.deviation[5])),
+        (float(found.value[5]), tuning.WIDENED_SOFTNESS * float(found.deviation[5])),
         (float(found.value[6]), float(found.deviation[6])),
         eye.noise,
         found.distance,
@@ -283,7 +236,7 @@ def compare(
 
 @dataclass(frozen=True, eq=False)
 class _Spread:
-    """What is drawn of a contact: means and deviations of the logarithms of penetration and damping, shape (2,)."""
+    """Distribution of drawn contacts: means and deviations of the logarithms of penetration and damping, shape (2,)."""
 
     mean: Array
     deviation: Array
@@ -291,24 +244,25 @@ class _Spread:
 
     @staticmethod
     def hard(unknowns: Unknowns) -> _Spread:
-        mean, deviation = _LN_PENETRATION
-        damping = float(unknowns.nominal()[DAMPING]), _DAMPING if unknowns.damped else 0.0
-        return _Spread(np.array([mean, damping[0]]), np.array([deviation, damping[1]]), _BOUNDS)
+        middle, deviation, damping, _ = tuning.HARD_DRAWN
+        mean = np.array([math.log(middle), float(unknowns.nominal()[DAMPING])])
+        return _Spread(mean, np.array([deviation, damping if unknowns.damped else 0.0]), _HARD_BOUNDS)
 
     @staticmethod
     def near(unknowns: Unknowns, vector: Array) -> _Spread:
         """Return that about the softness and damping of a vector."""
         mean = np.array([math.log(unknowns.penetration_of(float(vector[SOFTNESS]))), vector[DAMPING]])
-        return _Spread(mean, _FIRM_SPREAD * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
+        return _Spread(mean, tuning.FIRM_SPREAD[0] * np.array([1.0, float(unknowns.damped)]), _FIRM_BOUNDS)
 
     def narrowed(self, found: _Regressed) -> _Spread:
         """Return the spread about a result."""
-        deviation = np.minimum(np.maximum(_NARROWED * found.deviation[5:7], _NEAREST), self.deviation)
+        _, over, least = tuning.FIRM_SPREAD
+        deviation = np.minimum(np.maximum(over * found.deviation[5:7], least), self.deviation)
         return _Spread(found.value[5:7], deviation, _FIRM_BOUNDS)
 
 
 class _Drawn:
-    """Draws of one law: features, targets, changes and, until they are cleared, the motions as they are seen."""
+    """Draws of one law: features, targets, changes and, until cleared, the observed motions."""
 
     def __init__(
         self, forward: Forward, unknowns: Unknowns, eye: MotionFeatures, spread: _Spread, rng: np.random.Generator
@@ -340,12 +294,12 @@ class _Drawn:
         """Return the logarithms of penetration and damping and three gains, shape (5,)."""
         mean = np.concatenate([self.spread.mean, np.ones(3)])
         drawn = self.rng.standard_normal(5)
-        numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, _GAIN)]) * drawn
+        numbers: Array = mean + np.concatenate([self.spread.deviation, np.full(3, tuning.HARD_DRAWN[3])]) * drawn
         numbers[0] = np.clip(numbers[0], *np.log(self.spread.bounds))
         if self.unknowns.scene.contact.law in OTHER_LAW.values():
             # a share of the critical damping of the head's mass, whatever the stiffness
             critical = self.unknowns.critical_damping(self.unknowns.force / math.exp(numbers[0]))
-            numbers[1] = math.log(_DAMPING_SHARE * critical) + _SHARE_DEVIATION * drawn[1]
+            numbers[1] = math.log(tuning.LAW_DAMPING[1] * critical) + tuning.LAW_DAMPING[2] * drawn[1]
         return numbers
 
     def of_other_law(self) -> _Drawn | None:
@@ -364,9 +318,9 @@ class _Drawn:
 
 
 def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, seen: Array) -> Array:
-    """Return by how much the likeliest clearances of each drawn and of the measured motion differ from the reach.
+    """Return the likeliest clearances less the reach, of each drawn motion and of the measured one, (n + 1, 2), in m.
 
-    Shape (n + 1, 2), in m; of what `seen` and `paths`, (lags, k) and (n, lags, k), hold the mean poses are used.
+    Only the mean poses in `seen`, (lags, k), and `paths`, (n, lags, k), are used.
     """
     before, after = _NO_LAG - 1, _NO_LAG + 1
     paths, seen = (path[..., : path.shape[-1] // 2] for path in (paths, seen))
@@ -382,17 +336,17 @@ def _likeliest(features: Array, targets: Array, paths: Array, measured: Array, s
 
     reach = features[:, :2]
     drawn = np.concatenate([targets[:, :2] + reach, targets[:, 5:]], axis=1)
-    likely = likeliest(drawn, _GAIN, motions(features, paths), motions(measured[None], seen[None]))
+    likely = likeliest(drawn, tuning.HARD_DRAWN[3], motions(features, paths), motions(measured[None], seen[None]))
     off: Array = likely - np.concatenate([reach, measured[None, :2]])
     return off
 
 
 def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measured: Array) -> float:
-    """Return the delay in s with which the measured path is nearest to that of motions drawn without one."""
+    """Return the delay in s that brings the measured path nearest to motions drawn without a delay."""
     paths = np.array([eye.paths(q, np.zeros(1))[0] for q in drawn])
     seen = eye.paths(eye.q, _LAGS_S)
     there = np.isfinite(paths).all(axis=0) & np.isfinite(seen).all(axis=0)
-    if there.sum() < _PATH_PHASES:
+    if there.sum() < tuning.PATH_PHASES:
         return 0.0
     value, left = _Near.to(features, measured).left_over(paths[:, there])
     off = ((seen[:, there] - value) ** 2 / ((left**2).mean(axis=0) + _NO_SCATTER)).sum(axis=1)
@@ -401,16 +355,15 @@ def path_delay(eye: MotionFeatures, features: Array, drawn: list[Array], measure
 
 
 def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) -> tuple[float, float]:
-    """Return how much more the measured motion is like those of another law, and the logarithm of its odds.
+    """Return the likeness of the measured motion to another law, and the log odds of that law.
 
-    Goodness of fit alone does not tell laws apart whose motions are nearly alike; what classifies draws of both does
-    (choice of a model by classification: Pudlo et al., Bioinformatics 32 (2016) 859), and so does the likelihood under
-    each. Each tells motions that the other does not.
+    Goodness of fit does not separate laws with similar motions. A classifier of draws of both laws does (Pudlo et al.,
+    Bioinformatics 32 (2016) 859), and so does the likelihood under each; each finds cases that the other misses.
     """
     other, nothing = drawn.of_other_law(), (0.0, -math.inf)
     if other is None:
         return nothing
-    other.add(_OTHER_DRAWS, centre, _CLEARANCE[-1], delay, most_work)
+    other.add(tuning.DRAWS[4], centre, tuning.DRAWN_CLEARANCE[2], delay, most_work)
     drawn.forward.work += other.forward.work
     if len(other.features) < _FEWEST:
         return nothing
@@ -421,10 +374,10 @@ def _of_other_law(drawn: _Drawn, centre: Array, delay: float, most_work: int) ->
 
 
 def class_deviate(believed: Array, other: Array, measured: Array) -> float:
-    """Return how much more features (m,) are like `other` (k, m) than like `believed` (n, m), as a normal deviate.
+    """Return the likeness of features (m,) to `other` (k, m) rather than `believed` (n, m), as a normal deviate.
 
-    A label of the two, each class weighing the same, is regressed; the deviate is among those of the believed ones,
-    each predicted by a regression without it.
+    The label of the two classes, which weigh the same, is regressed on the features. The deviate is relative to the
+    cross-validated predictions of the believed class.
     """
     features = np.concatenate([believed, other])
     sizes = [len(believed), len(other)]
@@ -432,30 +385,28 @@ def class_deviate(believed: Array, other: Array, measured: Array) -> float:
     weight = np.repeat(0.5 * len(label) / np.array(sizes), sizes)
     z = (features - measured) / (features.std(axis=0) + 1e-12)
     basis = np.concatenate([np.ones((len(z), 1)), z], axis=1)
-    ridge = np.diag([0.0] + [_LAW_RIDGE] * z.shape[1])
-    inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
+    inverse, leverage = ridge(basis, tuning.RIDGE[2], weight)
     beta = inverse @ (basis.T @ (weight * label))
-    leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
     held_out = label - (label - basis @ beta) / (1.0 - np.minimum(leverage, 0.95))
     right = held_out[: len(believed)]
     return float((beta[0] - right.mean()) / right.std(ddof=1))
 
 
 def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Array) -> float:
-    """Return how far off the measured path is among the drawn motions, a normal deviate; 0 without enough of it.
+    """Return the distance of the measured path from the drawn motions as a normal deviate; 0 with too few measurements.
 
-    Each of the drawn motions near the measured one is compared with all others as that is: how far right models are off
-    is known then, whatever the contact, the noise and the length of the window.
+    Nearby drawn motions are compared with the rest in the same way. This gives the distances of right models,
+    whatever the contact, the noise and the length of the window.
     """
     # (n, lags, parts); stamps may be late or early: a delay is no other path
     paths = np.array(drawn)
     there = np.isfinite(paths).all(axis=(0, 1)) & np.isfinite(seen).all(axis=0)
-    if there.sum() < _PATH_PHASES:
+    if there.sum() < tuning.PATH_PHASES:
         return 0.0
     paths, off = paths[:, :, there], _distance_of_paths(features, paths[:, :, there], measured, seen[:, there])
     distance = (((features - measured) / (features.std(axis=0) + 1e-12)) ** 2).mean(axis=1)
     others = []
-    for index in np.argsort(distance, kind="stable")[:_COMPARED]:
+    for index in np.argsort(distance, kind="stable")[:FEWEST_FOR_SCATTER]:
         rest = np.arange(len(features)) != index
         others.append(_distance_of_paths(features[rest], paths[rest], features[index], paths[index]))
     ln_others = np.log(others)
@@ -465,9 +416,8 @@ def path_deviate(seen: Array, features: Array, drawn: list[Array], measured: Arr
 def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Array) -> float:
     """Return the mean square distance of a seen path (lags, k) from the prediction of the drawn ones (n, lags, k).
 
-    Weighed by the covariance of what the drawn ones leave over, for what the phases of a path have in common is no
-    more than one deviation (Mahalanobis); of its directions the variances are drawn to their mean (Ledoit and Wolf, J.
-    Multivar. Anal. 88 (2004) 365).
+    The distance is Mahalanobis's, with the covariance of the drawn paths' residuals, shrunk toward equal variances
+    (Ledoit and Wolf, J. Multivar. Anal. 88 (2004) 365).
     """
     near = _Near.to(features, measured)
     value, left = near.left_over(paths[:, _NO_LAG])
@@ -475,7 +425,8 @@ def _distance_of_paths(features: Array, paths: Array, measured: Array, seen: Arr
     deviation = np.sqrt(variance * (1.0 + near.inverse[0, 0]))
     left *= np.sqrt(near.weight / near.weight.sum())[:, None] / deviation
     common = left.T @ left
-    covariance = (1.0 - _COMMON) * common + _COMMON * np.trace(common) / len(common) * np.eye(len(common))
+    share, size = tuning.SHRINKAGE[1], len(common)
+    covariance = (1.0 - share) * common + share * np.trace(common) / size * np.eye(size)
     off = (seen - value) / deviation
     square = np.einsum("ki,ik->k", off, np.linalg.solve(covariance, off.T))
     return float(square.min() / seen.shape[1])
@@ -490,7 +441,7 @@ class _Regressed:
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """What a regression on features among the nearest of n draws needs.
+    """The terms of a regression on features among the nearest of n draws.
 
     distance, weight : (n,) distance of a draw from the measured features, and its weight
     scale : (m,) scatter of the features
@@ -510,11 +461,9 @@ class _Near:
         scale = features.std(axis=0) + 1e-12
         z = (features - measured) / scale
         distance = (z * z).mean(axis=1)
-        weight = np.maximum(1.0 - distance / np.sort(distance)[int(_NEAR * len(distance))], 0.0)
+        weight = np.maximum(1.0 - distance / np.sort(distance)[int(tuning.NEAR * len(distance))], 0.0)
         basis = np.concatenate([np.ones((len(z), 1)), z], axis=1)
-        ridge = np.diag([0.0] + [_RIDGE] * z.shape[1])
-        inverse = np.linalg.inv(basis.T @ (weight[:, None] * basis) + ridge)
-        leverage = np.einsum("ij,jk,ik->i", basis, inverse, basis) * weight
+        inverse, leverage = ridge(basis, tuning.RIDGE[0], weight)
         return _Near(distance, weight, scale, basis, inverse, leverage)
 
     def regress(self, targets: Array) -> tuple[Array, Array]:
@@ -523,7 +472,7 @@ class _Near:
         return beta[0], targets - self.basis @ beta
 
     def left_over(self, targets: Array) -> tuple[Array, Array]:
-        """Return the same, of each draw as it would be foretold without it."""
+        """Return the same with cross-validated residuals: each draw predicted without itself."""
         value, error = self.regress(targets)
         left: Array = error / (1.0 - np.minimum(self.leverage, 0.9))[:, None]
         return value, left
@@ -546,11 +495,11 @@ def regress_near(features: Array, targets: Array, measured: Array) -> _Regressed
 def _scatter_at(basis: Array, weight: Array, error: Array, leverage: Array) -> Array:
     """Return the residual variance of a regression at the measured features, shape (k,).
 
-    It is another one for softer or noisier draws: the logarithm of the squares is regressed too (Blum and Francois).
+    It varies with softness and noise, so the logarithm of the squares is regressed too (Blum and Francois).
     """
     freed = 1.0 - np.minimum(leverage, 0.9)
     square = error**2 / freed[:, None]
-    held = np.diag([0.0] + [_SCATTER_RIDGE] * (basis.shape[1] - 1))
+    held = np.diag([0.0] + [tuning.RIDGE[1]] * (basis.shape[1] - 1))
     beta = np.linalg.solve(
         basis.T @ (weight[:, None] * basis) + held, basis.T @ (weight[:, None] * np.log(square + _NO_SCATTER))
     )
@@ -568,15 +517,15 @@ class MotionFeatures:
         self._there = np.isfinite(poses.q)
         self.q = filled(poses)
         self.noise = noise_level(self.q)
-        self._period = period
+        self._period, self._parts = period, tuning.PATH_PHASES // 2
         #: until then a motion forgets where it began, which a delay makes another place
         self._settled = poses.t - poses.t[0] >= period
         self._whole = self._there.all(axis=1)
         if self._whole.sum() <= _FEWEST_WHOLE:
             self._whole = np.ones(len(poses.t), np.bool_)
-        self._smooth = max(min(smooth_width(poses, _AVERAGED_S), int(self._whole.sum()) // 8), 1)
-        self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * _REACH_PHASES).astype(int)
-        self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * _PHASES).astype(int), _PHASES - 1)
+        self._smooth = max(min(smooth_width(poses, tuning.AVERAGED), int(self._whole.sum()) // 8), 1)
+        self._reach_phase = ((poses.t[self._whole] - poses.t[0]) / period % 1.0 * tuning.PATH_PHASES).astype(int)
+        self._phase = np.minimum(((poses.t - poses.t[0]) / period % 1.0 * self._parts).astype(int), self._parts - 1)
 
     def look(
         self, forward: Forward, unknowns: Unknowns, clearance: Array, numbers: Array, delay: float,
@@ -603,20 +552,21 @@ class MotionFeatures:
     def _path(self, q: Array, lag_s: float) -> Array:
         """Return mean pose, its mean taken away, and logarithm of the scatter at each phase of the load, shape (240,).
 
-        NaN where too few were measured. The scatter tells how fast bounces die out, which the mean does not.
+        NaN where too few were measured. The scatter shows how fast bounces die out.
         """
-        phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * _PATH_PHASES).astype(int) % _PATH_PHASES
-        out = np.full((2, _PATH_PHASES, 3), np.nan)
+        parts = tuning.PATH_PHASES
+        phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * parts).astype(int) % parts
+        out = np.full((2, parts, 3), np.nan)
         for i in range(3):
             there = self._there[:, i] & self._settled
             inside = phase[there]
-            count = np.bincount(inside, minlength=_PATH_PHASES)
+            count = np.bincount(inside, minlength=parts)
             known = count >= _FEWEST_OF_PHASE
             if not known.any():
                 continue
             value = q[there, i] - q[there, i].mean()
-            mean = np.bincount(inside, value, _PATH_PHASES) / np.maximum(count, 1)
-            square = np.bincount(inside, (value - mean[inside]) ** 2, _PATH_PHASES) / np.maximum(count, 1)
+            mean = np.bincount(inside, value, parts) / np.maximum(count, 1)
+            square = np.bincount(inside, (value - mean[inside]) ** 2, parts) / np.maximum(count, 1)
             out[0, known, i] = mean[known] - mean[known].mean()
             out[1, known, i] = 0.5 * np.log(square[known] + _NO_SCATTER)
         return out.ravel()
@@ -650,7 +600,7 @@ class MotionFeatures:
         for i in range(3):
             parts = np.array([
                 q[inside, i].std()
-                for k in range(_PHASES)
+                for k in range(self._parts)
                 if (inside := (self._phase == k) & self._there[:, i]).sum() > 8
             ])  # fmt: skip
             calm = np.sort(parts)[: max(len(parts) // 3, 1)]
@@ -669,13 +619,13 @@ class MotionFeatures:
         return np.log(np.concatenate(parts) + 1e-12)
 
     def changes_by_phase(self, q: Array, lag_s: float = 0.0) -> Array:
-        """Return the same of the pose at each phase of the load, of a motion that is `lag_s` late: when it bounces."""
-        phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * _PHASES).astype(int) % _PHASES
-        count = np.maximum(np.bincount(phase, minlength=_PHASES), 1)
+        """Return such logarithms of the pose at each phase of the load, of a motion that is `lag_s` late."""
+        phase = ((self._t - self._t[0] - lag_s) / self._period % 1.0 * self._parts).astype(int) % self._parts
+        count = np.maximum(np.bincount(phase, minlength=self._parts), 1)
         parts = []
         for apart in _CHANGES_BY_PHASE:
             squares = _second_difference(q, apart) ** 2
-            parts += [np.bincount(phase[apart:-apart], column, _PHASES) / count for column in squares.T]
+            parts += [np.bincount(phase[apart:-apart], column, self._parts) / count for column in squares.T]
         return 0.5 * np.log(np.concatenate(parts) + _NO_SCATTER)
 
     def _averaged(self, q: Array) -> Array:
@@ -688,16 +638,16 @@ class MotionFeatures:
     def _by_phase(self, q: Array) -> Array:
         """Return mean reaches in the phases of the load in which they are farthest, shape (3, 4): where it rests."""
         reach, phase = reaches(self._unknowns.scene, q), self._reach_phase
-        count = np.bincount(phase, minlength=_REACH_PHASES + 1)
+        count = np.bincount(phase, minlength=tuning.PATH_PHASES + 1)
         known = count > 0
         means = np.stack([np.bincount(phase, one, len(count))[known] / count[known] for one in reach.T], axis=1)
         means.sort(axis=0)
-        parts = [means[-max(int(share * len(means)), 1) :].mean(axis=0) for share in _FARTHEST_PARTS]
+        parts = [means[-max(int(share * len(means)), 1) :].mean(axis=0) for share in tuning.FARTHEST_PARTS]
         return np.stack(parts)
 
 
 def _second_difference(rows: Array, apart: int) -> Array:
-    """Return by how much rows are off those `apart` before and after, shape (n - 2 apart, k)."""
+    """Return second differences of rows `apart`, shape (n - 2 apart, k)."""
     change: Array = rows[2 * apart :] - 2.0 * rows[apart:-apart] + rows[: -2 * apart]
     return change
 
@@ -706,5 +656,7 @@ def _reach(unknowns: Unknowns, q: Array) -> Array:
     """Return mean reaches toward the right, left, top and bottom between quantiles, shape (3, 4), in m."""
     ordered = np.sort(reaches(unknowns.scene, q), axis=0)
     count = len(ordered)
-    windows = [ordered[int(low * count) : max(int(high * count), int(low * count) + 1)] for low, high in _WINDOWS]
+    windows = [
+        ordered[int(low * count) : max(int(high * count), int(low * count) + 1)] for low, high in tuning.REACH_WINDOWS
+    ]
     return np.stack([window.mean(axis=0) for window in windows])

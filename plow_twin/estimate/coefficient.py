@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, ndtri
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, Interval
 from plow_twin.model.pairs import PAIR_COUNT
@@ -21,22 +22,15 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Points of the grid, and how far it reaches in standard deviations of the prior.
+#: Bound: points of the grid. Derived: it reaches four deviations of the prior to both sides, all but 6e-5 of it.
 _POINTS, _REACH = 801, 4.0
-#: How much further than the history the path is followed, as a multiple of what the clearance has grown, and in m.
+#: Bound: the path is followed beyond the history by as many times the clearance's growth, and by a depth in m.
 _FURTHER, _FURTHER_M = 2.0, 5e-4
-#: Most probability at an end of the grid: with more of it the history says something that the prior does not allow.
-_MOST_AT_END = 0.02
-#: Relative standard deviation of the rate beside what a history tells: means over a few periods, a load whose share
-#: differs from pad to pad. Set on lives with seeds below 1000 (benchmark/lives.py).
-PATH_DEVIATION = 0.03
-#: A history that is less probable than that along the path that fits it best contradicts wear.
-_LEAST_PROBABLE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Clearances as they were estimated.
+    """Estimated clearances against travel.
 
     travel : (n,) along the face since the first one, in m, never falling
     clearance, deviation : (n, 2) horizontal and vertical with their standard deviations, in m
@@ -80,9 +74,9 @@ class Coefficient:
         return Interval(self.quantile(0.5), self.quantile(0.05), self.quantile(0.95))
 
     def quantile(self, share: float) -> float:
-        """Return a point of the distribution in m^2/N; the path that tells it is itself known to `PATH_DEVIATION`."""
+        """Return a point of the distribution in m^2/N, widened by `tuning.PATH_DEVIATION`."""
         middle, point = np.log(np.interp([0.5, share], np.cumsum(self.weight), self.value))
-        off = math.hypot(point - middle, PATH_DEVIATION * float(ndtri(share)))
+        off = math.hypot(point - middle, tuning.PATH_DEVIATION * float(ndtri(share)))
         return math.exp(float(middle) + math.copysign(off, share - 0.5))
 
     def draw(self, count: int, rng: np.random.Generator) -> Array:
@@ -130,7 +124,7 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
     share = np.exp(likely - likely.max())
     share /= share.sum()
     ends = np.exp(grid[[0, -1]])
-    if max(share[0], share[-1]) > _MOST_AT_END:
+    if max(share[0], share[-1]) > tuning.LEAST_PROBABLE[1]:
         raise LifeError(
             f"history: got a growth that the prior of the coefficient does not allow, from {ends[0]:.2g} to "
             f"{ends[1]:.2g} m^2/N, expected a wider wear.prior_m2_n"
@@ -144,13 +138,13 @@ def coefficient(scene: Scene, history: History) -> Coefficient:
 def _check_fit(history: History, grown: Array) -> None:
     """Raise LifeError where clearances are farther from a growth, shape (n, 2), than their deviations allow.
 
-    The growth itself is known to within `PATH_DEVIATION`.
+    The growth itself is known to within `tuning.PATH_DEVIATION`.
     """
-    weight = 1.0 / (history.deviation**2 + (PATH_DEVIATION * grown) ** 2)
+    weight = 1.0 / (history.deviation**2 + (tuning.PATH_DEVIATION * grown) ** 2)
     apart = history.clearance - grown
     apart -= (weight * apart).sum(axis=0) / weight.sum(axis=0)
     square, freedom = float((weight * apart**2).sum()), 2 * (len(apart) - 1)
-    if chdtrc(freedom, square) < _LEAST_PROBABLE:
+    if chdtrc(freedom, square) < tuning.LEAST_PROBABLE[0]:
         row, axis = np.unravel_index(int((weight * apart**2).argmax()), apart.shape)
         name = ("horizontally", "vertically")[axis]
         raise LifeError(

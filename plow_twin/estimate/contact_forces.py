@@ -1,22 +1,21 @@
 """Contact forces measured by load cells at the guides, which add to the motion in stiffness, damping and clearances.
 
-After the fit the motion is known at every moment, and the law gives each pair's force from it. A cell that is not like
-its pair's force is named, and so is the law where all are unlike it; nothing is made better then. Else poses and forces
-are fitted together (`force_fit`).
+After the fit the motion is known at every moment, and the law gives each pair's force from it. A cell that
+contradicts its pair's force is named, and so is the law if all cells do; the forces are not used then. Otherwise poses
+and forces are fitted together (`force_fit`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import Fit, Problem, Window, depth_of
-from plow_twin.estimate.forward import TOLERANCE
-from plow_twin.estimate.measurements import Poses, usable_rows
+from plow_twin.estimate.measurements import FEWEST_IN_CONTACT, FEWEST_POSES, Poses, usable_rows
 from plow_twin.estimate.unknowns import BIAS, DELAY
 from plow_twin.model.contact import free_force
 from plow_twin.model.geometry import body_states, penetration_rows
@@ -26,24 +25,11 @@ from plow_twin.solve.compiled_scene import compile_scene
 
 Array = NDArray[np.float64]
 
-#: Fewest messages for an answer.
-FEWEST_MESSAGES: Final = 50
-#: Beyond it a number is no force [N].
+#: Guard: beyond it a number is no force [N].
 _LARGEST = 1e12
-#: How far from 1 a cell's gain may be.
-MOST_GAIN = 0.25
-#: Delays at which the motion's forces are compared with those measured: the largest and their distance in s.
+#: Bound: delays at which the motion's forces are compared with those measured, the largest and their distance in s.
+#: Derived: three deviations of the prior of a sensor's delay.
 _LARGEST_DELAY, _DELAY_STEP = 0.15, 2e-3
-#: Head room in m from which on a pad is in flight for certain, and fewest such rows for a cell's offset.
-_FLIGHT, _FEWEST_FLIGHT = 1e-3, 20
-#: Fewest rows in contact from which a cell tells anything.
-_FEWEST_CONTACT = 10
-#: Correlation with the motion's force below which a cell does not measure it.
-_LEAST_CORRELATION = 0.7
-#: Rows in a row with one value, and the force that the motion gives meanwhile, in its largest, of a cell that is stuck.
-_STUCK_ROWS, _STUCK_FORCE = 12, 0.2
-#: What a cell without contact may show, in the largest force of the motion.
-_MOST_IN_FLIGHT = 0.2
 #: The law as a Python function: Python cannot call the compiled one.
 _LAW = getattr(free_force, "py_func", free_force)
 
@@ -63,7 +49,7 @@ class ContactForces:
     def of(t: ArrayLike, force: ArrayLike) -> tuple[ContactForces, int]:
         """Put rows in order of time; return them and how many had to be left out.
 
-        Those are the ones without a finite stamp or any force, with one beyond 1e12 N, or with a stamp that is there.
+        Left out are rows without a finite stamp or any force, with a force beyond 1e12 N, or with a repeated stamp.
 
         Raises
         ------
@@ -84,14 +70,14 @@ class ContactForces:
         return ContactForces(self.t[inside], self.force[inside])
 
     def thinned(self, most: int) -> ContactForces:
-        """Return each second, third, ... row, so many that at most `most` are left."""
+        """Return every n-th row, at most `most` rows."""
         apart = max(1, -(-len(self.t) // most))
         return ContactForces(self.t[::apart], self.force[::apart])
 
 
 @dataclass(frozen=True, eq=False)
 class Felt:
-    """What the motion gives at the measured times.
+    """Penetration and force of the fitted motion at the measured times.
 
     swing : (n,) swing of each row, -1 outside of all swings
     penetration, force : (n, 8) in m and N; NaN outside the swings
@@ -146,14 +132,14 @@ class Feeling:
 def forces_at(scene: Scene, q: Array, v: Array, depth: Array | None = None) -> tuple[Array, Array]:
     """Return penetrations in m and forces in N of the pairs, (n, 8) each, from poses and rates, (n, 3) each.
 
-    `depth`, shape (8,), is by how much each pad lies further out, in m. The law's damping must be the scene's own, not
+    `depth`, shape (8,), is the outward displacement of each pad in m. The law's damping must be the scene's own, not
     one that a restitution and the speed of the touch give.
     """
     x, y, vx, vy, omega, c, s, _ = body_states(np.hstack((q, v)), scene.head.com_offset_m).T
     rows = penetration_rows(scene)
     penetration = np.stack([c, s, x, y], axis=1) @ rows[:4] + rows[4] - (0.0 if depth is None else depth)
     rate = np.stack([-omega * s, omega * c, vx + omega * y, vy - omega * x], axis=1) @ rows[:4]
-    params = compile_scene(scene, TOLERANCE, sampled=True).params
+    params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params
     viscous = float(params["viscous"])
     factor = 0.0 if viscous else float(scene.contact.damping or 0.0)
     numbers = float(params["stiffness"]), float(params["exponent"]), factor, viscous, float(params["ramp"])
@@ -176,8 +162,8 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
     offset, noise = np.zeros(PAIR_COUNT), np.zeros(PAIR_COUNT)
     for i in range(PAIR_COUNT):
         column = forces.force[:, i]
-        flight = column[(felt.penetration[:, i] < -_FLIGHT) & np.isfinite(column)]
-        if len(flight) >= _FEWEST_FLIGHT:
+        flight = column[(felt.penetration[:, i] < -tuning.HEAD_ROOM) & np.isfinite(column)]
+        if len(flight) >= FEWEST_POSES:
             offset[i] = np.median(flight)
             noise[i] = 1.4826 * np.median(np.abs(flight - offset[i]))
     measured = forces.force - offset
@@ -192,7 +178,7 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
         why = _contradiction(measured[there], felt.force[there], i, largest, float(noise[i]))
         if why:
             found_out.append(f"contact forces: {name}: {why}")
-        elif (felt.force[there, i] > 0.0).sum() >= _FEWEST_CONTACT:
+        elif (felt.force[there, i] > 0.0).sum() >= FEWEST_IN_CONTACT:
             pairs.append(i)
     if not (found_out or pairs):
         return None, []
@@ -202,29 +188,35 @@ def cells_of(feeling: Feeling, found: Fit, forces: ContactForces) -> tuple[Cells
 def _contradiction(measured: Array, felt: Array, pair: int, largest: float, noise: float) -> str:
     """Return the reason against a cell, from (n, 8) measured and modelled forces at its times; empty without one."""
     own = felt[:, pair]
-    if (own > 0.0).sum() < _FEWEST_CONTACT:
+    if (own > 0.0).sum() < FEWEST_IN_CONTACT:
         most = float(np.abs(measured[:, pair]).max())
-        return f"{most:.3g} N where the motion gives no contact" if most > _MOST_IN_FLIGHT * largest + 6 * noise else ""
+        return (
+            f"{most:.3g} N where the motion gives no contact" if most > tuning.CELL_SHARE * largest + 6 * noise else ""
+        )
     value = measured[:, pair]
     ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
     for first, end in zip(np.append(0, ends[:-1] + 1), ends + 1, strict=True):
-        if end - first >= _STUCK_ROWS and np.ptp(own[first:end]) > max(_STUCK_FORCE * own.max(), 6.0 * noise):
+        if end - first >= tuning.STUCK[0] and np.ptp(own[first:end]) > max(tuning.CELL_SHARE * own.max(), 6.0 * noise):
             return f"the same value {end - first} times in a row, while the motion gives {np.ptp(own[first:end]):.3g} N"
     if own.max() < 6.0 * noise:
         return ""
     like = np.array([correlation(value, felt[:, other]) for other in range(PAIR_COUNT)])
-    if like[pair] < _LEAST_CORRELATION:
+    if like[pair] < tuning.LEAST_CORRELATION:
         best = int(np.argmax(like))
-        other = f", {like[best]:.2f} with {PAIR_NAMES[best]}" if like[best] > _LEAST_CORRELATION else ""
-        return f"correlation of {like[pair]:.2f} with what the motion gives{other}, expected {_LEAST_CORRELATION:g}"
+        other = f", {like[best]:.2f} with {PAIR_NAMES[best]}" if like[best] > tuning.LEAST_CORRELATION else ""
+        return (
+            f"correlation of {like[pair]:.2f} with what the motion gives{other}, expected {tuning.LEAST_CORRELATION:g}"
+        )
     gain = float(value @ own / (own @ own))
-    if abs(gain - 1.0) > MOST_GAIN:
-        return f"{gain:.3g} times what the motion gives, expected {1.0 - MOST_GAIN:g} to {1.0 + MOST_GAIN:g}"
+    if abs(gain - 1.0) > tuning.MOST_GAIN:
+        return (
+            f"{gain:.3g} times what the motion gives, expected {1.0 - tuning.MOST_GAIN:g} to {1.0 + tuning.MOST_GAIN:g}"
+        )
     return ""
 
 
 def _delay(forces: ContactForces, felt: Felt) -> float:
-    """Return the delay at which the measured forces are most like those of the motion."""
+    """Return the delay with the largest correlation of measured forces and forces of the motion."""
     t, measured, given = forces.t, np.nan_to_num(forces.force), np.nan_to_num(felt.force)
     pairs = np.flatnonzero(given.any(axis=0) & measured.any(axis=0))
     lags = np.arange(-_LARGEST_DELAY, _LARGEST_DELAY + 0.5 * _DELAY_STEP, _DELAY_STEP)

@@ -1,12 +1,11 @@
-"""What a machine has beyond the model: further unknowns beside a fit, an uncertain load, and the rest as noise.
+"""Discrepancy of machine and model: further unknowns beside a fit, an uncertain load, and the rest as noise.
 
-No machine is exactly the model. Quantities that every machine has and no fit begins with (its inertia, the size of its
-frame, friction, the exponent of its law, walls that differ, the errors of its sensor) are further unknowns, each with
-a prior. Beside a fit they are found by one linearised step, and which of them differ from the model is drawn (Bayesian
-selection of variables): a quantity that the motion does not ask for stays where the scene has it, one that it does ask
-for is estimated, and one that it cannot tell widens the interval. The load of each swing has a constant error of its
-own, whose size is learned from all swings (empirical Bayes). What is still left over is noise: the measurements count
-less by its size and by how long it lasts (tempered likelihood).
+No machine is exactly the model. Inertia, size of the frame, friction, exponent, differences of the walls and errors of
+the sensor are further unknowns, each with a prior. One linearised step beside a fit gives them, and Bayesian selection
+of variables draws which of them differ from the scene: a quantity without evidence stays at its value in the scene, and
+a quantity that the motion does not determine widens the interval. The load of each swing has a constant error, whose
+size is learned from all swings (empirical Bayes). The remaining residuals are noise: the variance of the measurements
+grows by their size and by the time for which they stay correlated (tempered likelihood).
 
 References: George and McCulloch, J. Am. Stat. Assoc. 88 (1993) 881 (selection by Gibbs sampling); Hoeting et al.,
 Stat. Sci. 14 (1999) 382 (averaging over models); Dempster, Laird and Rubin, J. R. Stat. Soc. B 39 (1977) 1 (the sizes
@@ -25,7 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from plow_twin.estimate.fit import HUBER, START_SPREAD, WALLS, Fit, Problem, freed
+from plow_twin.estimate import tuning
+from plow_twin.estimate.fit import FEWEST_OF_SWING, WALLS, Fit, Problem, freed, huber_weight
+from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER
+from plow_twin.estimate.pads import TURN_STEP
 from plow_twin.estimate.priors import deviation_of
 from plow_twin.estimate.unknowns import GX, GY, MOVING, SIZE, SOFTNESS
 from plow_twin.model.pairs import PAIR_COUNT
@@ -33,9 +35,9 @@ from plow_twin.model.scene import Friction, Scene
 
 Array = NDArray[np.float64]
 
-#: Quantities beside those of the fit that no scene states: prior deviation. Walls by `WALLS`: stiffness over the
-#: contact's, turn in m. Of the sensor: scales, lever arm in m, square of the time constant of a filter in s2 (its delay
-#: is estimated already), drift of its clock.
+#: Prior: deviations of quantities that no scene states. Walls by `WALLS`: stiffness over the contact's, turn in m. Of
+#: the sensor: scales, lever arm in m, square of the time constant of a filter in s2 (its delay is estimated already),
+#: drift of its clock.
 UNSTATED: Final = {
     **{f"stiffness_{wall}": 0.1 for wall in ("left", "right", "top", "bottom")},
     **{f"turn_{wall}": 1e-3 for wall in ("left", "right", "top", "bottom")},
@@ -44,7 +46,8 @@ UNSTATED: Final = {
     "filter": 1e-4,
     "clock": 1e-4,
 }
-#: Those that a scene states, by their path there, and the steps of their difference quotients.
+#: Step: of the difference quotients by quantities that a scene states, by their path there; a fifth to a half of the
+#: deviation of a prior.
 STATED: Final = {
     "head.mass_kg": 0.02,
     "head.inertia_kg_m2": 0.02,
@@ -53,27 +56,18 @@ STATED: Final = {
     "contact.exponent": 0.02,
     "friction.coefficient": 0.01,
 }
-#: Steps of the stiffness and the turn of a wall, and of a constant load as a share of half its range.
-_WALL_STEP, _TURN_STEP, _PUSH_STEP = 0.02, 2e-4, 5e-3
-#: First guess of the load's error in each swing, as that share, and the least.
-_PUSH, _LEAST_PUSH = 0.02, 1e-5
-#: Rounds of learning its size, before and after the noise is tempered.
+#: Step: of the stiffness of a wall, and of a constant load in half its range.
+_WALL_STEP, _PUSH_STEP = 0.02, 5e-3
+#: Guard: least error of the load, in half its range.
+_LEAST_PUSH = 1e-5
+#: Bound: rounds of expectation and maximisation, between which the noise is tempered.
 _ROUNDS = (8, 5, 3)
-#: Probability that a quantity differs from the scene: nothing is known of it.
+#: Derived: probability that a quantity differs from the scene; nothing is known of it.
 _DIFFERS = 0.5
-#: Sweeps of the sampler, and those that are not counted.
+#: Bound: sweeps of the sampler, and the first of them, which are not counted.
 _SWEEPS, _BURNT = 50, 10
-#: Longest span in rows over which residuals are compared with each other, and the correlation that ends it.
-_LONGEST_LAG, _UNCORRELATED = 60, 0.05
-#: Fewest rows of a swing, and of a component.
-_FEWEST_OF_SWING, _FEWEST = 4, 50
-#: Share of the linearised step by which it may be wrong: the model bends along it.
-_BENT = 0.3
-#: What a clearance may be off by beside that, in m: by the square of the exponent's change, along which motions bend
-#: most, and by the root of the growth of the variance, for what no quantity explains. Without them machines with
-#: exponent 1.5, or 15 % of a third harmonic, were up to 9 deviations off (`exponent`, `shape` of the benchmark, seeds 1
-#: and 2).
-_BENT_BY_EXPONENT, _UNEXPLAINED = 0.1, 1e-4
+#: Bound: longest lag in rows over which residuals are compared.
+_LONGEST_LAG = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +79,7 @@ class Graded:
     shared, covariance : ndarray, shape (11,), (11, 11)
         The shared unknowns.
     differs : dict of str to (float, float, float)
-        Of each further quantity the probability that it differs from the scene, and by how much then: mean and
+        Of each further quantity the probability that it differs from the scene, and the difference: mean and
         standard deviation.
     load : ndarray, shape (3,)
         Standard deviation of the load's error in a swing as a share of half the load's range.
@@ -128,11 +122,11 @@ def graded(problem: Problem, found: Fit, seed: int = 0) -> Graded:
     step = mean[:SIZE]
     surprise = linear.surprise(mean, differs)
     covariance = covariance[:SIZE, :SIZE] * max(1.0, linear.scatter()) * surprise
-    covariance += np.diag((_BENT * step) ** 2)
+    covariance += np.diag((tuning.BENT * step) ** 2)
     named = linear.named(mean, differs)
     share, exponent, _ = named.get("contact.exponent", (0.0, 0.0, 0.0))
-    bent = _BENT_BY_EXPONENT * share * exponent**2
-    unexplained = _UNEXPLAINED * math.sqrt(float(linear.inflation.mean()) - 1.0)
+    bent = tuning.BENT_BY_EXPONENT * share * exponent**2
+    unexplained = tuning.UNEXPLAINED * math.sqrt(float(linear.inflation.mean()) - 1.0)
     covariance[[GX, GY], [GX, GY]] += bent**2 + unexplained**2
     return Graded(found.shared + step, covariance, named, linear.load, linear.inflation, surprise)
 
@@ -156,10 +150,10 @@ def _columns(problem: Problem, found: Fit) -> tuple[dict[str, tuple[float, Array
     for index, wall in enumerate(("left", "right", "top", "bottom")):
         share, turns = np.ones(PAIR_COUNT), problem.turns.copy()
         share[list(WALLS[index])] += _WALL_STEP
-        turns[index] += _TURN_STEP
+        turns[index] += TURN_STEP
         for name, step, moved in (
             (f"stiffness_{wall}", _WALL_STEP, problem.predicted(found.point, share=share)),
-            (f"turn_{wall}", _TURN_STEP, problem.predicted(found.point, turns=turns)),
+            (f"turn_{wall}", TURN_STEP, problem.predicted(found.point, turns=turns)),
         ):
             if moved is not None:
                 out[name] = UNSTATED[name], np.nan_to_num((moved[0] - base[0]) / step)
@@ -204,7 +198,7 @@ def variants(scene: Scene) -> tuple[Scene, ...]:
 def _moved(scene: Scene, path: str, step: float, depth: float) -> Scene:
     """Return a scene with a number changed by `step`: mass and inertia by a share of theirs.
 
-    With another exponent the force at the penetration `depth`, in m, stays the same.
+    With another exponent the force at the penetration `depth`, in m, is kept.
     """
     part, name = path.split(".")
     if part == "friction":
@@ -236,7 +230,7 @@ class _Linearised:
         self._pull = np.zeros(len(self._precision))
         self._pull[:SIZE] = (problem.mean - found.shared) / problem.deviation**2
         rows = [np.flatnonzero(self._swing == index) for index in range(problem.window.swings)]
-        self._rows = [some for some in rows if len(some) >= _FEWEST_OF_SWING]
+        self._rows = [some for some in rows if len(some) >= FEWEST_OF_SWING]
         if not self._rows:
             raise np.linalg.LinAlgError("no swing has enough poses")
         linear, residual = found.linear.rows, found.point.residual
@@ -251,18 +245,18 @@ class _Linearised:
         self._residual = [np.nan_to_num(residual[some]).ravel() for some in self._rows]
         self._there = [np.isfinite(residual[some]).ravel() for some in self._rows]
         self._left = self._residual
-        self.inflation, self.load = np.ones(3), np.full(3, _PUSH)
+        self.inflation, self.load = np.ones(3), np.full(3, tuning.PUSH)
 
     def eliminate(self) -> None:
         """Eliminate the unknowns of each swing."""
-        held = np.diag(np.concatenate([START_SPREAD**-2.0, self.load**-2.0]))
+        held = np.diag(np.concatenate([tuning.START_SPREAD**-2.0, self.load**-2.0]))
         self._blocks, self._swings = [], []
         for rows, border, own, residual, there, left in zip(
             self._rows, self._border, self._own, self._residual, self._there, self._left, strict=True
         ):
             variance = (self._found.variance[rows] * self.inflation).ravel()
             z = np.abs(left) / np.sqrt(variance)
-            weight = (there * np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / variance)[:, None]
+            weight = (there * huber_weight(z) / variance)[:, None]
             cross, score = (weight * border).T @ own, (weight * own).T @ residual
             factor = cho_factor((weight * own).T @ own + held)
             gain = cho_solve(factor, cross.T)
@@ -298,7 +292,7 @@ class _Linearised:
         for index in range(3):
             column = left[:, index]
             known = np.isfinite(column)
-            if known.sum() < _FEWEST:
+            if known.sum() < FEWEST_FOR_SCATTER:
                 continue
             usual = float(np.median(self._found.variance[known, index]))
             square = float((column[known] ** 2).mean())
@@ -355,7 +349,7 @@ class _Linearised:
         return max(1.0, float((z**2 / np.maximum(often, 0.1)).sum() / max(often.sum(), 1.0)))
 
     def named(self, mean: Array, often: Array) -> dict[str, tuple[float, float, float]]:
-        """Return of each quantity how often it differs, and by how much then."""
+        """Return of each quantity the probability that it differs, and the difference with its deviation."""
         deviation = np.sqrt(1.0 / np.diag(self._normal)[SIZE:])
         return {
             name: (float(share), float(value / max(share, 1e-9)), float(spread))
@@ -369,10 +363,10 @@ def _lasting(left: Array, swing: NDArray[np.int64], square: float) -> float:
     for lag in range(1, _LONGEST_LAG):
         one, other = left[:-lag], left[lag:]
         both = np.isfinite(one) & np.isfinite(other) & (swing[:-lag] == swing[lag:])
-        if both.sum() < _FEWEST:
+        if both.sum() < FEWEST_FOR_SCATTER:
             break
         alike = float((one[both] * other[both]).mean()) / square
-        if alike < _UNCORRELATED:
+        if alike < tuning.UNCORRELATED:
             break
         rows += 2.0 * alike
     return rows

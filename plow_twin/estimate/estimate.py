@@ -8,17 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.block import estimate_block
-from plow_twin.estimate.bouncing import FITTED, SURE, Bounced, bias_of_hard, bounces, compare
+from plow_twin.estimate.bouncing import Bounced, bias_of_hard, bounces, compare
 from plow_twin.estimate.discrepancy import Graded, graded, variants
-from plow_twin.estimate.fit import MOST_LEFT, Fit, Problem, freed
+from plow_twin.estimate.fit import Fit, Problem, freed
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.gaps import Gaps, GapsFit, fit_gaps
-from plow_twin.estimate.measurements import FEWEST_POSES, USELESS, Load, Poses
+from plow_twin.estimate.measurements import FEWEST_POSES, Load, Poses, useless_deviation
 from plow_twin.estimate.pads import askew, by_group, of_turns, turned
-from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, State
-from plow_twin.estimate.search import HARD, candidate, refine
+from plow_twin.estimate.result import NORMAL_P95, Estimate, ForcesUsed, Interval, Motion, State
+from plow_twin.estimate.search import candidate, refine
 from plow_twin.estimate.similar import Units
 from plow_twin.estimate.start import filled, noise_level, range_of_motion
 from plow_twin.estimate.unknowns import (
@@ -33,7 +35,7 @@ from plow_twin.estimate.unknowns import (
     Unknowns,
     with_other_law,
 )
-from plow_twin.estimate.verdict import COMPONENTS, Verdict, foretold, judge, judge_sensor, sandwich
+from plow_twin.estimate.verdict import COMPONENTS, Verdict, judge, judge_sensor, predicted, sandwich
 from plow_twin.model import geometry
 from plow_twin.model.scene import Gravity, Scene
 from plow_twin.solve.compiled_scene import inertias
@@ -45,71 +47,15 @@ Array = NDArray[np.float64]
 #: Shared unknowns, noise and turns of the walls of the window before, 18 numbers; empty: no guess.
 Guess = tuple[float, ...]
 
-#: Largest standard deviation in m with which a clearance counts as estimated.
-OBSERVED = 1e-3
-#: The same for a rough one: the prior's is 8 mm.
-ROUGHEST = 2e-3
-#: Growth of the variance, mean of x, y and theta, from which on a fit that has not come to its end tells nothing:
-#: behind a broad-band load that was sampled at 10 Hz fits were 9 to 15 mm off, with 15 to 25 (`cutting_10hz` of the
-#: benchmark, seeds 80000, 80001, 81000). With half of it, load errors of 5 % would be withdrawn too.
-MOST_INFLATED = 15.0
-#: The same of the clearance of a group of pads: enough to see that a wall is worn askew.
-GROUP_OBSERVED = 5e-4
-#: Longest distance of poses in s: where fewer lie in a flight, its start is guessed wrong and the fit with it.
-SPARSEST = 0.125
-#: Load periods and seconds of a window, whichever is longer; of more the newest are taken, since the work is bounded.
+#: Bound: load periods and seconds of a window, whichever is longer, and the longest window of a node in s; of more the
+#: newest are taken, since the work is bounded.
 MOST_PERIODS, MOST_SPAN_S = 20.0, 60.0
-#: What is looked at at all, in s: the longest window of a node.
 _LONGEST_S = 600.0
-#: Scatter of the last half of the poses, in that of their quick changes, from which on the head moves.
-_MOVES = 5.0
-#: The same up to which it rests, and how much the load scatters meanwhile at most, in weights of the head.
-_RESTS, _IDLE_LOAD = 1.3, 0.05
-#: Least time in contact in s of the walls of both sides.
-TOUCHED = 0.02
-#: Share of the measured x, or y, that the model must predict: the rest hardly counts in the fit.
-FORETOLD = 0.08
-#: Penetration of both walls at most, in that under the reference force: the paper's forces are up to twice as large.
-_GIVEN = 4.0
-#: Knots of the load in a period that are simulated, about.
-KNOTS = 120
-#: Beyond so many times that, the load is averaged instead: 9 ms at the period of the paper.
-_MOST_KNOTS = 3
-#: What a broad-band load does between its samples counts so many times: contacts turn it from pose to rate and back.
-_LEFT_OPEN = 4.0
-#: What a hard contact adds to the standard deviation of a clearance in m: the fit ends in one of many optima, and this
-#: is their scatter in the benchmark's own hard group.
-HARD_SCATTER = 4e-4
-#: The same of a contact not quite so hard, and the penetration in m under the reference force below which it is one:
-#: set on seeds 43201 to 43215 of the benchmark (K 3e7 .. 1.4e8).
-FIRM_SCATTER, _FIRM = 4.5e-5, 3.5e-3
-#: How far, in that of drawn ones, a motion may be from those drawn.
-MOST_DISTANCE = 4.0
-#: How far the path over the load's period may be from theirs, and how much more like those of another law, as normal
-#: deviates.
-MOST_PATH, MOST_OTHER_LAW = 4.5, 2.33
-#: How much likelier it may be under another law, as a logarithm: of that fewer motions are drawn, which makes its
-#: likelihood too small. Right models (seeds from 42200 on) have -7 at most.
-MOST_ODDS = -3.0
-#: Where it is known to be less likely by more than that, a motion that looks like one of another law is none of it: the
-#: right model of seed 46205 has 2.43 deviates and -44.
-_NO_ODDS = -20.0
-#: Largest standard deviation in m there: beyond it the wall was touched too seldom, and the answer is a wrong one.
-#: Set on seeds 40400 to 40409 of the benchmark; see docs/estimate.md.
-BOUNCED_MOST = 2e-4
-#: Widening of a fit that had not come to its end.
-UNFINISHED = 1.3
-#: Chi^2 of the four turns of the walls from which on they are turned: of right models (seeds 42000 to 42004, 3 groups
-#: of the benchmark) it was 9 at most, of walls worn askew it was 25 from a sixth of the year of examples/a_year on.
-MOST_ASKEW = 25.0
-#: The same in the chi^2 of the sensor's scales, since each explains the other in part: walls worn askew had 5 and more
-#: (0.3 to 1 times the wear late in a life), scales of 1.05 had 0.4 to 1.6.
-MORE_ASKEW = 3.0
-#: How far gaps may be from each other, and from the motion's estimate, in their standard deviations.
-MOST_CONTRADICTION = 5.0
-#: Logarithms of the penetrations under the reference force that a contact can have, in m.
+#: Derived: normal deviate that a right model exceeds in one of a hundred cases, to two digits.
+MOST_OTHER_LAW = round(float(ndtri(0.99)), 2)
+#: Guard: logarithms of the penetrations in m that a contact can have.
 _LN_PENETRATIONS = (math.log(1e-9), math.log(0.12))
-#: Pairs of the left, right, top and bottom walls of the cavity.
+#: Definition: pairs of the left, right, top and bottom walls of the cavity.
 _SIDES = {"left": (1, 7), "right": (3, 5), "top": (0, 2), "bottom": (4, 6)}
 
 
@@ -221,7 +167,7 @@ def _from_motion(
         return _without_fit(unknowns, poses, lost, "load: the same value throughout, while the head moves"), ()
     if _is_idle(scene, load, poses):
         nothing = prior_of(unknowns, (float(poses.t[0]), float(poses.t[-1])), lost)
-        unseen, why = State.NOT_OBSERVABLE, "the head rests under a load that hardly changes: its motion tells nothing"
+        unseen, why = State.NOT_OBSERVABLE, "the head rests under a load that hardly changes"
         return replace(nothing, horizontal_state=unseen, vertical_state=unseen, reasons=(why,)), ()
     if _rests(poses):
         return _without_fit(
@@ -229,13 +175,13 @@ def _from_motion(
         ), ()
     period = min(load.period(), float(poses.t[-1] - poses.t[0]))
     felt, broad = thinned(load, period)
-    drift = _LEFT_OPEN * load.left_open() / np.asarray(inertias(scene)) ** 2 if broad else None
+    drift = tuning.LEFT_OPEN * load.left_open() / np.asarray(inertias(scene)) ** 2 if broad else None
     forward = Forward(scene, felt)
     if guess:
         numbers = np.array(guess)
         shared, noise, turns = np.split(numbers, [SIZE, SIZE + 3])
         # a guess comes from a fit, and contacts harder than this are not fitted
-        certain = unknowns.penetration_of(float(shared[SOFTNESS])) > FITTED
+        certain = unknowns.penetration_of(float(shared[SOFTNESS])) > tuning.FITTED
         near = refine(forward, unknowns, poses, period, unknowns.within(shared), noise, drift, turns, certain)
         verdict = judge(*near, period) if near else None
         if near and verdict and not (verdict.model or verdict.sensor) and near[1].finished:
@@ -268,12 +214,12 @@ def _searched(
     first = candidate(forward, unknowns, poses, period) if bounced is None else None
     if first is not None:
         penetration = unknowns.penetration_of(float(first.shared[SOFTNESS]))
-        if penetration < SURE and not narrow:
+        if penetration < tuning.CERTAINLY_HARD and not narrow:
             bounced = compare(forward, unknowns, poses, period)
-        if bounced is None and penetration < HARD:
+        if bounced is None and penetration < tuning.HARD:
             bounced = compare(forward, unknowns, poses.moved(-first.shared[BIAS]), period, first.shared)
             bounced = bounced and replace(bounced, bias=bounced.bias + first.shared[BIAS])
-    if bounced is not None and (first is None or bounced.ln_penetration[0] < math.log(FITTED)):
+    if bounced is not None and (first is None or bounced.ln_penetration[0] < math.log(tuning.FITTED)):
         return summarise_bounced(unknowns, poses, bounced, lost, forward.work), ()
     if first is None:
         return _without_fit(unknowns, poses, lost), ()
@@ -309,7 +255,7 @@ def with_bounced(result: Estimate, bounced: Bounced, spent: int) -> Estimate:
         bounced.clearance_deviation.tolist(),
         strict=True,
     ):
-        if state is State.ESTIMATED and bounced.distance < MOST_DISTANCE and deviation < OBSERVED:
+        if state is State.ESTIMATED and bounced.distance < tuning.MOST_DISTANCE and deviation < tuning.OBSERVED:
             off = abs(value.mean - mean) / math.hypot(deviation, value.deviation)
             mean, deviation = _both((value.mean, value.deviation), (mean, deviation))
             value = Interval.normal(mean, deviation * max(1.0, off)).above(0.0)
@@ -327,7 +273,9 @@ def _with_turns(found: tuple[Problem, Fit], verdict: Verdict, period: float) -> 
     if verdict.sensor and not verdict.by_scale:
         return found, verdict
     fits = not verdict.model and found[1].finished
-    if fits and askew(*found) < (MORE_ASKEW * verdict.figures["scale"] if verdict.by_scale else MOST_ASKEW):
+    if fits and askew(*found) < (
+        tuning.MORE_ASKEW * verdict.figures["scale"] if verdict.by_scale else tuning.OUTLYING**2
+    ):
         return found, verdict
     again = turned(*found)
     other = None if again is None else judge(*again, period)
@@ -342,16 +290,17 @@ def _moved_back(result: Estimate, bias: Array) -> Estimate:
         None if known is None else Interval(known.mean + by, known.p05 + by, known.p95 + by)
         for known, by in zip((result.bias_x, result.bias_y, result.bias_theta), bias.tolist(), strict=True)
     )
-    return replace(result, bias_x=x, bias_y=y, bias_theta=theta)
+    motion = None if result.motion is None else result.motion.moved(bias)
+    return replace(result, bias_x=x, bias_y=y, bias_theta=theta, motion=motion)
 
 
 def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
     """Combine the estimate from the motion with that from gap sensors; no state is kept where they contradict."""
     found = []
-    if by_gaps.contradiction > MOST_CONTRADICTION:
+    if by_gaps.contradiction > tuning.OUTLYING:
         found.append(
             f"gaps: {by_gaps.contradiction:.1f} times their stated error from the clearances of all sensors, "
-            f"expected at most {MOST_CONTRADICTION:g}"
+            f"expected at most {tuning.OUTLYING:g}"
         )
     values, states = [], []
     for name, value, state, mean, deviation in zip(
@@ -364,7 +313,7 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
     ):
         moved = value.deviation
         off = abs(value.mean - mean) / math.hypot(deviation, moved)
-        if state.known and off > MOST_CONTRADICTION:
+        if state.known and off > tuning.OUTLYING:
             found.append(
                 f"gaps: {name} {mean:.5f} m, by the motion {value.mean:.5f} m: {off:.1f} of their deviations apart"
             )
@@ -391,23 +340,25 @@ def with_gaps(result: Estimate, by_gaps: GapsFit) -> Estimate:
 def summarise_bounced(unknowns: Unknowns, poses: Poses, bounced: Bounced, lost: int, work: int) -> Estimate:
     """Turn the comparison of a hard contact's motion into values, intervals and states."""
     sensor = judge_sensor(poses)
-    found = (("motion", bounced.distance, MOST_DISTANCE), ("path over the load's period", bounced.path, MOST_PATH))
+    found = (
+        ("motion", bounced.distance, tuning.MOST_DISTANCE),
+        ("path over the load's period", bounced.path, tuning.MOST_PATH),
+    )
     model = [
         f"{name} unlike those of the model: {value:.1f}, expected at most {most:g}"
         for name, value, most in found
         if value > most
     ]
-    if bounced.law > MOST_OTHER_LAW and not -math.inf < bounced.odds < _NO_ODDS:
+    if bounced.law > MOST_OTHER_LAW and not -math.inf < bounced.odds < tuning.MOST_ODDS[1]:
         model.append(f"motion like that of another contact law: {bounced.law:.1f}, expected at most {MOST_OTHER_LAW:g}")
-    if bounced.odds > MOST_ODDS:
-        model.append(
-            f"motion likely under another contact law: ln odds {bounced.odds:.1f}, expected at most {MOST_ODDS:g}"
-        )
+    if bounced.odds > tuning.MOST_ODDS[0]:
+        odds = f"ln odds {bounced.odds:.1f}, expected at most {tuning.MOST_ODDS[0]:g}"
+        model.append(f"motion likely under another contact law: {odds}")
     reasons = sensor or model
     clearances, states = [], []
     for index in (GX, GY):
         deviation = float(bounced.clearance_deviation[index])
-        observed = deviation < BOUNCED_MOST
+        observed = deviation < tuning.BOUNCED_MOST
         value = Interval.normal(bounced.clearance[index], deviation)
         if not observed:
             value = _unobserved(unknowns, np.zeros(2), index, 0.0, bounced.noise)
@@ -476,9 +427,8 @@ def _figures(beside: Graded | None) -> dict[str, float]:
 def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
     """Return the result of the fit where the machine may differ from the model; None where data contradict themselves.
 
-    Linked swings, and walls that were found turned, are taken as they are while nothing is against the model. A fit
-    that has not come to its end may be in another optimum: None too where its swings are linked, or where far more than
-    noise is left over.
+    None too for linked swings and turned walls while no check fails. A fit that has not converged may be in another
+    optimum: None if its swings are linked, or if its residuals far exceed the noise.
     """
     if verdict.broken:
         return None
@@ -489,7 +439,7 @@ def _graded(problem: Problem, fit: Fit, verdict: Verdict) -> Graded | None:
         found = graded(problem, fit)
     except np.linalg.LinAlgError:
         return None
-    return found if fit.finished or found.inflation.mean() < MOST_INFLATED else None
+    return found if fit.finished or found.inflation.mean() < tuning.MOST_INFLATED else None
 
 
 def _next_guess(problem: Problem, fit: Fit) -> Guess:
@@ -497,8 +447,8 @@ def _next_guess(problem: Problem, fit: Fit) -> Guess:
 
 
 def thinned(load: Load, period: float) -> tuple[Load, bool]:
-    """Thin a load to what the motion feels; return whether it is broad-band, so that nearly every sample counts."""
-    most = KNOTS * max(1.0, float(load.t[-1] - load.t[0]) / period)
+    """Thin a load to the samples that move the head; return whether it is broad-band: nearly every sample counts."""
+    most = tuning.KNOTS[0] * max(1.0, float(load.t[-1] - load.t[0]) / period)
     shares = (5e-4, 1e-3, 2e-3, 4e-3, 8e-3)
     significance = load.significance(shares[0])
     thin = load
@@ -507,12 +457,12 @@ def thinned(load: Load, period: float) -> tuple[Load, bool]:
         if len(thin.t) <= most:
             break
     broad = len(thin.t) > most
-    # where every sample is another one, their means move the head
-    return load.averaged(_MOST_KNOTS * int(most)) if len(thin.t) > _MOST_KNOTS * most else thin, broad
+    # the means of a broad-band load move the head
+    return load.averaged(tuning.KNOTS[1] * int(most)) if len(thin.t) > tuning.KNOTS[1] * most else thin, broad
 
 
 def warm_up(scene: Scene) -> None:
-    """Compile the kernels that a scene needs, or load them from the cache on disk; a block needs none."""
+    """Compile the kernels that a scene needs, or load them from the cache; a block needs no kernel."""
     if scene.head.carries == "corners":
         return
     load = Load(np.array([0.0, 1.0]), np.zeros((2, 3)))
@@ -544,22 +494,23 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
     deviation = np.sqrt(np.diag(covariance))
     reasons = verdict.model + verdict.sensor
     if not finished and not suspect:
-        reasons = [
-            f"the fit has not come to its end: {fit.gain_left:.0f} are left to gain, expected at most {MOST_LEFT:g}"
-        ]
-    # walls give way: the head has been farther than they are, at most by so much
-    given = _GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
+        gain = f"{fit.gain_left:.0f} are left to gain, expected at most {tuning.OUTLYING**2:g}"
+        reasons = [f"the fit has not come to its end: {gain}"]
+    # walls give way: largest distance of the head beyond them
+    given = tuning.GIVEN * float(np.exp(shared[SOFTNESS] + NORMAL_P95 * min(deviation[SOFTNESS], 1.0)))
     least = range_of_motion(unknowns.scene, poses)[0] - given
-    share = foretold(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
+    share = predicted(fit).sum(axis=0) / np.maximum(np.isfinite(fit.point.residual).sum(axis=0), 1)
     clearances, states = [], []
     for index, sides in ((GX, ("left", "right")), (GY, ("top", "bottom"))):
         # a moment that cannot be predicted contradicts no clearance; a bouncing head cannot be predicted for long
-        tested = share[index] > FORETOLD or unknowns.penetration_of(float(shared[SOFTNESS])) < HARD
+        tested = share[index] > tuning.PREDICTED or unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.HARD
         if not tested and finished and not suspect:
-            reasons.append(f"{COMPONENTS[index]}: {share[index]:.0%} of it can be foretold, expected {FORETOLD:.0%}")
+            reasons.append(
+                f"{COMPONENTS[index]}: {share[index]:.0%} of it is predicted, expected {tuning.PREDICTED:.0%}"
+            )
         touched = min(float(fit.point.contact[:, _SIDES[side]].sum()) for side in sides)
-        observed = tested and touched > TOUCHED
-        observed &= deviation[index] < (ROUGHEST if rough else OBSERVED) and (finished or rough)
+        observed = tested and touched > tuning.TOUCHED
+        observed &= deviation[index] < (2.0 * tuning.OBSERVED if rough else tuning.OBSERVED) and (finished or rough)
         value = Interval.normal(shared[index], deviation[index])
         if not observed:
             value = _unobserved(unknowns, deviation, index, least[index], fit.noise)
@@ -589,6 +540,7 @@ def summarise(problem: Problem, fit: Fit, verdict: Verdict, lost: int, forces: C
             "gain_left": fit.gain_left,
             "work": float(problem.forward.work),
         },
+        motion=Motion(poses.t, poses.q, poses.q - fit.point.residual),
     )
     if forces is None:
         return result
@@ -645,12 +597,12 @@ def _plain(problem: Problem, fit: Fit) -> Array:
 
 
 def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> Array:
-    """Return the covariance of the shared unknowns: `plain` of the noise, or as the swings scatter if that is more.
+    """Return the covariance of the shared unknowns: `plain` of the noise, or from the scatter of the swings if larger.
 
-    What scatters is one thing for all unknowns that move the head: the ratio is the mean of theirs, since each by
-    itself is a chance of some tens of swings. Linked swings have it in their links. The fit has taken its own freedom
-    out of the scatter. Residuals beyond the noise are of one piece for long: the deviations grow with their
-    size, not with its root. The step that a fit would still take is not known.
+    One cause scatters all unknowns that move the head, so one ratio, the mean of theirs, widens all of them; a single
+    ratio from some tens of swings would be chance. The links of linked swings hold it already. The scatter is
+    corrected for the unknowns fitted to it. Residuals beyond the noise are correlated for long, so deviations grow with
+    their size, not with its root. The step that the fit would still take is unknown.
     """
     size = len(fit.shared)
     covariance: Array = plain * _widened(problem, fit, verdict) + np.outer(fit.left[:size], fit.left[:size])
@@ -659,18 +611,18 @@ def _covariance(problem: Problem, fit: Fit, verdict: Verdict, plain: Array) -> A
 
 
 def _widened(problem: Problem, fit: Fit, verdict: Verdict) -> float:
-    """Return the variance by the scatter of the swings and by the residuals' colour over that of the noise."""
+    """Return the variance over that of the noise, by the scatter of the swings and by the residuals' colour."""
     ratio = 1.0 if len(problem.link) else max(1.0, _scatter(problem, fit, np.diag(fit.covariance)))
     colour = max(verdict.figures.get(f"colour_{name}", 1.0) for name in COMPONENTS)
-    widened = max(1.0, colour) * (1.0 if fit.converged else UNFINISHED)
+    widened = max(1.0, colour) * (1.0 if fit.converged else tuning.UNFINISHED)
     return widened**2 * ratio
 
 
 def _between_optima(unknowns: Unknowns, shared: Array) -> float:
     """Return the addition to the standard deviation of a clearance where the contact is hard, or nearly so, in m."""
     if unknowns.is_hard(shared):
-        return HARD_SCATTER
-    return FIRM_SCATTER if unknowns.penetration_of(float(shared[SOFTNESS])) < _FIRM else 0.0
+        return tuning.OPTIMA[0]
+    return tuning.OPTIMA[1] if unknowns.penetration_of(float(shared[SOFTNESS])) < tuning.FIRM else 0.0
 
 
 def _scatter(problem: Problem, fit: Fit, variance: Array) -> float:
@@ -685,14 +637,14 @@ def _groups(
 ) -> dict[str, tuple[Interval, State]]:
     """Return the clearance of each group of pads; not observable where the motion does not determine it.
 
-    `added` is the covariance beyond that of the fit alone; `shared` are unknowns and differences from the model.
+    `added` is the covariance beyond the fit's; `shared` are unknowns and differences from the model.
     """
     out = {}
     for name, (value, deviation) in by_group(problem, fit, widened).items():
         axis = GX if name.startswith("horizontal") else GY
         state = states[axis]
         whole = math.sqrt(deviation**2 + max(float(added[axis, axis]), 0.0))
-        if state.known and whole > GROUP_OBSERVED:
+        if state.known and whole > 0.5 * tuning.OBSERVED:
             state = State.NOT_OBSERVABLE
         out[name] = Interval.normal(value.mean + float(shared[axis] - fit.shared[axis]), whole).above(0.0), state
     return out
@@ -727,6 +679,14 @@ def _damping(unknowns: Unknowns, value: Interval) -> Interval | None:
     return Interval(*numbers)
 
 
+def priors(scene: Scene, load: Load, poses: Poses) -> dict[str, Interval]:
+    """Return what is known of each quantity before the motion, by the names of `QUANTITIES`, in SI."""
+    unknowns = Unknowns.stated(scene, load, poses)
+    normal = [Interval.normal(*pair) for pair in zip(unknowns.nominal(), unknowns.deviations(), strict=True)]
+    numbers = {name: value for name, value in _numbers(unknowns, normal).items() if value is not None}
+    return {"horizontal": normal[GX].above(0.0), "vertical": normal[GY].above(0.0), **numbers}
+
+
 def prior_of(unknowns: Unknowns, span: tuple[float, float], lost: int) -> Estimate:
     """Return the prior as an estimate."""
     nominal, spread = unknowns.nominal(), unknowns.deviations()
@@ -741,7 +701,7 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
     """Return which components were hardly measured: a corner's place follows from all three only."""
     useless = tuple(
         f"{name}: stated deviation {deviation:g}, expected at most {most:g}"
-        for name, deviation, most in zip(COMPONENTS, poses.deviation, USELESS, strict=True)
+        for name, deviation, most in zip(COMPONENTS, poses.deviation, useless_deviation(), strict=True)
         if deviation > most
     )
     if useless:
@@ -752,28 +712,30 @@ def _lacking(poses: Poses) -> tuple[str, ...]:
         for name, count in zip(COMPONENTS, counts, strict=True)
         if count < FEWEST_POSES
     )
-    if not lacking and poses.interval() > SPARSEST:
-        lacking = (f"poses: got {1.0 / poses.interval():.1f} a second, expected at least {1.0 / SPARSEST:.1f}",)
+    if not lacking and poses.interval() > tuning.SPARSEST:
+        lacking = (f"poses: got {1.0 / poses.interval():.1f} a second, expected at least {1.0 / tuning.SPARSEST:.1f}",)
     return lacking
 
 
 def _is_dead(load: Load, poses: Poses) -> bool:
     """Return whether a load that never changes must be absent: under a constant one the head comes to rest."""
     late = filled(poses)[len(poses.t) // 2 :]
-    return not np.ptp(load.wrench, axis=0).any() and bool((late.std(axis=0) > _MOVES * noise_level(late)).any())
+    return not np.ptp(load.wrench, axis=0).any() and bool(
+        (late.std(axis=0) > tuning.OUTLYING * noise_level(late)).any()
+    )
 
 
 def _is_idle(scene: Scene, load: Load, poses: Poses) -> bool:
-    """Return whether a machine stands: its pose is constant but for noise, and the load hardly changes."""
+    """Return whether the machine is idle: its pose is constant up to noise, and the load hardly changes."""
     weight = scene.head.mass_kg * Gravity().acceleration_m_s2
-    most = _IDLE_LOAD * weight * np.array([1.0, 1.0, geometry.half_diagonal(scene)])
+    most = tuning.IDLE_LOAD * weight * np.array([1.0, 1.0, geometry.half_diagonal(scene)])
     return bool((load.wrench.std(axis=0) < most).all()) and _rests(poses)
 
 
 def _rests(poses: Poses) -> bool:
     """Return whether all but the first of the pose is noise."""
     q = filled(poses)[len(poses.t) // 4 :]
-    return bool((q.std(axis=0) < _RESTS * noise_level(q)).all())
+    return bool((q.std(axis=0) < tuning.RESTS * noise_level(q)).all())
 
 
 def _without_fit(

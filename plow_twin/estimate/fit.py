@@ -1,12 +1,11 @@
 """Least squares of the measured motion over the unknowns and the state at the start of each swing.
 
 The window is cut into swings, each begun in flight between the walls, where the state is best known and a small error
-of it does no harm. Each is simulated from a state of its own (multiple shooting), so neither the last bounces of a hard
-contact nor an error of the load's model can grow from swing to swing. Levenberg-Marquardt minimises Huber's function of
-the residuals and the prior. Under a load that leaves open what it does between its samples the swings are short, and
-each is linked to the next by what such a load can have added on the way (weak constraints). Runs from displaced
-starting states show which moments of a swing cannot be foretold: the measurements there get less weight by just that
-much.
+of it does no harm. Each is simulated from its own starting state (multiple shooting), so neither the last bounces of a
+hard contact nor an error of the load can grow from swing to swing. Levenberg-Marquardt minimises Huber's function of
+the residuals and the prior. Under a load that is unknown between its samples the swings are short, and
+each is linked to the next by the covariance of that unknown part (weak constraints). Runs from displaced starting
+states give the variance of the prediction at each moment, which is added to that of the measurement.
 
 References: Bock, Recent advances in parameter identification techniques for ODE (1983); Nocedal and Wright, Numerical
 Optimization, ch. 10; Huber, Robust Statistics, ch. 7; Tremolet, Q. J. R. Meteorol. Soc. 132 (2006) 2483.
@@ -22,6 +21,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN, Arrow, Factor
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
@@ -31,39 +31,31 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Normalised residual from which a measurement counts less (Huber).
-HUBER = 3.0
-#: Weight of the variance that cannot be foretold: where there is any, the Jacobian is noise too and must count little.
-JITTER_WEIGHT = 100.0
-#: Its weight where fits are compared.
-_COMPARED_WEIGHT = 5.0
-#: Precision of an unknown without a prior.
+#: Guard: precision of an unknown without a prior.
 NO_PRIOR = 1e-6
-#: Most that the scatter of few swings is widened for the unknowns fitted to them.
-_MOST_FREED = 3.0
-#: Steps of the solver after which no further iteration begins: the cost of a fit is counted, not timed.
-MOST_WORK = 3_000_000
-#: Displacements of a starting state: m, m, rad, m/s, m/s, rad/s.
+#: Step: of the difference quotients by a starting state: m, m, rad, m/s, m/s, rad/s.
 _DISPLACED = np.array([2e-4, 2e-4, 1e-3, 5e-3, 5e-3, 3e-2])
-#: Prior standard deviations of a starting state about its guess.
-START_SPREAD = np.array([4e-3, 4e-3, 0.02, 0.2, 0.2, 1.0])
-#: Standard deviations of the displacements of a starting state that probe the predictability.
-_PROBED_STATE = np.array([2e-4, 2e-4, 8e-4, 6e-3, 6e-3, 3e-2])
-#: A rate of 0.1 mm/s, or mrad/s, after a second: less of it no solver and no sensor tells.
+#: Guard: a rate of 0.1 mm/s, or mrad/s, after a second; neither a solver nor a sensor resolves less.
 _LEAST_DRIFT = 1e-8
-#: Walls by their two pads: left, right (top pad first), top, bottom (left pad first).
+#: Definition: walls by their two pads: left, right (top pad first), top, bottom (left pad first).
 WALLS: Final = ((1, 7), (3, 5), (0, 2), (6, 4))
-#: Gain in the cost that a fit may still have before it.
-MOST_LEFT = 25.0
-#: Rows of a swing with fewer of which it tells nothing beside its own state.
-_FEWEST_ROWS = 4
-#: Longest step of the iteration in units of the prior's standard deviation.
-_LONGEST_STEP = 1.0
+#: Derived: three numbers a row against the six of a swing's start; with fewer rows it knows nothing else.
+FEWEST_OF_SWING = 4
+
+
+def huber_loss(z: Array) -> Array:
+    """Return Huber's function of absolute normalised residuals: their square, linear beyond `tuning.HUBER`."""
+    return np.where(z <= tuning.HUBER, z * z, tuning.HUBER * (2.0 * z - tuning.HUBER))
+
+
+def huber_weight(z: Array) -> Array:
+    """Return the weights of squared residuals that give Huber's function."""
+    return np.minimum(1.0, tuning.HUBER / np.maximum(z, 1e-12))
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """What is fitted.
+    """Poses cut into swings.
 
     starts : (s + 1,) model times in s at which swings begin, and the end of the last
     states : (s, 6) guesses of x, y, theta and their rates there
@@ -115,7 +107,7 @@ class Linear:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the normal equations: the shared unknowns and those of some swings in a row, from `swing` on.
+    """A part of the normal equations: the shared unknowns and those of consecutive swings from `swing` on.
 
     rows, weighted : (m, 17) or (m, 23)
     residual : (m,)
@@ -161,16 +153,16 @@ class Fit:
 
     @property
     def finished(self) -> bool:
-        """Whether it is in an optimum: the residuals are then those of the model."""
-        return self.gain_left < MOST_LEFT
+        """Whether it has reached an optimum, so that its residuals judge the model."""
+        return self.gain_left < tuning.OUTLYING**2
 
     @property
     def loss(self) -> float:
-        """Twice the negative logarithm of the likelihood, to compare fits of the same measurements."""
-        variance = self.noise**2 + _COMPARED_WEIGHT * self.jitter
+        """Twice the negative log likelihood; it compares fits to the same measurements."""
+        variance = self.noise**2 + tuning.JITTER_WEIGHT[1] * self.jitter
         there = np.isfinite(self.point.residual)
         z = np.abs(self.point.residual[there]) / np.sqrt(variance[there])
-        return float(np.where(z <= HUBER, z * z, HUBER * (2.0 * z - HUBER)).sum() + np.log(variance[there]).sum())
+        return float(huber_loss(z).sum() + np.log(variance[there]).sum())
 
     @property
     def shared(self) -> Array:
@@ -185,7 +177,7 @@ class Fit:
 
 
 def depth_of(turns: Array) -> Array | None:
-    """Return by how much each pad lies further out, shape (8,), in m; None where no wall is turned."""
+    """Return the outward displacement of each pad, shape (8,), in m; None if no wall is turned."""
     if not turns.any():
         return None
     depth = np.zeros(PAIR_COUNT)
@@ -197,9 +189,9 @@ def depth_of(turns: Array) -> Array | None:
 class Problem:
     """A window of measurements, the prior and the forward model together.
 
-    `horizon` limits each swing to its first seconds; `turns` (4,) are by how much the first pad of each wall lies
-    further out than the second, in m (`WALLS`); `drift` (3,) is the spectral density in m2/s3 and rad2/s3 of an
-    acceleration that nobody knows: with it the swings are linked.
+    `horizon` limits each swing to its first seconds; `turns` (4,) are the distances in m by which the first pad of
+    each wall lies further out than the second (`WALLS`); `drift` (3,) is the spectral density of an unknown
+    acceleration, in m2/s3 and rad2/s3, with which the swings are linked.
     """
 
     def __init__(
@@ -223,7 +215,7 @@ class Problem:
         # times rise, so a swing's rows lie together
         edges = np.searchsorted(swing[rows], np.arange(window.swings + 1)).astype(np.int64)
         asked, ends = times[rows], np.zeros(0, np.int64)
-        if len(self.link):  # each swing but the last goes on to the start of the next
+        if len(self.link):  # each swing but the last runs to the start of the next
             ends = edges[1:-1] + np.arange(len(self.link))
             asked = np.insert(asked, edges[1:-1], window.starts[1:-1])
             edges = edges + np.minimum(np.arange(window.swings + 1), len(self.link))
@@ -278,10 +270,10 @@ class Problem:
         A measurement that a point does not reach costs as much as one that fits.
         """
         z = np.abs(point.residual) / np.sqrt(variance)
-        loss = np.where(z <= HUBER, z * z, HUBER * (2.0 * z - HUBER))
+        loss = huber_loss(z)
         lacking = np.isnan(loss) & np.isfinite(self.window.poses.q)
         shift = (point.shared - self.mean) / self.deviation
-        moved = (point.states - self.window.states) / START_SPREAD
+        moved = (point.states - self.window.states) / tuning.START_SPREAD
         linked = np.einsum("si,sij,sj->", point.defect, self.link, point.defect)
         return float(np.nansum(loss) + lacking.sum() + shift @ shift + (moved * moved).sum() + linked)
 
@@ -346,11 +338,11 @@ def fit(
         return None
     damping, converged, done = 1e-3, False, 0
     linear = problem.linearise(point)
-    jitter = unforeseen(problem, point, linear.rows, seed)
-    while done < iterations and problem.forward.work < MOST_WORK:
+    jitter = unpredicted(problem, point, linear.rows, seed)
+    while done < iterations and problem.forward.work < tuning.MOST_WORK[0]:
         done += 1
         noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.noise)
-        variance = noise**2 + JITTER_WEIGHT * jitter
+        variance = noise**2 + tuning.JITTER_WEIGHT[0] * jitter
         point.cost = problem.cost(point, variance)
         normal, gradient = normal_equations(problem, point, linear, variance)
         trial, damping = _descend(problem, point, variance, normal, gradient, damping)
@@ -363,9 +355,9 @@ def fit(
         if gained < enough:
             converged = True
             break
-        jitter = unforeseen(problem, point, linear.rows, seed)
+        jitter = unpredicted(problem, point, linear.rows, seed)
     noise = np.maximum(noise_of(point.residual, noise, jitter), problem.unknowns.noise)
-    variance = noise**2 + JITTER_WEIGHT * jitter
+    variance = noise**2 + tuning.JITTER_WEIGHT[0] * jitter
     point.cost = problem.cost(point, variance)
     normal, gradient = normal_equations(problem, point, linear, variance)
     factor = normal.factorised()
@@ -377,7 +369,7 @@ def fit(
 def pieces(problem: Problem, point: Point, linear: Linear, variance: Array) -> Iterator[list[Piece]]:
     """Yield for each swing the terms of its measurements and of its link to the next swing in the normal equations."""
     z = np.abs(point.residual) / np.sqrt(variance)
-    weight = np.nan_to_num(np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / variance) * np.isfinite(point.residual)
+    weight = np.nan_to_num(huber_weight(z) / variance) * np.isfinite(point.residual)
     weighted, residual = linear.rows * weight[:, :, None], np.nan_to_num(point.residual)
     # times rise, so a swing's rows lie together
     used = np.flatnonzero(point.swing >= 0)
@@ -402,30 +394,32 @@ def normal_equations(problem: Problem, point: Point, linear: Linear, variance: A
         gradient[:SIZE] += right[:SIZE]
         gradient[piece.own] += right[SIZE:]
     gradient[:SIZE] += (problem.mean - point.shared) / problem.deviation**2
-    gradient[SIZE:] += ((problem.window.states - point.states) / START_SPREAD**2).ravel()
-    return normal.plus(np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / START_SPREAD**2, swings)])), gradient
+    gradient[SIZE:] += ((problem.window.states - point.states) / tuning.START_SPREAD**2).ravel()
+    return normal.plus(
+        np.concatenate([1.0 / problem.deviation**2, np.tile(1.0 / tuning.START_SPREAD**2, swings)])
+    ), gradient
 
 
 def freed(swings: int, unknowns: int) -> float:
-    """Return the factor by which unknowns fitted to few swings lessen their scatter, at most `_MOST_FREED`."""
-    return swings / max(swings - unknowns, swings / _MOST_FREED)
+    """Return the factor by which unknowns fitted to few swings lessen their scatter, at most `tuning.MOST_FREED`."""
+    return swings / max(swings - unknowns, swings / tuning.MOST_FREED)
 
 
 def joint_step(problem: Problem, found: Fit, columns: Array, precision: Array, pull: Array) -> tuple[Array, Array]:
     """Return the linearised step of the shared unknowns and of further ones together, and its covariance.
 
-    `columns` (n, 3, k) are the derivatives of the prediction by the further unknowns, `precision` and `pull` (k,) what
-    the prior adds to their normal equations. Each swing's starting state is eliminated.
+    `columns` (n, 3, k) are the derivatives of the prediction by the further unknowns, `precision` and `pull` (k,) the
+    prior's terms in their normal equations. Each swing's starting state is eliminated.
     """
     size = SIZE + len(precision)
     normal = np.diag(np.concatenate([1.0 / problem.deviation**2, precision]))
     gradient = np.concatenate([(problem.mean - found.shared) / problem.deviation**2, pull])
     z = np.abs(np.nan_to_num(found.point.residual)) / np.sqrt(found.variance)
-    weight = np.isfinite(found.point.residual) * np.minimum(1.0, HUBER / np.maximum(z, 1e-12)) / found.variance
+    weight = np.isfinite(found.point.residual) * huber_weight(z) / found.variance
     residual = np.nan_to_num(found.point.residual)
     for swing in range(problem.window.swings):
         inside = found.point.swing == swing
-        if inside.sum() < _FEWEST_ROWS:
+        if inside.sum() < FEWEST_OF_SWING:
             continue
         shared = np.concatenate([found.linear.rows[inside][:, :, :SIZE], columns[inside]], axis=2).reshape(-1, size)
         own = found.linear.rows[inside][:, :, SIZE:].reshape(-1, 6)
@@ -446,10 +440,10 @@ def _descend(
 ) -> tuple[Point | None, float]:
     """Return the next point, or None where no step gains, and the damping for the next step."""
     scale = normal.diagonal()
-    deviations = np.concatenate([problem.deviation, np.tile(START_SPREAD, problem.window.swings)])
+    deviations = np.concatenate([problem.deviation, np.tile(tuning.START_SPREAD, problem.window.swings)])
     for _ in range(6):
         step = normal.plus(damping * scale).factorised().solve(gradient)
-        step *= min(1.0, _LONGEST_STEP / max(np.abs(step / deviations)[:SIZE].max(), 1e-12))
+        step *= min(1.0, 1.0 / max(np.abs(step / deviations)[:SIZE].max(), 1e-12))
         step = np.clip(step, -deviations, deviations)
         shared = problem.unknowns.within(point.shared + step[:SIZE])
         trial = problem.evaluate(shared, point.states + step[SIZE:].reshape(-1, 6))
@@ -461,17 +455,17 @@ def _descend(
     return None, damping
 
 
-def unforeseen(problem: Problem, point: Point, jacobian: Array, seed: int, probes: int = 3) -> Array:
+def unpredicted(problem: Problem, point: Point, jacobian: Array, seed: int, probes: int = 3) -> Array:
     """Return the variance by which the motion leaves its linearisation under small displacements, shape (n, 3).
 
-    Displaced points are run and compared with what the Jacobian foretells: smooth motion differs by little, the moments
-    after the last bounces of a hard contact by as much as they can.
+    Displaced points are run and compared with the prediction of the Jacobian. Smooth motion differs little; after the
+    last bounces of a hard contact the difference is as large as the motion.
     """
     rng = np.random.default_rng(seed)
     total, count = np.zeros_like(point.residual), np.zeros_like(point.residual)
     inside = point.swing >= 0
     for _ in range(probes):
-        states = _PROBED_STATE * rng.standard_normal(point.states.shape)
+        states = tuning.PROBED_STATE * rng.standard_normal(point.states.shape)
         shared = problem.unknowns.within(point.shared + PROBES * rng.standard_normal(SIZE))
         other = problem.evaluate(shared, point.states + states)
         if other is None:
@@ -487,7 +481,7 @@ def unforeseen(problem: Problem, point: Point, jacobian: Array, seed: int, probe
 
 
 def _spread(variance: Array, reach: int = 2) -> Array:
-    """Take the mean of each variance and its neighbours: a few probes tell it only roughly."""
+    """Return running means of the variance: a few probes give it only roughly."""
     padded = np.pad(variance, ((reach, reach), (0, 0)), mode="edge")
     total = np.zeros_like(variance)
     for shift in range(2 * reach + 1):

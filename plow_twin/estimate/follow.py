@@ -6,7 +6,10 @@ Kalman filter with perturbed observations (Burgers et al., Mon. Weather Rev. 126
 covariance with the present. A member whose walls the correction would press on with more than half of the head's weight
 goes on as it is: behind a hard contact a tenth of a millimetre would be an impact that never was.
 
-The first member has the middle of all that is known and no drawn noise. It is the median twin: a real motion.
+The first member has the middle of all that is known and no drawn noise. It is the median twin: a real motion. Before
+the first estimate it is the nominal twin, which no pose moves: steered to where a machine with other clearances is, it
+would press its own walls, and its forces would be further off than those of a twin that does not follow. The second
+member is then its double that the poses move, and shows where a first estimate begins.
 """
 
 from __future__ import annotations
@@ -529,6 +532,10 @@ class Ensemble:
     ) -> None:  # fmt: skip
         scenes, gain = draw_scenes(scene, known, members, rng) if members > 1 else ([scene], np.ones((1, 3)))
         scenes[0], gain[0] = middle_of(scene, known)
+        #: whether poses move the first member, whose numbers are those of an estimate; else its double, the second
+        self._steers_first = known.horizontal_state is not State.PRIOR
+        if not self._steers_first and members > 1:
+            scenes[1], gain[1] = scenes[0], gain[0]
         #: wear of the pads at the beginning, and by how much it had widened the clearances that are known, (2, 1)
         self.worn_before, self.moved_before = worn, np.zeros((2, 1))
         if scene.wear is not None:
@@ -666,13 +673,21 @@ class Ensemble:
         return out
 
     def stand_like(self, before: Ensemble, wrench: Array) -> None:
-        """Begin where others stand under a load, each by its own clearances, with what they have gone through."""
+        """Begin where others stand under a load, each by its own clearances, with what they have gone through.
+
+        The first with the numbers of an estimate begins where the second stood, which the poses have moved; the second
+        of a prior begins where the first stood.
+        """
+        before.settle()
         from_ = np.where(before.good, np.arange(len(before.good)), int(np.argmax(before.good)))[: len(self.good)]
+        if self._steers_first and not before._steers_first and len(before.good) > 1 and before.good[1]:
+            from_[0] = 1
+        if before._steers_first and not self._steers_first and before.good[0]:
+            from_[1:2] = 0
         share = self._shares(before._room()[from_])
         self.twins.set_wrench(wrench * self._gain)
         self._path = deque((t, q[from_] * share) for t, q in before._path)
-        before.settle()
-        self._told[:] = before._told[from_]
+        self._told[1:], self._told[0] = before._told[from_[1:]], before._told[0]
         self._stand(self._path[-1][1], before._v[from_], before._force(before._depth)[from_])
 
     def stand_about(self, q: Array, v: Array) -> None:
@@ -722,6 +737,8 @@ class Ensemble:
         then = ((1.0 - share) * path[0] + share * path[1])[:, there]
         state = np.concatenate([self._v, *path], axis=1)
         use = self._used()
+        if not self._steers_first and use[1:].any():
+            use = use & (np.arange(len(use)) > 0)
         about, seen = state - state[use].mean(axis=0), then - then[use].mean(axis=0)
         freedom = max(int(use.sum()) - 1, 1)
         scatter = seen[use].T @ seen[use] / freedom + np.diag(noise[there] ** 2)
@@ -743,6 +760,7 @@ class Ensemble:
         moved = state + (off + noise[there] * white) @ weight
         v, places = moved[:, :3], moved[:, 3:].reshape(len(moved), -1, 3).transpose(1, 0, 2)
         allowed = np.flatnonzero(self._allowed(places[-1], self._force(self._depth)))
+        allowed = allowed[allowed >= 1 - self._steers_first]
         for place, index in enumerate(range(after - 1, len(times))):
             self._path[index][1][allowed] = places[place, allowed]
         self._put(allowed, places[-1, allowed], v[allowed])

@@ -1,4 +1,4 @@
-"""A measured stretch followed from its first row to its last, each row from what was measured up to it."""
+"""A measured stretch followed causally: each row uses only earlier measurements."""
 
 from __future__ import annotations
 
@@ -24,16 +24,17 @@ from plow_twin.stream.session import Session
 
 Array = NDArray[np.float64]
 
-#: Length of the windows of the estimates and distance of their ends in s, as a node has them by default.
+#: Definition: length of the windows of the estimates and distance of their ends in s, as a node has them by default.
 WINDOW_S, INTERVAL_S = 32.0, 10.0
+#: Definition: nanoseconds of a second.
 _NS: Final = 1e9
-#: Seconds of load that are advanced through at once: the rows of all members stay in the processor's cache.
+#: Bound: seconds of load that are advanced at once; the rows of all members stay in the processor's cache.
 _PART_S: Final = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """What is known at some times, from what was measured before each.
+    """Forces and clearances at some times, each from earlier measurements only.
 
     Attributes
     ----------
@@ -53,14 +54,14 @@ class Followed:
 
     @classmethod
     def of(cls, t: Array, rows: NDArray[np.void]) -> Followed:
-        """Take the rows of a twin that follows."""
+        """Return them from the rows of a following twin."""
         clearance = rows["known_clearance"].reshape(-1, 2, 3)
         return cls(t, rows["force"], rows["force_low"], rows["force_high"], clearance)
 
 
 @dataclass(frozen=True)
 class TakenOver:
-    """An estimate and the time in s from which on the twins are drawn from it, or as before where it says no more."""
+    """An estimate, and the time in s from which on the twins are drawn from it, if `taken`."""
 
     t: float
     estimate: Estimate
@@ -69,7 +70,7 @@ class TakenOver:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What was known at each time, the estimates on the way, and peaks and impulses span by span."""
+    """Rows, the estimates on the way, and peaks and impulses of each span."""
 
     rows: Followed
     taken_over: list[TakenOver]
@@ -87,20 +88,20 @@ def follow(
     span: float | None = None,
     seed: int = 0,
 ) -> Stretch:
-    """Return what is known at each sample of the load, or each `dt` s, from what was measured up to then.
+    """Return forces and clearances at each sample of the load, or each `dt` s, from earlier measurements.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     load, poses, gaps : Load, Poses, Gaps
-        What was measured, on one clock. Times count from the load's first sample in the windows of the estimates.
+        Measurements on one clock. In the windows of the estimates, times count from the load's first sample.
     members : int
         Twins.
     dt : float, optional
         Distance of the rows in s; one at each sample of the load by default.
     span : float, optional
-        Seconds over which peaks and impulses are told; none are by default.
+        Seconds of a span of peaks and impulses; no spans by default.
     seed : int
         Of all that is drawn.
     """
@@ -111,7 +112,7 @@ def follow(
 
 
 class _Steps:
-    """The loop over the load: the session that a live twin has gets what was measured in the order of its stamps."""
+    """The loop over the load: a session, as of a live twin, gets all measurements in the order of their stamps."""
 
     def __init__(
         self, scene: Scene, load: Load, poses: Poses, gaps: Gaps | None, members: int, seed: int, span: float | None
@@ -124,38 +125,38 @@ class _Steps:
         deviation = 0.0 if gaps is None else gaps.deviation
         self._windows = Windows(WINDOW_S, INTERVAL_S, 0.0, poses.deviation, load.deviation, deviation, early=True)
         self._guess: Guess = ()
-        #: rows on a grid so far, poses and gaps that were taken in
-        self._count = self._poses_taken = self._gaps_taken = 0
+        #: rows on a grid, poses and gaps added so far
+        self._count = self._poses_added = self._gaps_added = 0
         self._span = span
         self.taken_over: list[TakenOver] = []
         self.spans: list[Span] = []
 
     def rows(self, dt: float | None) -> Iterator[Followed]:
-        """Yield what is known, part by part."""
+        """Yield the rows, part by part."""
         step = max(1, int(np.searchsorted(self._load.t, self._load.t[0] + _PART_S)))
-        # the first sample alone: a pose before it is of no motion
+        # the first sample alone: there is no motion before it
         for first in (0, *range(1, len(self._stamps), step)):
             part = slice(first, min(first + step, len(self._stamps)) if first else 1)
             if first:
-                self._take_poses(self._stamps[part][-1])
+                self._add_poses(self._stamps[part][-1])
             yield from self._advance(part, dt)
             if self._span is not None and self._follower.time >= (len(self.spans) + 1) * self._span:
                 self.spans.append(self._follower.span())
-            self._take_gaps(float(self._load.t[part][-1]))
+            self._add_gaps(float(self._load.t[part][-1]))
             stamps, samples = self._stamps[part].tolist(), self._load.wrench[part].tolist()
             for stamp, sample in zip(stamps, samples, strict=True):
-                window = self._windows.take_load(stamp, tuple(sample))
+                window = self._windows.add_load(stamp, tuple(sample))
                 if window is not None:
                     self._estimate(window)
 
-    def _take_poses(self, until_ns: int) -> None:
-        """Take in the poses up to a stamp: the model uses each once it comes there."""
+    def _add_poses(self, until_ns: int) -> None:
+        """Add the poses up to a stamp; the model uses each once it comes to its time."""
         last = int(np.searchsorted(self._pose_stamps, until_ns, side="right"))
-        for index in range(self._poses_taken, last):
+        for index in range(self._poses_added, last):
             stamp, q = int(self._pose_stamps[index]), tuple(self._poses.q[index].tolist())
             self._session.apply(Pose(stamp, q))
-            self._windows.take_pose(stamp, q)
-        self._poses_taken = max(last, self._poses_taken)
+            self._windows.add_pose(stamp, q)
+        self._poses_added = max(last, self._poses_added)
 
     def _advance(self, part: slice, dt: float | None) -> Iterator[Followed]:
         t, stamps, wrench = self._load.t[part], self._stamps[part], self._load.wrench[part]
@@ -172,16 +173,16 @@ class _Steps:
                 self._count += 1
                 yield Followed.of(t[here], now)
 
-    def _take_gaps(self, now: float) -> None:
+    def _add_gaps(self, now: float) -> None:
         if self._gaps is None:
             return
         last = int(np.searchsorted(self._gaps.t, now, side="right"))
         stamps = _stamps(self._gaps.t, self._load.t[0]).tolist()
-        for index in range(self._gaps_taken, last):
+        for index in range(self._gaps_added, last):
             there = np.flatnonzero(np.isfinite(self._gaps.gap[index]))
             values = tuple(self._gaps.gap[index, there].tolist())
-            self._windows.take_gaps(stamps[index], tuple(there.tolist()), values)
-        self._gaps_taken = last
+            self._windows.add_gaps(stamps[index], tuple(there.tolist()), values)
+        self._gaps_added = last
 
     def _estimate(self, window: Window) -> None:
         found, following = estimate_window(self._scene, window.load, window.pose, window.lost, self._guess, window.gaps)

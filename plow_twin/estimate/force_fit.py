@@ -1,8 +1,8 @@
 """Poses and contact forces fitted together: Gauss-Newton steps from the fit of the poses.
 
 Beside the shared unknowns are the delay of the forces and the logarithm of each cell's gain; the state at the start of
-each swing is eliminated. Moments that a small change of the unknowns makes hard to predict count less, Huber's
-function bounds what one moment can do, and the scatter of the swings' scores widens the intervals (White 1982).
+each swing is eliminated. Moments that are hard to predict count less, Huber's function
+bounds the influence of a moment, and the scatter of the swings' scores widens the intervals (White 1982).
 """
 
 from __future__ import annotations
@@ -12,34 +12,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.contact_forces import FEWEST_MESSAGES, Cells, ContactForces, Feeling, cells_of
-from plow_twin.estimate.fit import HUBER, START_SPREAD, Fit, Linear, Point, Problem, freed, pieces
+from plow_twin.estimate import tuning
+from plow_twin.estimate.contact_forces import Cells, ContactForces, Feeling, cells_of
+from plow_twin.estimate.fit import Fit, Linear, Point, Problem, freed, huber_loss, pieces
+from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_IN_CONTACT
 from plow_twin.estimate.result import Cell, ForcesUsed, Interval
 from plow_twin.estimate.unknowns import DAMPING, MOVING, QUANTITIES, SIZE
 from plow_twin.model.pairs import PAIR_NAMES
 
 Array = NDArray[np.float64]
 
-#: Prior deviation of a cell's gain, of the delay about that at which forces are most alike in s.
-_GAIN, _DELAY = 0.05, 0.02
-#: Rows that are used at most: some 200 a second of a window of ten load periods.
+#: Bound: rows, some 200 a second of a window of ten load periods.
 _MOST_ROWS = 6000
-#: Head room in m up to which a pad may touch.
-_NEAR = 2e-3
-#: Error of the law itself, and of the load, as a share of the force.
-_LAW_ERROR = 0.01
-#: What may be left over beyond the noise, as a share of the force: of a cell's, of all of them; medians over swings. Of
-#: right models (seeds 62000 to 62004 of the benchmark) it was 0.04 and 0.013 at most, of Kelvin-Voigt 0.037 and more.
-MOST_LEFT_OVER, MOST_BY_LAW = 0.1, 0.02
-#: Mean square of a swing's normalised residuals beyond which it is not fitted to the forces: 0.5 to 0.85 where it is.
-MOST_MISFIT = 1.5
-#: Fewest rows of a cell in a swing, and its mean square force over that of the noise, from which on that is looked at.
-_FEWEST_ROWS, _CLEAR = 10, 25.0
-#: Weight of the variance that cannot be predicted.
-_JITTER_WEIGHT = 10.0
-#: Steps; first steps, with draws that probe the predictability; number of draws; gain of the cost that ends them.
+#: Bound: steps, the first of them with draws that probe predictability, number of these draws; gain of the cost that
+#: ends them, that of noise.
 _ROUNDS, _DRAWN_ROUNDS, _PROBES, _ENOUGH = 8, 3, 3, 0.5
-#: Steps of the difference quotients to both sides: of the delay in s and of a starting state. With the longer steps of
+#: Step: of the difference quotients to both sides, of the delay in s and of a starting state. With the longer steps of
 #: the poses, to one side, clearances were off by 4 of their deviations.
 _DELAY_STEP = 2e-5
 _STATE_STEPS = np.array([1e-5, 1e-5, 5e-5, 2e-4, 2e-4, 1.4e-3])
@@ -83,7 +71,7 @@ class _At:
 class _Block:
     """Normal equations of one swing, its starting state eliminated: normal (b, b), score (b,) of the others.
 
-    `state`, `answer` : (6,), (6, b) the state's step without, and by, those of the others; `root` draws it
+    `state`, `answer` : (6,), (6, b) step of the state alone, and its derivative by the others' steps; `root` draws it
     """
 
     normal: Array
@@ -112,13 +100,13 @@ def not_used(why: str) -> JointFit:
 
 
 def fit_jointly(problem: Problem, found: Fit, forces: ContactForces, widened: float) -> JointFit:
-    """Fit poses and forces together, from a fit of the poses whose variance is `widened` times that of its noise."""
+    """Fit poses and forces together, from a fit of the poses with `widened` times the variance of its noise."""
     if problem.unknowns.scene.contact.restitution is not None:
         return not_used("the law's damping follows from the speed of each touch")
     if len(problem.link):
         return not_used("the load is broad-band: its swings are linked")
-    if len(forces.t) < FEWEST_MESSAGES:
-        return not_used(f"got {len(forces.t)} messages in the window, expected at least {FEWEST_MESSAGES}")
+    if len(forces.t) < FEWEST_FOR_SCATTER:
+        return not_used(f"got {len(forces.t)} messages in the window, expected at least {FEWEST_FOR_SCATTER}")
     forces = forces.thinned(_MOST_ROWS)
     feeling = Feeling(problem, forces.t)
     cells, against = cells_of(feeling, found, forces)
@@ -137,7 +125,11 @@ class _Joint:
         self._variance = found.variance * widened
         self._border = SIZE + 1 + len(cells.pairs)
         self._precision = np.concatenate(
-            [1.0 / problem.deviation**2, [_DELAY**-2], np.full(len(cells.pairs), _GAIN**-2)]
+            [
+                1.0 / problem.deviation**2,
+                [tuning.CELL_PRIOR[1] ** -2],
+                np.full(len(cells.pairs), tuning.CELL_PRIOR[0] ** -2),
+            ]
         )
 
     def solve(self) -> JointFit:
@@ -145,7 +137,7 @@ class _Joint:
         found, cells = self._found, self._cells
         felt = self._feeling.at(found.shared, found.point.states, cells.delay)
         assert felt is not None  # the cells were looked at there
-        near = np.isfinite(cells.force) & (felt.penetration > -_NEAR)
+        near = np.isfinite(cells.force) & (felt.penetration > -2.0 * tuning.HEAD_ROOM)
         near[:, np.setdiff1d(np.arange(near.shape[1]), cells.pairs)] = False
         self._row, self._pair = np.nonzero(near)
         self._cell, self._swing = np.searchsorted(cells.pairs, self._pair), felt.swing[self._row]
@@ -159,7 +151,7 @@ class _Joint:
             if index < _DRAWN_ROUNDS:  # at first only the poses limit the draws
                 self._weigh(at.force)
                 known = self._blocks(at, linear, jacobian if index else 0.0 * jacobian)
-                self._jitter = self._unforeseen(at, jacobian, known)
+                self._jitter = self._unpredicted(at, jacobian, known)
             self._weigh(at.force)
             following = self._descended(at, self._blocks(at, linear, jacobian))
             if following is None:
@@ -177,7 +169,9 @@ class _Joint:
     def _weigh(self, force: Array) -> None:
         """Set the variance of each entry, from about the force that the motion gives."""
         noise = self._cells.noise[self._pair]
-        self._spread = noise**2 + (_LAW_ERROR * np.nan_to_num(force)) ** 2 + _JITTER_WEIGHT * self._jitter
+        self._spread = (
+            noise**2 + (tuning.LAW_ERROR * np.nan_to_num(force)) ** 2 + tuning.JITTER_WEIGHT[2] * self._jitter
+        )
 
     def _force(self, place: _Place) -> Array | None:
         felt = self._feeling.at(place.shared, place.states, place.delay)
@@ -194,13 +188,13 @@ class _Joint:
 
     def _cost(self, at: _At) -> float:
         z = np.abs(self._measured - at.force) / np.sqrt(self._spread)
-        loss = np.where(z <= HUBER, z * z, HUBER * (2.0 * z - HUBER))
+        loss = huber_loss(z)
         away = self._away(at.place)[SIZE:]
         prior = float(self._precision[SIZE:] @ away**2)
         return self._problem.cost(at.point, self._variance) + float(np.nansum(loss) + np.isnan(loss).sum()) + prior
 
     def _linearised(self, at: _At) -> tuple[Linear, Array]:
-        """Return the Jacobians of the poses, and that of the forces by the border and the own state, (m, b + 6)."""
+        """Return the Jacobians of the poses, and of the forces by the border and the swing's state, (m, b + 6)."""
         place, border = at.place, self._border
         out = np.zeros((len(self._row), border + 6))
         for j in MOVING:
@@ -233,7 +227,9 @@ class _Joint:
         border, out = self._border, []
         places = np.r_[0:SIZE, border : border + 6]
         residual = np.nan_to_num(self._measured - at.force)
-        weight = np.minimum(1.0, HUBER * np.sqrt(self._spread) / np.maximum(np.abs(residual), 1e-12)) / self._spread
+        weight = (
+            np.minimum(1.0, tuning.HUBER * np.sqrt(self._spread) / np.maximum(np.abs(residual), 1e-12)) / self._spread
+        )
         for piece, *_ in pieces(self._problem, at.point, linear, self._variance):
             inside = self._swing == piece.swing
             rows = jacobian[inside]
@@ -241,8 +237,8 @@ class _Joint:
             normal, score = weighted.T @ rows, weighted.T @ residual[inside]
             normal[np.ix_(places, places)] += piece.weighted.T @ piece.rows
             score[places] += piece.weighted.T @ piece.residual
-            normal[border:, border:] += np.diag(START_SPREAD**-2)
-            score[border:] += (self._problem.window.states - at.place.states)[piece.swing] / START_SPREAD**2
+            normal[border:, border:] += np.diag(tuning.START_SPREAD**-2)
+            score[border:] += (self._problem.window.states - at.place.states)[piece.swing] / tuning.START_SPREAD**2
             out.append(_Block.of(normal, score, border))
         return out
 
@@ -273,7 +269,7 @@ class _Joint:
                 return other
         return None
 
-    def _unforeseen(self, at: _At, jacobian: Array, blocks: list[_Block]) -> Array:
+    def _unpredicted(self, at: _At, jacobian: Array, blocks: list[_Block]) -> Array:
         """Return the variance of the forces about their linearisation within the uncertainty of the poses, (m,)."""
         rng, place, total = np.random.default_rng(0), at.place, np.zeros(len(at.force))
         root = np.linalg.cholesky(self._step(at, blocks)[1][:SIZE, :SIZE])
@@ -308,14 +304,15 @@ class _Joint:
         used = ForcesUsed(found, Interval.normal(place.delay, deviation[SIZE]))
         all_shares = [share for shares in left_over for share in shares]
         together = float(np.median(all_shares)) if all_shares else 0.0
-        if together > MOST_BY_LAW:
+        most, most_together = tuning.MOST_LEFT_OVER
+        if together > most_together:
             used = replace(used, unused="the law's forces are others")
-            why = f"contact forces: {together:.1%} of them are left over, expected at most {MOST_BY_LAW:.0%}"
+            why = f"contact forces: {together:.1%} of them are left over, expected at most {most_together:.0%}"
             return JointFit(used, model=(why,))
         bad = tuple(
-            f"contact forces: {name}: {cell.left_over:.0%} are left over, expected at most {MOST_LEFT_OVER:.0%}"
+            f"contact forces: {name}: {cell.left_over:.0%} are left over, expected at most {most:.0%}"
             for name, cell in found.items()
-            if cell.left_over > MOST_LEFT_OVER
+            if cell.left_over > most
         )
         if bad:
             return JointFit(replace(used, unused="a cell contradicts the motion"), sensor=bad)
@@ -329,7 +326,7 @@ class _Joint:
         z = (self._measured - at.force) ** 2 / self._spread
         z, swing = z[np.isfinite(z)], self._swing[np.isfinite(z)]
         count, total = np.bincount(swing), np.bincount(swing, z)
-        return int((total > MOST_MISFIT * np.maximum(count, 1)).sum())
+        return int((total > tuning.MOST_MISFIT * np.maximum(count, 1)).sum())
 
     def _left_over(self, at: _At) -> list[list[float]]:
         """Return for each cell, of each swing, the share of its force that is left over beyond its noise."""
@@ -340,8 +337,8 @@ class _Joint:
             variance = float(self._cells.noise[pair]) ** 2
             for swing in range(self._problem.window.swings):
                 inside = there & (self._cell == k) & (self._swing == swing)
-                square = float((at.force[inside] ** 2).mean()) if inside.sum() >= _FEWEST_ROWS else 0.0
-                if square > _CLEAR * variance:
+                square = float((at.force[inside] ** 2).mean()) if inside.sum() >= FEWEST_IN_CONTACT else 0.0
+                if square > tuning.OUTLYING**2 * variance:
                     beyond = max(float((residual[inside] ** 2).mean()) - variance, 0.0)
                     out[-1].append(float(np.sqrt(beyond / square)))
         return out

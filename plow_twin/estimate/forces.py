@@ -1,8 +1,8 @@
 """Contact forces with intervals: full twins drawn from an estimate, advanced together under the load believed.
 
-Each member has clearances, contact parameters and load gains of its own, drawn from the estimate with their
-correlation, and each follows every sample of the load; the quantiles over the members are the interval. After some
-load periods the members have forgotten their starts, so their differences are the uncertainty.
+Each member has its own clearances, contact parameters and load gains, drawn from the estimate with their correlation.
+The quantiles over the members are the interval. After some load periods the members have forgotten their starts, so
+their differences are the uncertainty.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.estimate import tuning
 from plow_twin.estimate.measurements import Load
 from plow_twin.estimate.result import NORMAL_P95, Estimate, Interval, State
 from plow_twin.estimate.unknowns import contact_with
@@ -23,33 +24,33 @@ from plow_twin.run.batch import TwinBatch
 
 Array = NDArray[np.float64]
 
-#: Members by default.
+#: Derived: members by default, of which a 5 % point has a standard error of 1.4 %.
 MEMBERS: Final = 256
-#: Tolerance of the pose relative to the clearance.
-TOLERANCE: Final = 1e-4
-#: Fewest of them: fewer have no 5 % point.
-FEWEST = 20
-#: Quantiles that are told.
+#: Definition: quantiles of an interval.
 POINTS: Final = (0.05, 0.5, 0.95)
-#: Least clearance that is drawn, as a share of the one believed.
+#: Derived: fewer members have no 5 % point.
+FEWEST: Final = 20
+#: Guard: least drawn clearance, in the estimated one.
 _LEAST_SHARE = 0.02
-#: Samples advanced in one call: the rows of all members are to stay in the processor's cache.
+#: Derived: tolerance of the members, that of the fit.
+TOLERANCE: Final = tuning.TOLERANCE
+#: Bound: samples advanced in one call; the rows of all members stay in the processor's cache.
 _CALL = 10
 
 
 class ForcesError(PlowTwinError):
-    """The estimate tells no forces."""
+    """No forces can be drawn from the estimate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Forces:
     """Quantiles over the members, in the order of `POINTS`.
 
-    start : from which on they count, in s
+    start : time in s from which on they count
     t : (n,) in s
     force : (3, n, 8) of each pair at these times in N
-    peak, impulse : (3, 8) largest force in N and impulse in N s from `start` to the last of them
-    members, left_out : number of twins, and of those that left the model's range
+    peak, impulse : (3, 8) largest force in N and impulse in N s from `start` to the end
+    members, left_out : number of twins, and how many left the model's range
     """
 
     start: float
@@ -106,7 +107,7 @@ class ForceEnsemble:
         if members < FEWEST:
             raise ForcesError(f"members: got {members}, expected at least {FEWEST}")
         scenes, self._gain = draw_scenes(scene, found, members, np.random.default_rng(seed))
-        self._twins = TwinBatch(scenes, tol=TOLERANCE, start=start)
+        self._twins = TwinBatch(scenes, tol=tuning.TOLERANCE, start=start)
         self._good = np.ones(members, dtype=bool)
 
     def __len__(self) -> int:
@@ -194,7 +195,7 @@ def draw_scenes(scene: Scene, found: Estimate, members: int, rng: np.random.Gene
 
 
 def _normal(value: Interval, white: Array) -> Array:
-    """Return normal numbers whose 5 % and 95 % points are the interval's, each side with a deviation of its own."""
+    """Return two-piece normal numbers with the 5 % and 95 % points of the interval."""
     below, above = (value.mean - value.p05) / NORMAL_P95, (value.p95 - value.mean) / NORMAL_P95
     return value.mean + np.where(white < 0.0, below, above) * white
 

@@ -1,6 +1,6 @@
 """Remaining life: when a clearance reaches its limit, as a distribution over coefficient, clearance now and load.
 
-Scenarios tell the same for another load or another wear coefficient, from the same draws.
+Scenarios repeat it with another load or wear coefficient, from the same draws.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plow_twin.estimate.coefficient import PATH_DEVIATION, Coefficient
+from plow_twin.estimate import tuning
+from plow_twin.estimate.coefficient import Coefficient
 from plow_twin.estimate.life import LifeError, Path, wear_path
 from plow_twin.estimate.result import NORMAL_P95, State
 from plow_twin.estimate.unknowns import contact_with
@@ -23,14 +24,15 @@ from plow_twin.model.scene import Clearance, Scene, Table, Wear
 
 Array = NDArray[np.float64]
 
+#: Definition: seconds of an hour.
 HOUR_S = 3600.0
-#: Share of a clearance by which it may be smaller than believed.
+#: Guard: share of a clearance by which a drawn one may be smaller.
 _LEAST_SHARE = 0.9
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """What may come otherwise: the load and the wear coefficient, as multiples of those expected."""
+    """Another load and wear coefficient, as multiples of the expected ones."""
 
     name: str
     load: float = 1.0
@@ -61,7 +63,7 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is asked: limits of the clearances [m], horizon and planned stop [h], how the machine is driven."""
+    """Limits of the clearances [m], horizon and planned stop [h], and how the machine is driven."""
 
     limit_horizontal_m: float
     limit_vertical_m: float
@@ -101,10 +103,10 @@ class Forecast:
     """Hours to the limit.
 
     hours : (draws,) sorted; infinite where the limit is not reached within the horizon
-    path : the wear as it goes on at the clearances believed
+    path : wear from the believed clearances on
     rate : (draws,) exposure in an hour in 1/N
     now : (draws, 2) clearances now in m
-    scenarios : the same for each scenario of the plan, by name
+    scenarios : forecast of each scenario of the plan, by name
     """
 
     hours: Array
@@ -138,7 +140,7 @@ class Forecast:
         return np.quantile(np.stack(each, axis=2), (0.1, 0.5, 0.9), axis=0, method="lower")
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON; null stands for `not reached in the horizon`."""
+        """Return it for JSON; null: not reached within the horizon."""
         plan = self.plan
         return {
             **self._times(),
@@ -187,8 +189,8 @@ def forecast(
     deviation_m : tuple of float
         Standard deviations of the clearances now, in m.
     known : Coefficient or None
-        What clearances over time have told of the wear coefficient; it holds the size of the load too, so only
-        `PATH_DEVIATION` of it is drawn. None: the prior.
+        Posterior of the wear coefficient from a history of clearances. It includes the size of the load, of which only
+        `tuning.PATH_DEVIATION` is drawn then. None: the prior.
 
     Raises
     ------
@@ -219,7 +221,7 @@ def _forecast(
     coefficient = np.exp(rng.normal(0.5 * (low + high), (high - low) / (2.0 * NORMAL_P95), plan.draws))
     load = np.maximum(1.0 + plan.load_deviation * rng.standard_normal(plan.draws), 0.1)
     if known is not None:
-        coefficient, load = known.draw(plan.draws, rng), 1.0 + PATH_DEVIATION * rng.standard_normal(plan.draws)
+        coefficient, load = known.draw(plan.draws, rng), 1.0 + tuning.PATH_DEVIATION * rng.standard_normal(plan.draws)
     coefficient = coefficient * multiple
     size = np.array([scene.clearance.horizontal_m, scene.clearance.vertical_m])
     # a clearance that is hardly known is not negative
@@ -279,7 +281,7 @@ def with_load(scene: Scene, multiple: float) -> Scene:
 def with_clearances(scene: Scene, horizontal_m: float, vertical_m: float, depth: Array | None = None) -> Scene:
     """Return the scene with the estimated clearances, which include all wear so far.
 
-    `depth`, shape (8,) in m, is by how much the pads are worn, where that is known: the clearances before it follow.
+    `depth`, shape (8,) in m, is the wear of the pads if known; the clearances before it follow.
     With running-in they are as worn as the clearances have grown, for they no longer wear as new ones.
     """
     wear, new = scene.wear, scene.clearance

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.measurements import EstimateError, Load
 from plow_twin.model.geometry import body_states
 from plow_twin.model.loads import Pieces
@@ -19,12 +20,10 @@ from plow_twin.solve.state import EVENT, SEGMENT, TOTALS, Parts, Status, new_rec
 
 Array = NDArray[np.float64]
 
-#: Tolerance of the pose relative to the clearance: a few micrometres, far below what sensors resolve.
-TOLERANCE = 1e-4
-#: Steps that one run may take for each second of motion, and beside them.
+#: Bound: steps that one run may take for each second of motion, and beside them; rows of its log.
 _STEPS_PER_SECOND, _STEPS = 20_000, 2_000
 _LOG_SIZE = 4096
-#: Steps of the series that cost as much as an implicit one.
+#: Bound: steps of the series that cost as much as an implicit one.
 _IMPLICIT_WORK = 10
 
 
@@ -38,7 +37,7 @@ class Motions:
 
 
 class Forward:
-    """Runs one scene with other numbers: all members have the same terms, so one compiled kernel serves them.
+    """Runs one scene with varied numbers; one compiled kernel serves them, since the terms stay.
 
     Parameters
     ----------
@@ -58,7 +57,7 @@ class Forward:
             raise EstimateError(f"scene: got head.carries {scene.head.carries}, expected walls: the fit knows no block")
         if scene.support is not None:
             raise EstimateError(f"scene: got {scene.support}, expected no support: the fit does not know its place")
-        nominal = compile_scene(replace(scene, loads=(), wear=None), TOLERANCE, sampled=True)
+        nominal = compile_scene(replace(scene, loads=(), wear=None), tuning.TOLERANCE, sampled=True)
         self._terms = nominal.parts.terms
         self._implicit = nominal.parts.implicit
         if self._implicit is None and scene.contact.restitution is not None:
@@ -73,11 +72,11 @@ class Forward:
         self.work = 0
 
     def renewed(self) -> Forward:
-        """Return another one for the same motions, with no work done."""
+        """Return a copy with no work done."""
         return Forward(self._scene, self.load)
 
     def of(self, scene: Scene) -> Forward:
-        """Return one of another nominal scene under the same load, with no work done."""
+        """Return a model of another nominal scene under the same load, with no work done."""
         return Forward(scene, self.load)
 
     def run(
@@ -97,7 +96,7 @@ class Forward:
         depth : ndarray, shape (8,), optional
             By how much each pad lies further out than the clearances say, in m.
         push : ndarray, shape (3,), optional
-            A constant load beside the one believed, in N, N, N m.
+            A constant load added to the believed load, in N, N, N m.
         share : ndarray, shape (8,), optional
             Each pair's stiffness over the contact's.
 
@@ -139,11 +138,11 @@ class Forward:
         segments["slope"] = self._slope / inertia * gain
         if push is not None:
             segments["start"] += push / inertia
-        params = compile_scene(scene, TOLERANCE, sampled=True).params
+        params = compile_scene(scene, tuning.TOLERANCE, sampled=True).params
         if depth is not None:
             params["penetration_rows"][4] -= depth
         if share is not None:
-            # a linear contact whose penetration counts so many times is so many times as stiff
+            # scaling the penetration of a linear contact scales its stiffness
             params["penetration_rows"][:] *= share
         self._last = scene, others, params, segments
         return params, segments

@@ -1,8 +1,8 @@
 """Clearances from gap sensors, independent of the contact law, and the pose where it is not measured.
 
 A gap is linear in the head's body coordinates and in the clearances (`model/geometry.py`), so each message with sensors
-at enough pairs gives both by least squares: five of them, or four, one at each wall, beside a measured theta. What is
-left is what the sensors' constant errors make of it: these do not average out.
+at enough pairs gives both by least squares: at five pairs, or at four, one at each wall, with a measured theta. The
+constant errors of the sensors do not average out; they limit the result.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from plow_twin.errors import PlowTwinError
-from plow_twin.estimate.measurements import Poses, usable_rows
+from plow_twin.estimate import tuning
+from plow_twin.estimate.measurements import FEWEST_POSES, Poses, usable_rows
 from plow_twin.estimate.result import Interval
 from plow_twin.model.geometry import penetration_rows
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y, PAIR_COUNT
@@ -22,16 +23,13 @@ from plow_twin.model.scene import Clearance, Scene
 
 Array = NDArray[np.float64]
 
-#: Constant error of a sensor in m (standard deviation) unless stated: dirt on a worn pad.
-CONSTANT_ERROR: Final = 1e-4
-#: Fewest messages for an answer.
-FEWEST_MESSAGES: Final = 20
-#: Beyond it a number is no gap [m].
+#: Guard: beyond it a number is no gap [m].
 _LARGEST = 1e3
+#: Bound: rounds of reweighting.
 _ROUNDS = 4
-#: Singular value of the equations below which an unknown does not follow from the sensors.
+#: Guard: singular value of the equations below which an unknown does not follow from the sensors.
 _SINGULAR = 1e-6
-#: Clearances between the pads that face each other, by the two pairs.
+#: Definition: clearances between the pads that face each other, by the two pairs.
 GROUPS: Final = {
     "horizontal_top": (1, 3),
     "horizontal_bottom": (7, 5),
@@ -102,7 +100,7 @@ def fit_gaps(scene: Scene, gaps: Gaps, poses: Poses) -> GapsFit | None:
 
     None where fewer than 20 messages have enough sensors.
     """
-    error = gaps.deviation or CONSTANT_ERROR
+    error = gaps.deviation or tuning.CONSTANT_ERROR
     rows = penetration_rows(replace(scene, clearance=Clearance(0.0, 0.0)))
     theta = _theta_at(gaps.t, poses)
     best: GapsFit | None = None
@@ -130,7 +128,7 @@ def _fit_one_set(
     rows: Array, t: Array, gap: Array, pairs: NDArray[np.int64], theta: Array, error: float, scene: Scene
 ) -> GapsFit | None:
     """Solve the messages of one set of sensors; `gap` (n, k) of `pairs` (k,)."""
-    # gap = half the clearances minus how far a corner reaches
+    # gap = half the clearances minus the reach of a corner
     half = 0.5 * np.abs(np.stack([NORMAL_X, NORMAL_Y], axis=1))[pairs]
     fixed = np.concatenate([-rows[2:4, pairs].T, half], axis=1)
     with_turn = np.concatenate([fixed, -rows[1, pairs][:, None]], axis=1)
@@ -140,7 +138,7 @@ def _fit_one_set(
             return None
         good = np.isfinite(theta)
         t, gap, theta = t[good], gap[good], theta[good]
-    if len(t) < FEWEST_MESSAGES:
+    if len(t) < FEWEST_POSES:
         return None
     unknown = np.zeros((len(t), 5))
     unknown[:, 4] = 0.0 if turns else theta

@@ -1,4 +1,4 @@
-"""Which of two laws of a hard contact a motion is like, by its likelihood under each.
+"""The odds of two laws of a hard contact, by the likelihood of the motion under each.
 
 The features of drawn motions of a law are a smooth function of their unknowns, a polynomial of few terms, and
 normal noise; of a measured motion the likelihood under each law follows, and from it the odds of the two (synthetic
@@ -13,29 +13,27 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
+from plow_twin.estimate.regression import ridge, shrunk_root
+
 Array = NDArray[np.float64]
 
-#: Share of its own variance in the covariance of a feature: 160 draws do not determine that of 200 features.
-OWN_VARIANCE = 0.4
-#: What a coefficient is held to zero by, and the least variance.
-_RIDGE, _LEAST = 1e-2, 1e-9
-#: Parameters that act to the third power, and those whose effect changes with them.
+#: Guard: least variance of a feature.
+_LEAST = 1e-9
+#: Definition: parameters that act to the third power (penetration, damping), and those whose effect changes with them
+#: (clearances).
 _CURVED, _CHANGING = (0, 1), (5, 6)
-#: Farthest from the middle of the draws, in their standard deviations.
-_FARTHEST = 3.5
-#: Steps to the likeliest parameters (Levenberg, Marquardt), damping of the first, gain that ends them, and distance of
-#: the points of a difference quotient.
+#: Bound: steps to the likeliest parameters (Levenberg, Marquardt), damping of the first, gain that ends them. Step: of
+#: their difference quotients.
 _STEPS, _DAMPED, _ENOUGH, _SMALL = 30, 1e-2, 1e-2, 1e-4
-#: Least share of a draw's residual that the fit including the draw leaves.
-LEAST_FREE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
     """Motions of one law: their features (n, m), and the unknowns that they were drawn with (n, 7).
 
-    The latter are the logarithms of penetration and damping, three gains of the load, and by how much the two
-    clearances differ from the reach.
+    The unknowns are the logarithms of penetration and damping, three gains of the load, and the differences of the two
+    clearances from the reach.
     """
 
     like: Array
@@ -43,14 +41,13 @@ class Draws:
 
 
 def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
-    """Return the logarithm of how much likelier `measured`, shape (m,), is under the other law."""
+    """Return the log odds of the other law for `measured`, shape (m,)."""
     both = np.concatenate([believed.like, other.like])
     middle, scale = both.mean(axis=0), both.std(axis=0) + _LEAST
     surfaces = [_Surface.through(law.drawn, (law.like - middle) / scale) for law in (believed, other)]
     left = np.concatenate([surface.left for surface in surfaces])
     covariance = left.T @ left / len(left)
-    own = np.diag(covariance)
-    root = np.linalg.cholesky((1.0 - OWN_VARIANCE) * covariance + np.diag(OWN_VARIANCE * own + _LEAST))
+    root = shrunk_root(covariance, _LEAST)
     seen: Array = np.linalg.solve(root, (measured - middle) / scale)
     one, two = (surface.ln_evidence(root, seen) for surface in surfaces)
     return two - one
@@ -58,10 +55,10 @@ def log_odds(believed: Draws, other: Draws, measured: Array) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Surface:
-    """What motions are like over the parameters, in units of their scatter, zero in the middle.
+    """Features as a polynomial of the parameters, both in units of their scatter about the mean.
 
     coefficients : (terms, m)
-    left : (n, m) residuals, each as if it was foretold without its own draw
+    left : (n, m) cross-validated residuals
     points : (n, 7) of the draws
     """
 
@@ -74,10 +71,9 @@ class _Surface:
         scatter = drawn.std(axis=0)
         points = (drawn - drawn.mean(axis=0)) / np.where(scatter > _LEAST, scatter, np.inf)
         terms = _terms(points)
-        inverse = np.linalg.inv(terms.T @ terms + np.diag([0.0] + [_RIDGE] * (terms.shape[1] - 1)))
+        inverse, leverage = ridge(terms, tuning.RIDGE[3])
         coefficients = inverse @ (terms.T @ like)
-        leverage = np.einsum("ij,jk,ik->i", terms, inverse, terms)
-        left = (like - terms @ coefficients) / np.sqrt(np.maximum(1.0 - leverage, LEAST_FREE))[:, None]
+        left = (like - terms @ coefficients) / np.sqrt(np.maximum(1.0 - leverage, tuning.LEAST_FREE))[:, None]
         return _Surface(coefficients, left, points)
 
     def ln_evidence(self, root: Array, seen: Array) -> float:
@@ -97,7 +93,7 @@ class _Surface:
             slope = matrix @ (nearby[1:] - nearby[0]).T / _SMALL
             curvature = slope.T @ slope + np.eye(size)
             held = curvature + damped * np.diag(np.diag(curvature))
-            tried = np.clip(point + np.linalg.solve(held, slope.T @ rest - point), -_FARTHEST, _FARTHEST)
+            tried = np.clip(point + np.linalg.solve(held, slope.T @ rest - point), -tuning.FARTHEST, tuning.FARTHEST)
             each, off = misfit(tried[None])
             gained = cost - float(each[0])
             damped *= 0.1 if gained > 0.0 else 10.0

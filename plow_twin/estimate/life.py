@@ -1,4 +1,4 @@
-"""Wear over months in seconds: a few load periods tell the mean force on each pad, then many periods are jumped.
+"""Wear over months in seconds: a few load periods give the mean force on each pad, then many periods are jumped.
 
 The wear rate of a pad is k_s <F> v / A (Archard), so depths depend on time, travel speed and coefficient only through
 the exposure E = k_s s / A in 1/N, s the travel in m:  dh/dE = <F>(h).  One path h(E) serves every coefficient. It is
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin.errors import PlowTwinError, SolverError
+from plow_twin.estimate import tuning
 from plow_twin.estimate.measurements import Load
 from plow_twin.model.pairs import NORMAL_X, NORMAL_Y
 from plow_twin.model.running_in import with_running_in, without_running_in
@@ -25,17 +26,13 @@ from plow_twin.run.simulate import simulate
 
 Array = NDArray[np.float64]
 
-#: Load periods that are left out, and over which the mean is taken.
-SETTLE_PERIODS, MEAN_PERIODS = 2, 4
-#: Largest change of a pad's depth in a step, as a share of the smaller clearance, and error allowed in a step.
-LARGEST_CHANGE, ERROR = 0.02, 1e-3
-#: Wear in m by which the way of sliding pads is told, far less than moves anything.
+#: Guard: wear in m by which the travel of sliding pads is found; it moves nothing.
 _TRACE_M = 1e-12
-#: Rows for one of a path with running-in.
+#: Bound: rows for one of a path with running-in.
 _FINER = 16
-#: Most steps of a path.
+#: Bound: steps of a path.
 _MOST_STEPS = 400
-#: Clearance in m as which smaller ones count in these shares: a path from none would have no end.
+#: Guard: smaller clearances count as this one, in m: a path from zero would have no end.
 _LEAST_CLEARANCE = 1e-3
 
 
@@ -70,7 +67,7 @@ class Path:
 
 
 def period_of(scene: Scene) -> float:
-    """Return the period in s of a scene's slowest harmonic load, or without one that of its table.
+    """Return the period in s of a scene's slowest harmonic load; without a harmonic load, of its table.
 
     Raises
     ------
@@ -86,15 +83,15 @@ def period_of(scene: Scene) -> float:
     longest = max(tables, key=lambda load: float(load.t[-1]))
     period = Load(longest.t, longest.wrench).period()
     periods = float(longest.t[-1]) / period
-    if periods < SETTLE_PERIODS + MEAN_PERIODS:
-        raise LifeError(f"loads: got {periods:.1f} periods, expected at least {SETTLE_PERIODS + MEAN_PERIODS}")
+    if periods < sum(tuning.MEAN_PERIODS):
+        raise LifeError(f"loads: got {periods:.1f} periods, expected at least {sum(tuning.MEAN_PERIODS)}")
     return period
 
 
 def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, Array]:
     """Return the mean force of each pad in N with worn walls, shape (8,), and its standard error over the periods.
 
-    Where sliding in the plane wears too the force counts by the way per travel.
+    With wear by sliding in the plane, the force counts by the sliding distance per travel.
 
     Raises
     ------
@@ -108,7 +105,7 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
         wear, coefficient_m2_n=trace, initial_depth_m=tuple(map(float, depth)), running_in_ratio=1.0
     ))  # fmt: skip
     impulses = []
-    for count in range(SETTLE_PERIODS, SETTLE_PERIODS + MEAN_PERIODS + 1):
+    for count in range(tuning.MEAN_PERIODS[0], sum(tuning.MEAN_PERIODS) + 1):
         try:
             result = simulate(worn, count * period, count * period, tol)
         except SolverError as error:
@@ -118,7 +115,7 @@ def mean_forces(scene: Scene, depth: Array, tol: float = 1e-6) -> tuple[Array, A
                 f"which the model runs: {error}"
             ) from error
         if trace:
-            # what the force and the way have worn, as the impulse that the travel alone would have needed
+            # the wear by force and sliding, as the impulse that would wear as much by travel alone
             impulses.append((result.wear_depth - depth) * (wear.pad_area_m2 / (trace * wear.travel_speed_m_s)))
         else:
             impulses.append(np.array([values["impulse"] for values in result.statistics.values()]))
@@ -131,7 +128,7 @@ def _trace(scene: Scene, period: float) -> float:
     wear = scene.wear
     if wear is None or wear.travel_speed_m_s <= 0.0:
         raise LifeError("wear: got none, or no travel speed, expected a section `wear` with travel_speed_m_s above 0")
-    impulse = scene.head.mass_kg * 10.0 * (SETTLE_PERIODS + MEAN_PERIODS) * period
+    impulse = scene.head.mass_kg * 10.0 * sum(tuning.MEAN_PERIODS) * period
     return _TRACE_M * wear.pad_area_m2 / (wear.travel_speed_m_s * impulse)
 
 
@@ -145,14 +142,14 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
     """
     if scene.wear is None:
         raise LifeError("wear: got none, expected its parameters")
-    # as worn without running-in: the rest of the pads' own coefficient is the same for all of them
+    # depths without running-in, so that one coefficient holds for all pads
     steady = without_running_in(scene.wear, np.array(scene.wear.initial_depth_m, dtype=np.float64))
     depth = with_running_in(scene.wear, steady)
     smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
     force, deviation = mean_forces(scene, depth)
     rows = [(0.0, steady, force, deviation)]
     error, exposure = 0.0, 0.0
-    step = LARGEST_CHANGE * smallest / max(float(force.max()), 1.0)
+    step = tuning.JUMP[0] * smallest / max(float(force.max()), 1.0)
     while exposure < most_exposure and len(rows) < _MOST_STEPS and not _beyond(scene, depth, limit):
         step = min(step, most_exposure - exposure)
         euler = steady + step * force
@@ -161,7 +158,7 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         # noise of the means is no error of the step
         noise = 0.5 * step * np.hypot(deviation, ahead_deviation)
         off = float(np.maximum(np.abs(change) - 2.0 * noise, 0.0).max()) / smallest
-        if off > ERROR and step * float(force.max()) > 1e-3 * smallest:
+        if off > tuning.JUMP[1] and step * float(force.max()) > 1e-3 * smallest:
             step *= 0.5
             continue
         exposure, steady, force, deviation = exposure + step, euler + change, ahead, ahead_deviation
@@ -169,8 +166,8 @@ def wear_path(scene: Scene, limit: tuple[float, float], most_exposure: float) ->
         error += off * off * smallest + float(noise.max()) ** 2 / smallest
         rows.append((exposure, steady, force, deviation))
         smallest = max(min(_clearances(scene, depth)), _LEAST_CLEARANCE)
-        grow = 1.5 if off < 0.3 * ERROR else 1.0
-        step = min(grow * step, LARGEST_CHANGE * smallest / max(float(force.max()), 1.0))
+        grow = 1.5 if off < 0.3 * tuning.JUMP[1] else 1.0
+        step = min(grow * step, tuning.JUMP[0] * smallest / max(float(force.max()), 1.0))
     if exposure < most_exposure and not _beyond(scene, depth, limit):
         raise LifeError(f"path: got {len(rows)} steps and no end, expected at most {_MOST_STEPS}")
     columns = [np.array([row[i] for row in rows]) for i in range(4)]

@@ -1,4 +1,4 @@
-"""What the estimate starts from: the measured pose and the load believed, both as arrays on one clock."""
+"""Input of the estimate: the measured pose and the believed load, as arrays on one clock."""
 
 from __future__ import annotations
 
@@ -12,32 +12,19 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solveh_banded
 
 from plow_twin.errors import PlowTwinError
+from plow_twin.estimate import priors, tuning
 
 Array = NDArray[np.float64]
 Deviation = tuple[float, ...]
-#: Nothing is stated of how well something was measured.
+#: Definition: no deviation is stated.
 UNSTATED: Deviation = (0.0, 0.0, 0.0)
-
-#: Least number of points between two knots at which a load is averaged.
+#: Derived: a standard deviation from n values is known to 1 / sqrt(2 n): 22 % of a cell in contact, 16 % of poses and
+#: gaps, 10 % of a scatter in a comparison.
+FEWEST_IN_CONTACT, FEWEST_POSES, FEWEST_FOR_SCATTER = 10, 20, 50
+#: Bound: least number of points between two knots at which a load is averaged.
 _FINER = 8
-#: Fewest measured poses from which anything is estimated.
-FEWEST_POSES = 20
-#: Largest number that can be a head's pose, in m or rad, and a load, in N or N m.
+#: Guard: largest number that can be a head's pose, in m or rad, and a load, in N or N m.
 _LARGEST_POSE, _LARGEST_LOAD = 1e6, 1e15
-#: Stated deviation of x, y [m], theta [rad] beyond which a component was not measured: a large one often says that.
-USELESS: Deviation = (0.05, 0.05, 0.2)
-#: The same as a multiple of the median of those that poses bring.
-_MUCH_WORSE = 10.0
-#: How far a spike is from the values about it, in noise from row to row; most of them, and fewest rows to look at.
-_SPIKE, _MOST_SPIKES, _SPIKED_ROWS = 20.0, 0.1, 50
-#: Share of rows that repeat the row before from which on a sensor may be slower than what sends it, and how much longer
-#: than the mean such a repetition may be: longer is a sensor that has stopped.
-_REPEATING, _LONGER = 0.25, 3.0
-#: Fewest different rows of such a sensor.
-_FEWEST_VALUES = 50
-#: Longest silence of the load in s: what acts meanwhile is not known; and in units of the median distance of samples,
-#: since a load may be given by few knots.
-LONGEST_GAP_S, LONGEST_GAP = 0.5, 20.0
 
 
 class EstimateError(PlowTwinError):
@@ -55,7 +42,7 @@ class Poses:
     q : ndarray, shape (n, 3)
         x, y [m] and theta [rad]; NaN where a component was not measured.
     deviation : tuple of 3 float
-        Stated standard deviation of each component; 0 where none is.
+        Stated standard deviation of each component; 0 if not stated.
     """
 
     t: Array
@@ -102,31 +89,31 @@ class Poses:
 
         Where many are, the sensor is a bad one, and nothing is left out.
         """
-        if len(self.t) < _SPIKED_ROWS:
+        if len(self.t) < FEWEST_FOR_SCATTER:
             return self, 0
         about = np.stack([np.roll(self.q, shift, axis=0) for shift in (-2, -1, 1, 2)])
         low, high = about.min(axis=0), about.max(axis=0)
-        far = _SPIKE * level + (high - low)
+        far = tuning.SPIKE[0] * level + (high - low)
         # no comparison with NaN holds
         spikes = (self.q > high + far) | (self.q < low - far)
         spikes[[0, 1, -2, -1]] = False
         count = int(spikes.sum())
-        if not count or spikes.mean(axis=0).max() > _MOST_SPIKES:
+        if not count or spikes.mean(axis=0).max() > tuning.SPIKE[1]:
             return self, 0
         return Poses(self.t, np.where(spikes, np.nan, self.q), self.deviation), count
 
     def fresh(self) -> Poses:
         """Leave out repetitions of a sensor that is slower than its sender: they are late and share their noise.
 
-        A value that stays for longer is that of a sensor that has stopped, and kept.
+        A value that stays longer comes from a stopped sensor and is kept.
         """
         one, next_one = self.q[:-1], self.q[1:]
         again = ((one == next_one) | (np.isnan(one) & np.isnan(next_one))).all(axis=1)
-        if again.mean() < _REPEATING if len(again) else True:
+        if again.mean() < tuning.REPEATING[0] if len(again) else True:
             return self
         first = np.flatnonzero(np.append(True, ~again))
         lengths = np.diff(np.append(first, len(self.t)))
-        if len(first) < _FEWEST_VALUES or lengths.max() > _LONGER * lengths.mean() + 1.0:
+        if len(first) < FEWEST_FOR_SCATTER or lengths.max() > tuning.REPEATING[1] * lengths.mean() + 1.0:
             return self
         return Poses(self.t[first], self.q[first], self.deviation)
 
@@ -142,7 +129,7 @@ class Load:
     wrench : ndarray, shape (n, 3)
         Fx, Fy [N] and M [N m] about the cavity's centre, without gravity.
     deviation : tuple of 3 float
-        Stated standard deviation of each component; 0 where none is.
+        Stated standard deviation of each component; 0 if not stated.
     """
 
     t: Array
@@ -178,7 +165,7 @@ class Load:
     def longest_stretch(self) -> Load:
         """Return the longest part without a silence."""
         apart = np.diff(self.t)
-        silent = np.flatnonzero(apart > max(LONGEST_GAP_S, LONGEST_GAP * float(np.median(apart))))
+        silent = np.flatnonzero(apart > max(tuning.LONGEST_GAP[0], tuning.LONGEST_GAP[1] * float(np.median(apart))))
         if not len(silent):
             return self
         bounds = np.concatenate([[0], silent + 1, [len(self.t)]])
@@ -219,7 +206,7 @@ class Load:
         return span / peak if power[peak - 1 : peak + 2].sum() > 0.3 * power.sum() else None
 
     def with_knot(self, t: float) -> Load:
-        """Return the same load with a sample at `t`, in s, on the line there."""
+        """Return the load with a further sample at `t` in s, interpolated."""
         place = int(np.searchsorted(self.t, t))
         if not 0 < place < len(self.t) or self.t[place] == t:
             return self
@@ -231,7 +218,7 @@ class Load:
         return self.kept(self.significance(share) > share)
 
     def kept(self, keep: NDArray[np.bool_]) -> Load:
-        """Return the samples that `keep`, shape (n,), says."""
+        """Return the samples selected by `keep`, shape (n,)."""
         return Load(self.t[keep], self.wrench[keep])
 
     def significance(self, share: float) -> Array:
@@ -270,9 +257,9 @@ class Load:
         return out
 
     def left_open(self) -> Array:
-        """Return the spectral density of the impulse that lines between the samples do not tell, in N2 s and (N m)2 s.
+        """Return the spectral density of the impulse missed by lines between the samples, in N2 s and (N m)2 s.
 
-        A load that is as rough between its samples as from one to the next leaves its lines by Brownian bridges.
+        A load that is as rough between its samples as from sample to sample differs from the lines by Brownian bridges.
         """
         step = np.diff(self.t)
         slope = np.diff(self.wrench, axis=0) / step[:, None]
@@ -283,7 +270,7 @@ class Load:
     def averaged(self, count: int) -> Load:
         """Return `count` knots at equal distances whose lines are nearest to this load (least squares).
 
-        What is left over has no mean over any few of them, so it moves the head nowhere for long.
+        The remainder has no mean over some knots, so it does not move the head for long.
         """
         knots = np.linspace(self.t[0], self.t[-1], count)
         within = max(_FINER, math.ceil(2.0 * len(self.t) / count))
@@ -309,8 +296,13 @@ def own_deviations(brought: Iterable[tuple[float, ...]]) -> Array:
     return np.array([one or (math.nan,) * 3 for one in brought], dtype=np.float64).reshape(-1, 3)
 
 
+def useless_deviation() -> Deviation:
+    """Return the stated deviations of x, y [m], theta [rad] beyond which a component counts as not measured."""
+    return tuple(tuning.MUCH_WORSE * bias for bias in priors.BIAS)
+
+
 def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]:
-    """Return poses without the components that they themselves say are hardly known, and the deviation of the others.
+    """Return poses without components of a large stated deviation, and the deviation of the others.
 
     Parameters
     ----------
@@ -322,12 +314,11 @@ def believed(stated: Deviation, q: Array, own: Array) -> tuple[Array, Deviation]
     Returns
     -------
     ndarray, tuple of 3 float
-        Poses, NaN where not to be believed; the root mean square of the own deviations of the others, at least what
-        is stated.
+        Poses, NaN where left out; root mean square of the deviations of the others, at least `stated`.
     """
-    told = [column[np.isfinite(column)] for column in own.T]
-    usual = np.array([float(np.median(column)) if len(column) else 0.0 for column in told])
-    worse = own > np.minimum(USELESS, np.where(usual > 0.0, _MUCH_WORSE * usual, np.inf))
+    known = [column[np.isfinite(column)] for column in own.T]
+    usual = np.array([float(np.median(column)) if len(column) else 0.0 for column in known])
+    worse = own > np.minimum(useless_deviation(), np.where(usual > 0.0, tuning.MUCH_WORSE * usual, np.inf))
     kept = np.where(worse | ~np.isfinite(own), 0.0, own)
     count = np.maximum((np.isfinite(own) & ~worse).sum(axis=0), 1)
     x, y, theta = np.maximum(stated, np.sqrt((kept**2).sum(axis=0) / count)).tolist()

@@ -1,10 +1,9 @@
-"""The clearance by groups of pads, as far as the motion tells it.
+"""The clearance by groups of pads.
 
-The two pads of a wall need not be worn alike. What turns the wall is one more unknown for each wall; beside a fit of
-the clearances it is found by one linearised step, all others eliminated with it, and its interval says whether the
-motion tells it. Where walls are turned so far that the fit does not hold, it is repeated with turned walls. How the
-clearance lies to the left and to the right of the head, or above and below, no pose tells: the sensor's bias stands for
-it.
+The two pads of a wall may be worn differently, which turns the wall. These turns are found beside a fit of the
+clearances by one linearised step, all other unknowns eliminated; their intervals show whether the motion determines
+them. If walls are turned so far that the fit does not hold, it is repeated with turned walls. A pose cannot separate
+the clearance on one side of the head from that on the other: the difference is the sensor's bias.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import WALLS, Fit, Problem, fit, joint_step
 from plow_twin.estimate.gaps import GROUPS
 from plow_twin.estimate.result import Interval
@@ -21,17 +21,17 @@ from plow_twin.estimate.unknowns import GX, GY, SIZE
 
 Array = NDArray[np.float64]
 
-#: Groups by clearance, and the share of each wall's turn in it: top and bottom, left and right.
+#: Definition: groups by clearance, and the share of each wall's turn in it: top and bottom, left and right.
 _MADE_OF: Final = {
     "horizontal_top": (GX, np.array([0.5, 0.5, 0.0, 0.0])),
     "horizontal_bottom": (GX, np.array([-0.5, -0.5, 0.0, 0.0])),
     "vertical_left": (GY, np.array([0.0, 0.0, 0.5, 0.5])),
     "vertical_right": (GY, np.array([0.0, 0.0, -0.5, -0.5])),
 }
-#: Prior deviation of a turn, and the step of its difference quotient, in m.
-_TURN, _STEP = 4e-3, 2e-4
-#: Rounds of fits with turned walls, iterations of each; longest turn of a round, and one that ends them, in m.
-_ROUNDS, _ITERATIONS, _LONGEST_TURN, _NO_TURN = 4, 15, 2e-3, 1e-4
+#: Step: of the difference quotient by a turn in m.
+TURN_STEP = 2e-4
+#: Bound: rounds of fits with turned walls, iterations of each; change of a turn in m that ends them, half of that step.
+_ROUNDS, _ITERATIONS, _NO_TURN = 4, 15, 0.5 * TURN_STEP
 assert list(_MADE_OF) == list(GROUPS)
 
 
@@ -64,7 +64,7 @@ def turned(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
     forward = problem.forward.renewed()
     for _ in range(_ROUNDS):
         step, _ = _joint_step(problem, found)
-        turn = np.clip(step[SIZE:], -_LONGEST_TURN, _LONGEST_TURN)
+        turn = np.clip(step[SIZE:], -tuning.TURN[1], tuning.TURN[1])
         problem = Problem(
             forward, problem.unknowns, problem.window, horizon=problem.horizon, turns=problem.turns + turn,
             drift=problem.drift,
@@ -79,9 +79,9 @@ def turned(problem: Problem, found: Fit) -> tuple[Problem, Fit] | None:
 
 
 def of_turns(problem: Problem, found: Fit) -> Array:
-    """Return what walls that may be turned add to the covariance of the shared unknowns, shape (11, 11).
+    """Return the covariance of the shared unknowns due to walls that may be turned, shape (11, 11).
 
-    Where only one of the pads that face each other is touched, how far the others are apart is not known.
+    If only one of two facing pads is touched, the distance of the others is unknown.
     """
     _, covariance = _joint_step(problem, found)
     held = np.linalg.inv(covariance)[:SIZE, :SIZE]
@@ -91,7 +91,7 @@ def of_turns(problem: Problem, found: Fit) -> Array:
 
 def _joint_step(problem: Problem, found: Fit) -> tuple[Array, Array]:
     """Return the linearised step of the shared unknowns and the turns together, shape (15,), and its covariance."""
-    precision = np.full(len(WALLS), 1.0 / _TURN**2)
+    precision = np.full(len(WALLS), 1.0 / tuning.TURN[0] ** 2)
     return joint_step(problem, found, _columns(problem, found), precision, -problem.turns * precision)
 
 
@@ -101,8 +101,8 @@ def _columns(problem: Problem, found: Fit) -> Array:
     out = np.zeros((*point.residual.shape, len(WALLS)))
     for index in range(len(WALLS)):
         turns = problem.turns.copy()
-        turns[index] += _STEP
+        turns[index] += TURN_STEP
         other = problem.evaluate(point.shared, point.states, turns)
         if other is not None:
-            out[:, :, index] = np.nan_to_num((point.residual - other.residual) / _STEP)
+            out[:, :, index] = np.nan_to_num((point.residual - other.residual) / TURN_STEP)
     return out

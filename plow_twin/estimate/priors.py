@@ -1,4 +1,4 @@
-"""How well the numbers of a scene are known: the deviation that it states, or the default of the number's mark."""
+"""Prior deviations of the numbers of a scene: the stated one, or the default of the number's mark."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Final
 
 from plow_twin.model.scene import Mark, Scene
 
-#: Standard deviation of a number without a stated one, by mark. A clearance grows by wear, whatever the drawing says,
-#: and a contact's numbers are seldom known at all: only those measured at the machine are worth more. Mass and inertia
-#: follow from a drawing to some percent, a frame's sides to a tolerance and to how far its corners are round. The
-#: exponent is that of an idealised law; friction is seldom written down. Units: m for lengths, the logarithm of
+#: Prior: standard deviation of a number without a stated one, by mark. Drawings do not show the wear of a clearance,
+#: and a contact's numbers are seldom known unless measured. Mass and inertia follow from a drawing to some percent, a
+#: frame's sides to a tolerance and the rounding of its corners. The exponent belongs to an idealised law; friction is
+#: seldom documented. Units: m for lengths, the logarithm of
 #: stiffness and damping (of a restitution its logit), shares of mass and inertia, else the number's own.
 DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "clearance": {Mark.GIVEN: 8e-3, Mark.MEASURED: 2e-3, Mark.RECONSTRUCTED: 8e-3, Mark.ASSUMED: 8e-3},
@@ -21,7 +21,9 @@ DEFAULTS: Final[dict[str, dict[Mark, float]]] = {
     "exponent": {Mark.GIVEN: 0.07, Mark.MEASURED: 0.03, Mark.RECONSTRUCTED: 0.07, Mark.ASSUMED: 0.07},
     "friction": {Mark.GIVEN: 0.05, Mark.MEASURED: 0.02, Mark.RECONSTRUCTED: 0.05, Mark.ASSUMED: 0.05},
 }
-#: Which row of the table a number has.
+#: Prior: standard deviation of a sensor's constant error of x, y [m] and theta [rad].
+BIAS: Final = (5e-3, 5e-3, 0.02)
+#: Row of the table for each number.
 KINDS: Final = {
     "clearance.horizontal_m": "clearance",
     "clearance.vertical_m": "clearance",
@@ -38,7 +40,7 @@ KINDS: Final = {
 
 
 def is_stated(scene: Scene, path: str) -> bool:
-    """Return whether the scene states how well it knows a number."""
+    """Return whether the scene states the deviation of a number."""
     provenance = scene.marks.get(path)
     return provenance is not None and provenance.deviation is not None
 

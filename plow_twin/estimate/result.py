@@ -1,4 +1,4 @@
-"""What an estimate says: values with 90 % intervals, the state of each, and whether model and sensor can be trusted."""
+"""The estimate: values with 90 % intervals, their states, and whether model and sensor can be trusted."""
 
 from __future__ import annotations
 
@@ -6,29 +6,31 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
+from html import escape
 from statistics import NormalDist
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from plow_twin.estimate.unknowns import CORRELATED, QUANTITIES
 
 Array = NDArray[np.float64]
 
-#: Quantile of the normal distribution at which a 90 % interval ends.
-NORMAL_P95: Final = 1.6448536269514722
-_STANDARD: Final = NormalDist()
-#: Standard deviations beyond which the normal distribution's tail is as good as exponential.
+#: Derived: quantile of the normal distribution at which a 90 % interval ends.
+NORMAL_P95: Final = float(ndtri(0.95))
+#: Guard: standard deviations beyond which the normal distribution's tail is as good as exponential.
 _FAR = 30.0
+_STANDARD: Final = NormalDist()
 
 
 class State(Enum):
-    """How far a value can be relied on."""
+    """Reliability of a value."""
 
     ESTIMATED = "estimated"
-    ROUGH = "rough"  #: the machine is not exactly the model: an interval that allows for it
-    NOT_OBSERVABLE = "not_observable"  #: the motion does not tell it: what was known before, with its interval
+    ROUGH = "rough"  #: the machine differs from the model: an interval that allows for it
+    NOT_OBSERVABLE = "not_observable"  #: the motion does not determine it: the prior, with its interval
     PRIOR = "prior"  #: nothing was measured
     WITHDRAWN = "withdrawn"  #: the sensor is broken, or the data contradict themselves or every motion of the model
 
@@ -40,7 +42,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Interval:
-    """A value with the 5 % and 95 % points of what it may be."""
+    """A value with its 5 % and 95 % points."""
 
     mean: float
     p05: float
@@ -62,7 +64,7 @@ class Interval:
         return Interval(self.mean * unit, self.p05 * unit, self.p95 * unit)
 
     def above(self, least: float) -> Interval:
-        """Return the interval of the same normal distribution cut off below `least`."""
+        """Return the interval of this normal distribution truncated at `least`."""
         deviation = self.deviation
         if deviation <= 0.0 or (least - self.mean) < -4.0 * deviation:
             return self
@@ -84,11 +86,11 @@ def _tail(least: float) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class Cell:
-    """What was found of a load cell.
+    """Estimated properties of a load cell.
 
     rows : rows in or near contact behind it
     gain : measured over true force
-    offset, noise : what it shows in flight, and its standard deviation there, in N
+    offset, noise : its mean and standard deviation in flight, in N
     left_over : share of its force that is left over beyond the noise
     """
 
@@ -137,6 +139,33 @@ class ForcesUsed:
         return {"rows": rows, "unused": self.unused, "delay": delay, "pairs": cells}
 
 
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A measured motion beside that of the model, as its sensor would show it: with bias and delay.
+
+    t : (n,) stamps in s
+    measured, model : (n, 3) x, y in m, theta in rad; NaN where nothing was measured, or the model was not fitted
+    """
+
+    t: Array
+    measured: Array
+    model: Array
+
+    @property
+    def residual(self) -> Array:
+        """Measured minus model, shape (n, 3)."""
+        return self.measured - self.model
+
+    def in_units(self, length: float, time: float) -> Motion:
+        """Return it where lengths and times were in these units."""
+        scale = np.array([length, length, 1.0])
+        return Motion(self.t * time, self.measured * scale, self.model * scale)
+
+    def moved(self, by: Array) -> Motion:
+        """Return both motions moved by x, y, theta."""
+        return Motion(self.t, self.measured + by, self.model + by)
+
+
 @dataclass(frozen=True)
 class Estimate:
     """Everything that is estimated from one window.
@@ -158,7 +187,7 @@ class Estimate:
     noise : tuple of float
         Standard deviation of the measured x, y, theta in m, m, rad.
     model, sensor : str
-        `ok` or `suspect`; `reasons` says why.
+        `ok` or `suspect`; `reasons` holds the causes.
     lost : int
         Rows that could not be used.
     correlation : tuple of tuple of float
@@ -169,8 +198,10 @@ class Estimate:
     forces_measured : ForcesUsed, optional
         How measured contact forces were used, where there were some.
     differs : dict of str to (float, float, float)
-        Of each further quantity of machine and sensor the probability that it differs from the scene, and by how much
+        Of each further quantity of machine and sensor: probability that it differs from the scene, and the difference
         then: mean and standard deviation.
+    motion : Motion, optional
+        What was fitted; None where the motion is not known moment by moment. It is no part of `as_dict`.
     """
 
     t_start: float
@@ -198,31 +229,47 @@ class Estimate:
     groups: dict[str, tuple[Interval, State]] = field(default_factory=dict)
     forces_measured: ForcesUsed | None = None
     differs: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    motion: Motion | None = field(default=None, compare=False, repr=False)
 
     @classmethod
-    def from_dict(cls, told: Mapping[str, Any]) -> Estimate:
-        """Return what `as_dict` told of the machine and the sensor that it moves; groups and figures are left out."""
+    def from_dict(cls, data: Mapping[str, Any]) -> Estimate:
+        """Return the estimate of which `data` is `as_dict`, without groups, figures and motion."""
 
         def clearance(name: str) -> tuple[Interval, State]:
-            one = told[name]
+            one = data[name]
             return Interval(one["mean_m"], one["p05_m"], one["p95_m"]), State(one["state"])
 
         (horizontal, horizontal_state), (vertical, vertical_state) = clearance("horizontal"), clearance("vertical")
         others: dict[str, Any] = {
-            quantity.name: Interval(**told[quantity.name])
+            quantity.name: Interval(**data[quantity.name])
             for quantity in QUANTITIES
-            if quantity.name in told and quantity.name not in ("horizontal", "vertical")
+            if quantity.name in data and quantity.name not in ("horizontal", "vertical")
         }
-        correlation = told["correlation"]
+        correlation = data["correlation"]
         return cls(
-            told["t_start"], told["t_end"], horizontal, vertical, horizontal_state, vertical_state,
-            noise=None if told["noise"] is None else tuple(told["noise"]), model=told["model"], sensor=told["sensor"],
-            reasons=tuple(told["reasons"]), lost=told["lost"],
+            data["t_start"], data["t_end"], horizontal, vertical, horizontal_state, vertical_state,
+            noise=None if data["noise"] is None else tuple(data["noise"]), model=data["model"], sensor=data["sensor"],
+            reasons=tuple(data["reasons"]), lost=data["lost"],
             correlation=None if correlation is None else tuple(tuple(row) for row in correlation["matrix"]), **others,
         )  # fmt: skip
 
+    def _repr_html_(self) -> str:
+        """Return the values with their intervals as a table, which notebooks show."""
+        states = {"horizontal": self.horizontal_state, "vertical": self.vertical_state}
+        values, rows = self.values(), []
+        for one in (quantity for quantity in QUANTITIES if quantity.name in values):
+            value = values[one.name].times(one.factor)
+            cells = [one.label, *(format(number, one.digits) for number in (value.mean, value.p05, value.p95))]
+            cells.append(states[one.name].value.replace("_", " ") if one.name in states else "")
+            rows.append("".join(f"<td>{escape(cell)}</td>" for cell in cells))
+        title = f"window from {self.t_start:.2f} s to {self.t_end:.2f} s; model {self.model}, sensor {self.sensor}"
+        heads = "".join(f"<th>{name}</th>" for name in ("", "mean", "5 %", "95 %", ""))
+        body = "".join(f"<tr>{row}</tr>" for row in rows)
+        reasons = "".join(f"<p>{escape(reason)}</p>" for reason in self.reasons)
+        return f"<table><caption>{title}</caption><tr>{heads}</tr>{body}</table>{reasons}"
+
     def values(self) -> dict[str, Interval]:
-        """Return all that is told, by the names of `QUANTITIES`."""
+        """Return all estimated values by the names of `QUANTITIES`."""
         every = ((quantity.name, getattr(self, quantity.name)) for quantity in QUANTITIES)
         return {name: value for name, value in every if value is not None}
 

@@ -1,6 +1,6 @@
-"""Whether the sensor's scales are right: a gain that is off makes the clearances wrong by as much.
+"""Test of the sensor's scales: an error of a scale is an error of the clearances.
 
-In flight the load over the mass is an acceleration in m/s2, gravity is known, and how far x and y reach at a turned
+In flight the load over the mass is an acceleration in m/s2, gravity is known, and the reach of x and y at a turned
 head follows from the frame. Three scales are further unknowns beside a fit, found by one linearised step with all
 others eliminated (score test).
 """
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Scales:
-    """What the residuals tell of the scales.
+    """Estimated scales.
 
     scale : (3,) measured over true x, y, theta
     chi2 : of the three; 3 on the average where they are right
@@ -31,7 +31,7 @@ class Scales:
 
 
 def scales_of(problem: Problem, found: Fit) -> Scales:
-    """Return what the residuals of a fit tell of the sensor's scales."""
+    """Return the sensor's scales by the residuals of a fit."""
     motion = np.nan_to_num(problem.window.poses.q - found.point.residual - found.shared[BIAS])
     columns = motion[:, :, None] * np.eye(3)
     step, covariance = joint_step(problem, found, columns, np.full(3, NO_PRIOR), np.zeros(3))

@@ -1,4 +1,4 @@
-"""From nothing to the best fit: the horizon of each swing grows while the candidates become fewer."""
+"""Search for the best fit: the horizon of each swing grows while candidates are dropped."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import Fit, Problem, Window, fit
 from plow_twin.estimate.forward import Forward
 from plow_twin.estimate.measurements import Poses
@@ -15,14 +16,6 @@ from plow_twin.estimate.start import cut, first_vectors, range_of_motion
 from plow_twin.estimate.unknowns import BIAS, DELAY, GX, GY, SOFTNESS, Unknowns
 
 Array = NDArray[np.float64]
-
-#: Periods in which candidates are compared.
-_FIRST_PERIODS = 3.0
-#: First guess of the noise: m, m, rad.
-_NOISE = np.array([1e-3, 1e-3, 4e-3])
-#: Penetration in m under the reference force below which a contact is hard: the head bounces long, and what it does
-#: after some bounces cannot be foretold.
-HARD = 3e-3
 
 
 @dataclass(frozen=True)
@@ -34,28 +27,22 @@ class Stage:
     keep: int
 
 
-#: Fewest rows within a horizon, and within a swing.
+#: Derived: rows within a horizon, and within a swing: more numbers than the six of its start in each component.
 _FEWEST_ROWS = (8, 12)
-
+#: Bound: rounds in which the candidates become fewer.
 STAGES: Final = (Stage(0.1, 4, 5), Stage(0.2, 3, 2))
-#: Shortest swing and horizon, as shares of the period, of hard and of soft contacts, and under a broad-band load, whose
-#: swings are linked: what its samples do not tell between them adds up along a swing.
-_SHORT, _LONG, _BROAD = (0.04, 0.11), (0.35, np.inf), (0.03, np.inf)
-
-#: Gain in the cost below which the beginnings of swings are fitted well enough to go on with all of them.
-_ENOUGH = 30.0
-#: Most swings: what a fit costs grows with them.
+#: Bound: swings; the cost of a fit grows with them.
 _MOST_SWINGS = 350
 
 
 def candidate(forward: Forward, unknowns: Unknowns, poses: Poses, period: float) -> Fit | None:
     """Return the best fit to the beginnings of the first swings, or None where no start could be run."""
     interval = poses.interval()
-    first = poses.between(float(poses.t[0]), float(poses.t[0]) + _FIRST_PERIODS * period)
+    first = poses.between(float(poses.t[0]), float(poses.t[0]) + tuning.FIRST_PERIODS * period)
     window = cut(unknowns.scene, first, period, max(0.2 * period, _FEWEST_ROWS[1] * interval))
     horizons = [max(stage.horizon * period, _FEWEST_ROWS[0] * interval) for stage in STAGES]
     vectors = first_vectors(Problem(forward, unknowns, window, horizon=horizons[0]), 6)
-    points = [(vector, states_at(window, vector), _NOISE) for vector in vectors]
+    points = [(vector, states_at(window, vector), tuning.FIRST_NOISE) for vector in vectors]
     fits: list[Fit] = []
     for stage, horizon in zip(STAGES, horizons, strict=True):
         problem = Problem(forward, unknowns, window, horizon=horizon)
@@ -72,28 +59,29 @@ def refine(
 ) -> tuple[Problem, Fit] | None:  # fmt: skip
     """Fit all poses from a good start: the beginning of each swing first.
 
-    From a start `close` to the optimum long swings of a hard contact end in it too.
+    From a start `close` to the optimum, long swings of a hard contact converge too.
 
-    `drift` (3,), in m2/s3 and rad2/s3, is what a broad-band load leaves open, None of another load; `turns` (4,) are
-    those of the walls, in m.
+    `drift` (3,) is the spectral density of the acceleration by the unknown part of a broad-band load in m2/s3 and
+    rad2/s3, None for another load; `turns` (4,) are those of the walls, in m.
     """
-    hard = not close and bool(np.exp(shared[SOFTNESS]) < HARD)
+    hard = not close and bool(np.exp(shared[SOFTNESS]) < tuning.HARD)
     rows = poses.interval() * np.array(_FEWEST_ROWS)
-    shortest, horizon = _SHORT if hard else _LONG if drift is None else _BROAD
+    shortest = tuning.SHORTEST[0 if hard else 1 if drift is None else 2]
+    horizon = tuning.HARD_HORIZON if hard else np.inf
     if drift is not None and not hard:
-        # as long as what the load leaves open moves the head by less than the sensor's noise
-        shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), _LONG[0])
+        # the unknown part of the load moves the head by less than the sensor's noise
+        shortest = min(max(shortest, float(np.cbrt(3.0 * noise**2 / drift).min()) / period), tuning.SHORTEST[1])
     shortest = max(shortest * period, rows[1], float(poses.t[-1] - poses.t[0]) / _MOST_SWINGS)
     horizon = max(horizon * period, rows[0])
     window = cut(unknowns.scene, poses, period, shortest)
     near = Problem(forward, unknowns, window, horizon=min(max(0.2 * period, rows[0]), horizon), turns=turns)
     starts = [shared]
-    if unknowns.is_hard(shared):  # a softer contact is never best from there, and the work is needed for the fit
+    if unknowns.is_hard(shared):  # only hard contacts are best from there
         starts.append(range_of_hard(unknowns, poses, shared))
     fits = []
     for start in starts:
         states = better_states(near, start, states_at(window, start))
-        fits.append(fit(near, start, states, noise, 10, *(() if hard else (_ENOUGH,))))
+        fits.append(fit(near, start, states, noise, 10, *(() if hard else (tuning.ENOUGH,))))
     found = min((one for one in fits if one is not None), key=lambda one: one.loss, default=None)
     if found is None:
         return None

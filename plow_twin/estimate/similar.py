@@ -1,16 +1,17 @@
-"""Machines of other sizes: estimated as one of the size that the search and its thresholds were made for.
+"""Machines of other sizes, estimated in units in which they have the paper's size, for which thresholds were chosen.
 
-Lengths, masses and times in units of their own leave the equations of motion as they are (similarity of mechanics), so
-a machine ten times as large is one of the paper's size in other units. Units are powers of two: nothing is rounded.
+The equations of motion keep their form in other units of length, mass and time (mechanical similarity). Units are
+powers of two, so nothing is rounded.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
-from plow_twin.estimate.gaps import CONSTANT_ERROR, Gaps
+from plow_twin.estimate import tuning
+from plow_twin.estimate.gaps import Gaps
 from plow_twin.estimate.measurements import Deviation, Load, Poses
 from plow_twin.estimate.priors import KINDS
 from plow_twin.estimate.result import Estimate
@@ -22,10 +23,8 @@ from plow_twin.model.scene import Clearance, Contact, Friction, Initial, Provena
 if TYPE_CHECKING:
     from plow_twin.estimate.contact_forces import ContactForces
 
-#: The machine of the paper: half of the frame's diagonal [m], mass [kg], period of the load [s].
+#: Definition: the machine of the paper, half of the frame's diagonal [m], mass [kg], period of the load [s].
 PAPER_LENGTH, _MASS, _PERIOD = 0.213, 2430.0, 3.14
-#: Factors in length, mass and time by which a machine may differ and be estimated in SI units.
-_ALIKE: Final = (2.5, 6.0, 4.0)
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Units:
         period = load.oscillation() or _PERIOD
         sizes = geometry.half_diagonal(scene) / PAPER_LENGTH, scene.head.mass_kg / _MASS, period / _PERIOD
         if scene.support is not None or all(
-            1.0 / most <= size <= most for size, most in zip(sizes, _ALIKE, strict=True)
+            1.0 / most <= size <= most for size, most in zip(sizes, tuning.ALIKE, strict=True)
         ):
             return Units()
         return Units(*(2.0 ** round(math.log2(size)) for size in sizes))
@@ -99,7 +98,7 @@ class Units:
         """Return gaps in these units; the error of a sensor does not grow with the machine."""
         if gaps is None:
             return None
-        return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or CONSTANT_ERROR) / self.length)
+        return Gaps(gaps.t / self.time, gaps.gap / self.length, (gaps.deviation or tuning.CONSTANT_ERROR) / self.length)
 
     def forces(self, forces: ContactForces | None) -> ContactForces | None:
         """Return contact forces in these units."""
@@ -108,7 +107,7 @@ class Units:
         return replace(forces, t=forces.t / self.time, force=forces.force / self.force)
 
     def in_si(self, found: Estimate, scene: Scene) -> Estimate:
-        """Return what was found in these units in those of SI, `scene` being that in SI."""
+        """Return an estimate in these units in SI units, for the `scene` in SI units."""
         contact = scene.contact
         length, time = self.length, self.time
         unit = {
@@ -142,6 +141,7 @@ class Units:
             if found.forces_measured is None
             else found.forces_measured.in_units(self.force, self.time),
             reasons=found.reasons + scale if found.reasons else (),
+            motion=None if found.motion is None else found.motion.in_units(length, time),
         )
 
     def _damping(self, contact: Contact) -> float:
@@ -169,7 +169,7 @@ class Units:
 
 
 def _converted(scene: Scene, its: Scene) -> dict[str, Provenance]:
-    """Return the marks with deviations that are to the numbers of `its` as they are to those of `scene`."""
+    """Return the marks with deviations converted to the units of `its`."""
     marks = dict(scene.marks)
     for path in KINDS:
         mark, (part, name) = marks.get(path), path.split(".")

@@ -1,10 +1,11 @@
-"""Where the fit starts: swings cut in flight, clearances from the range of motion, several stiffnesses tried."""
+"""Starting points of a fit: swings cut in flight, clearances from the range of motion, several stiffnesses."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.fit import Problem, Window
 from plow_twin.estimate.measurements import Poses
 from plow_twin.estimate.unknowns import BIAS, DAMPING, DELAY, GX, GY, SOFTNESS, Unknowns
@@ -14,14 +15,8 @@ from plow_twin.model.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Penetrations in m under the reference force that are tried: hard and soft contacts.
-_PENETRATIONS = (1e-4, 7e-4, 1.5e-3, 2.5e-3, 4e-3, 6e-3, 8.5e-3, 1.2e-2, 1.7e-2, 2.4e-2, 4e-2)
-#: Spans in s of the parabolas that tell a starting state, and their misfit in standard deviations that will do.
-_SPANS, _FITS = (0.12, 0.09, 0.06), 1.4
-#: Moments tried for the start of a swing.
+#: Bound: moments tried for the start of a swing.
 _CANDIDATES = 12
-#: Distance from the walls from which the head counts as clear of them, in standard deviations of its noise.
-_CLEAR = 5.0
 
 
 def filled(poses: Poses) -> Array:
@@ -44,9 +39,9 @@ def smoothed(q: Array, width: int) -> Array:
 
 
 def reaches(scene: Scene, q: Array) -> Array:
-    """Return how far the corners reach toward the right, left, top and bottom walls beyond the frame's half size.
+    """Return the reach of the corners toward the right, left, top and bottom wall beyond the frame's half size.
 
-    Shape (n, 4) in m; where a wall touches it is half of the clearance and the penetration.
+    Shape (n, 4) in m; at contact it is half the clearance plus the penetration.
     """
     rows = geometry.penetration_rows(scene)[:4]
     c, s = np.cos(q[:, 2]), np.sin(q[:, 2])
@@ -63,7 +58,7 @@ def smooth_width(poses: Poses, span: float = 0.06) -> int:
 
 
 def range_of_motion(scene: Scene, poses: Poses) -> tuple[Array, Array]:
-    """Return the clearances (2,) and the bias of x and y (2,) that the range of motion alone tells, in m."""
+    """Return clearances (2,) and bias of x and y (2,) by the range of motion alone, in m."""
     reach = reaches(scene, smoothed(filled(poses), smooth_width(poses)))
     right, left, top, bottom = np.quantile(reach, 0.99, axis=0)
     # seen from the head the corner goes left when the measured head goes right
@@ -82,7 +77,7 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
     # distance from where the nearest wall touches
     room = -(reach - np.quantile(reach, 0.99, axis=0)).max(axis=1)
     noise = np.maximum(noise_level(raw), 1e-7)
-    clear = _CLEAR * np.hypot(*(noise[[0, 2]] * [1.0, geometry.half_diagonal(scene)])) / np.sqrt(width)
+    clear = tuning.OUTLYING * np.hypot(*(noise[[0, 2]] * [1.0, geometry.half_diagonal(scene)])) / np.sqrt(width)
     apart = max(shortest, 6 * interval)
     starts, states = [float(t[0])], [_parabola(t, raw, float(t[0]), noise)[0]]
     while t[-1] > starts[-1] + 2.0 * apart:
@@ -103,13 +98,13 @@ def cut(scene: Scene, poses: Poses, period: float, shortest: float) -> Window:
 
 
 def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, float]:
-    """Return pose and rate at `start` by parabolas through the poses about it, shape (6,), and how badly they fit.
+    """Return pose and rate at `start` by parabolas through the poses about it, shape (6,), and their misfit.
 
     The longest span that fits to the noise is taken: an impact within it would spoil the rates.
     """
     near, misfit = np.zeros(0, np.int64), np.inf
     state = np.zeros(6)
-    for span in _SPANS:
+    for span in tuning.PARABOLAS:
         low, high = np.searchsorted(t, [start - 0.5 * span, start + 0.5 * span])
         if high - low < 6:
             middle = int(np.searchsorted(t, start))
@@ -121,13 +116,13 @@ def _parabola(t: Array, q: Array, start: float, noise: Array) -> tuple[Array, fl
         now = float(np.sqrt((error**2).sum(axis=0) / max(len(near) - 3, 1)).max())
         if now < misfit:
             misfit, state = now, np.concatenate([coefficients[0], coefficients[1]])
-        if now < _FITS:
+        if now < tuning.PARABOLA_FITS:
             return np.concatenate([coefficients[0], coefficients[1]]), now
     return state, misfit
 
 
 def noise_level(q: Array) -> Array:
-    """Return the standard deviation of what changes from row to row, by third differences, shape (3,)."""
+    """Return the standard deviation of white noise by third differences, shape (3,)."""
     if len(q) < 8:
         return np.zeros(3)
     level: Array = 1.4826 * np.median(np.abs(np.diff(q, n=3, axis=0)), axis=0) / np.sqrt(20.0)
@@ -143,7 +138,7 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
     unknowns, window = problem.unknowns, problem.window
     measured, bias = range_of_motion(unknowns.scene, window.poses)
     found: list[tuple[float, Array]] = []
-    for penetration in (None, *_PENETRATIONS):
+    for penetration in (None, *tuning.PENETRATIONS):
         for damping in (0.0, -1.0, 1.0) if unknowns.damped else (0.0,):
             vector = unknowns.nominal()
             vector[BIAS][:2] = bias
@@ -157,7 +152,7 @@ def first_vectors(problem: Problem, most: int) -> list[Array]:
 
 
 def _matched(problem: Problem, vector: Array, measured: Array) -> list[tuple[float, Array]]:
-    """Match the range of motion from a vector on; return what fits best with its loss, if it can be run."""
+    """Match the range of motion from a vector on; return the best vector with its loss, if it can be run."""
     poses, unknowns = problem.window.poses, problem.unknowns
     found = []
     for _ in range(4):

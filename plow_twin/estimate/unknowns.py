@@ -1,8 +1,8 @@
-"""What is estimated: the vector of unknowns, its prior, and the scene that a vector stands for.
+"""The vector of unknowns, its prior, and the scene of a vector.
 
 Softness stands for the stiffness: u = (F0 / K)^(1/n) is the penetration in m under the reference force F0, and the
-unknown is psi = ln(u + u0). For soft contacts it acts as ln K, for hard ones as the compliance: there the motion tells
-no more than that K is large, and psi has an end.
+unknown is psi = ln(u + u0). For soft contacts it acts as ln K, for hard contacts as the compliance: the motion shows
+only that K is large then, and psi has a lower end.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import priors, tuning
 from plow_twin.estimate.measurements import Load, Poses
 from plow_twin.estimate.priors import deviation_of, is_stated
 from plow_twin.model.scene import Clearance, Contact, Scene
@@ -30,17 +31,17 @@ class Quantity:
     name : str
         Its name in an estimate.
     label, factor, digits : str, float, str
-        How it is printed: its name with the unit, what the number is multiplied by, and the format.
+        How it is printed: name with unit, factor, and format.
     deviation : float
         Standard deviation of the prior about the nominal scene, in the unknown's own unit.
     dimension : tuple of 3 int
-        Powers of length, mass and time in the unit that it is told in; the contact's follow from its law.
+        Powers of length, mass and time in its published unit; the contact's follow from its law.
     step : float, optional
         Step of its difference quotient; None where the derivative is known exactly.
     fine_step : float, optional
-        The same beside measured forces, which bend more over a step.
+        The same with measured forces, which are less linear.
     probe : float
-        Standard deviation of the displacement that probes what can be foretold.
+        Standard deviation of the displacement that probes predictability.
     """
 
     name: str
@@ -54,10 +55,10 @@ class Quantity:
     probe: float = 0.0
 
 
-#: All that is estimated, in the order of a vector of unknowns: the clearances in m, the softness psi (told as the
-#: stiffness), the logarithm of the damping (of a restitution its logit), three gains of the load, three biases and the
-#: delay of the sensor. The quantities with a `step` move the head and come first; the others change how its motion is
-#: measured.
+#: Prior: all that is estimated, in the order of a vector of unknowns: the clearances in m, the softness psi (given as
+#: the stiffness), the logarithm of the damping (of a restitution its logit), three gains of the load, three biases and
+#: the delay of the sensor. The quantities with a `step` move the head and come first; the others change how its
+#: motion is measured.
 QUANTITIES: Final = (
     Quantity("horizontal", "horizontal clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
     Quantity("vertical", "vertical clearance [mm]", 1e3, ".3f", 8e-3, (1, 0, 0), 2e-4, 1e-5, 5e-5),
@@ -66,9 +67,9 @@ QUANTITIES: Final = (
     Quantity("gain_fx", "load gain fx [1]", 1.0, ".4f", 0.07, (0, 0, 0), 0.01, 4e-4, 2e-3),
     Quantity("gain_fy", "load gain fy [1]", 1.0, ".4f", 0.07, (0, 0, 0), 0.01, 4e-4, 2e-3),
     Quantity("gain_m", "load gain m [1]", 1.0, ".4f", 0.07, (0, 0, 0), 0.01, 4e-4, 2e-3),
-    Quantity("bias_x", "bias x [mm]", 1e3, ".3f", 5e-3, (1, 0, 0)),
-    Quantity("bias_y", "bias y [mm]", 1e3, ".3f", 5e-3, (1, 0, 0)),
-    Quantity("bias_theta", "bias theta [mrad]", 1e3, ".3f", 0.02),
+    Quantity("bias_x", "bias x [mm]", 1e3, ".3f", priors.BIAS[0], (1, 0, 0)),
+    Quantity("bias_y", "bias y [mm]", 1e3, ".3f", priors.BIAS[1], (1, 0, 0)),
+    Quantity("bias_theta", "bias theta [mrad]", 1e3, ".3f", priors.BIAS[2]),
     Quantity("delay", "delay [ms]", 1e3, ".3f", 0.05, (0, 0, 1)),
 )
 
@@ -81,39 +82,31 @@ GX: Final = _place("horizontal")
 GY: Final = _place("vertical")
 SOFTNESS: Final = _place("stiffness")
 DAMPING: Final = _place("damping")
+#: Definition: places of the gains and of the biases in a vector of unknowns.
 GAIN: Final = slice(_place("gain_fx"), _place("gain_m") + 1)
 BIAS: Final = slice(_place("bias_x"), _place("bias_theta") + 1)
 DELAY: Final = _place("delay")
 SIZE: Final = len(QUANTITIES)
 #: Places of the quantities that move the head.
 MOVING: Final = tuple(place for place, quantity in enumerate(QUANTITIES) if quantity.step is not None)
-#: Standard deviations of the displacements that probe what can be foretold, shape (11,).
+#: Standard deviations of the displacements that probe predictability, shape (11,).
 PROBES: Final = np.array([quantity.probe for quantity in QUANTITIES])
-#: Names of what moves the head, as their correlation is told: softness is the penetration under a force.
+#: Names in the published correlation; softness is the penetration under a force.
 CORRELATED: Final = tuple("softness" if place == SOFTNESS else QUANTITIES[place].name for place in MOVING)
 
-#: Impact speed in m/s below which lambda = D / v0 is not followed: touches at rest would make the contact stiff and the
-#: fit slow, for what a sensor of the pose does not see.
-SLOWEST_IMPACT: Final = 0.03
-
-#: u0 in m: penetrations below it cannot be told from none.
-_RESOLVED = 1e-4
-#: Smallest softness in m that is simulated; harder contacts move the head alike.
-_HARDEST = 3e-5
-#: Softness in m below which a contact is hard.
-_HARD = 3e-4
-#: Largest softness in m.
-_SOFTEST = 0.12
-#: Smallest clearance in m that is simulated.
+#: Guard: smallest and largest penetration in m that is simulated; harder contacts move the head alike, softer ones let
+#: it through the wall.
+_HARDEST, _SOFTEST = 3e-5, 0.12
+#: Guard: smallest clearance in m that is simulated.
 _LEAST_CLEARANCE = 5e-4
 
 
-#: The law that a linear contact may have instead of the one believed.
+#: The alternative law of a linear contact.
 OTHER_LAW: Final = {"hunt_crossley": "kelvin_voigt"}
 
-#: Least prior deviation: a number stated to be known exactly stays where it is.
+#: Guard: least prior deviation; a number stated to be known exactly stays where it is.
 _HELD = 1e-6
-#: Largest prior deviation of a load's gain.
+#: Guard: largest prior deviation of a load's gain.
 _MOST_GAIN = 1.0
 
 
@@ -123,7 +116,7 @@ def _prior() -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Unknowns:
-    """The prior about a nominal scene, and what a vector of unknowns means.
+    """The prior about a nominal scene, and the meaning of a vector of unknowns.
 
     Attributes
     ----------
@@ -144,15 +137,15 @@ class Unknowns:
 
     @staticmethod
     def stated(scene: Scene, load: Load, poses: Poses) -> Unknowns:
-        """Return the prior with the deviations that scene, load and poses state; a load's moves all samples alike."""
+        """Return the prior with the stated deviations of scene, load (as of its gains) and poses."""
         unknowns, deviation, contact = Unknowns(scene), _prior(), scene.contact
         deviation[GX] = deviation_of(scene, "clearance.horizontal_m")
         deviation[GY] = deviation_of(scene, "clearance.vertical_m")
         deviation[SOFTNESS] = deviation_of(scene, "contact.stiffness")
         if is_stated(scene, "contact.stiffness"):
-            # of the logarithm of K to that of u + u0
-            u = math.exp(unknowns.softness_of(contact.stiffness)) - _RESOLVED
-            deviation[SOFTNESS] *= u / (u + _RESOLVED) / contact.exponent
+            # from ln K to ln(u + u0)
+            u = math.exp(unknowns.softness_of(contact.stiffness)) - tuning.RESOLVED
+            deviation[SOFTNESS] *= u / (u + tuning.RESOLVED) / contact.exponent
         damped = "contact.damping" if contact.restitution is None else "contact.restitution"
         deviation[DAMPING] = deviation_of(scene, damped)
         deviation[GAIN] = np.minimum(np.hypot(deviation[GAIN], load.gain_deviations()), _MOST_GAIN)
@@ -177,40 +170,40 @@ class Unknowns:
         return vector
 
     def deviations(self) -> Array:
-        """Return the prior's standard deviations, shape (11,); a law without damping has none to estimate."""
+        """Return the prior's standard deviations, shape (11,); the damping of a law without it is fixed."""
         deviations = self.deviation.copy()
         if not self.damped:
             deviations[DAMPING] = 1e-6
         return deviations
 
     def is_hard(self, vector: Array) -> bool:
-        """Return whether the contact is so hard that its bounces cannot be foretold for long."""
-        return bool(vector[SOFTNESS] < math.log(_HARD + _RESOLVED))
+        """Return whether the bounces of the contact cannot be predicted for long."""
+        return bool(vector[SOFTNESS] < math.log(tuning.CERTAINLY_HARD + tuning.RESOLVED))
 
     def softness_of(self, stiffness: float) -> float:
         """Return psi of a stiffness."""
-        return math.log((self.force / stiffness) ** (1.0 / self.scene.contact.exponent) + _RESOLVED)
+        return math.log((self.force / stiffness) ** (1.0 / self.scene.contact.exponent) + tuning.RESOLVED)
 
     def penetration_of(self, psi: float) -> float:
         """Return the penetration in m under the reference force."""
-        return math.exp(psi) - _RESOLVED
+        return math.exp(psi) - tuning.RESOLVED
 
     def stiffness_of(self, psi: float) -> float:
-        """Return the stiffness of psi, at most that of the hardest contact that is simulated."""
-        u = max(math.exp(psi) - _RESOLVED, _HARDEST)
+        """Return the stiffness of psi, at most that of the hardest simulated contact."""
+        u = max(math.exp(psi) - tuning.RESOLVED, _HARDEST)
         return float(self.force / u**self.scene.contact.exponent)
 
     def critical_damping(self, stiffness: float) -> float:
-        """Return the damping in N s/m with which the head's mass on a spring of `stiffness` N/m just does not swing."""
+        """Return the critical damping in N s/m of the head's mass on a spring of `stiffness` N/m."""
         return 2.0 * math.sqrt(stiffness * self.scene.head.mass_kg)
 
     @property
     def hardest_believed(self) -> float:
-        """Stiffness up to which the prior reaches where the motion only tells that the contact is hard."""
+        """Upper end of the stiffness if the motion shows only that the contact is hard."""
         return float(self.force / (1e-6) ** self.scene.contact.exponent)
 
     def damping_of(self, value: float) -> float:
-        """Return the number that the law takes, its restitution or its damping."""
+        """Return the law's restitution or damping."""
         number = math.exp(float(np.clip(value, -30.0, 30.0)))
         return min(number / (1.0 + number), 0.999) if self._restitution else number
 
@@ -218,7 +211,9 @@ class Unknowns:
         """Return the nearest vector that can be simulated."""
         out = vector.copy()
         out[[GX, GY]] = np.maximum(out[[GX, GY]], _LEAST_CLEARANCE)
-        out[SOFTNESS] = np.clip(out[SOFTNESS], math.log(_HARDEST + _RESOLVED), math.log(_SOFTEST + _RESOLVED))
+        out[SOFTNESS] = np.clip(
+            out[SOFTNESS], math.log(_HARDEST + tuning.RESOLVED), math.log(_SOFTEST + tuning.RESOLVED)
+        )
         if self._restitution:
             out[DAMPING] = np.clip(out[DAMPING], -5.0, 5.0)
         out[GAIN] = np.clip(out[GAIN], 0.2, 5.0)
@@ -229,17 +224,19 @@ class Unknowns:
         return self.scene.contact.restitution is not None
 
     def scene_of(self, vector: Array) -> Scene:
-        """Return the scene that a vector stands for."""
+        """Return the scene of a vector."""
         damping = self.damping_of(float(vector[DAMPING])) if self.damped else None
         contact = contact_with(self.scene.contact, self.stiffness_of(float(vector[SOFTNESS])), damping)
         if self._restitution:
-            contact = replace(contact, impact_speed_floor_m_s=max(contact.impact_speed_floor_m_s, SLOWEST_IMPACT))
+            contact = replace(
+                contact, impact_speed_floor_m_s=max(contact.impact_speed_floor_m_s, tuning.SLOWEST_IMPACT)
+            )
         clearance = Clearance(float(vector[GX]), float(vector[GY]))
         return replace(self.scene, clearance=clearance, contact=contact, loads=(), wear=None)
 
 
 def contact_with(contact: Contact, stiffness: float, damping: float | None) -> Contact:
-    """Return a contact with a stiffness and the number that its law takes for damping (None: its own)."""
+    """Return a contact with another stiffness and damping number of its law (None: its own)."""
     contact = replace(contact, stiffness=stiffness)
     if damping is None:
         return contact

@@ -1,6 +1,6 @@
-"""Whether what is left over looks like noise: if not, the model or the sensor is not what it is taken for.
+"""Tests whether the residuals are noise; if not, the model or the sensor is suspect.
 
-The thresholds were set on truths with seeds below 1000 and tried on others; see docs/estimate.md for what they miss.
+The thresholds were set on truths with seeds below 1000; docs/estimate.md lists the faults that they miss.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.arrow import OWN
 from plow_twin.estimate.fit import NO_PRIOR, Fit, Problem, joint_step, pieces
-from plow_twin.estimate.measurements import FEWEST_POSES, Poses
+from plow_twin.estimate.measurements import FEWEST_FOR_SCATTER, FEWEST_POSES, Poses
 from plow_twin.estimate.scales import scales_of
 from plow_twin.estimate.start import noise_level
 from plow_twin.estimate.unknowns import BIAS, DAMPING, GAIN, GX, GY, SIZE, SOFTNESS, with_other_law
@@ -23,40 +24,17 @@ Array = NDArray[np.float64]
 
 COMPONENTS = ("x", "y", "theta")
 
-#: Mean square of the residuals over that of their quick changes: 1 for white noise.
-MOST_COLOUR = 2.0
-#: Scatter of the residuals' means over the load's phase, over that within one phase: 1 where nothing repeats.
-MOST_REPEATED = 2.0
-#: Parts of a period that are told apart.
-PHASES = 24
-#: Gain beyond which the load is not what it is said to be.
-MOST_GAIN = 0.25
-#: Rows in a row with one and the same value, and the motion meanwhile in standard deviations of the noise.
-STUCK_ROWS, STUCK_MOTION = 12, 6.0
-#: Rows in a row with one value, whatever the motion is.
-STUCK_FOR_CERTAIN = 50
-#: Gain in chi^2 from which a change within the window counts, and its least size in m.
-CHANGE_CHI2, CHANGE_M = 200.0, 5e-4
-#: Share of what is left over beyond the noise that a change must explain to be one.
-CHANGE_SHARE = 0.25
-#: Moments of a window, about, at which a change is looked for.
+#: Bound: moments of a window, about, at which a change is looked for.
 MOMENTS = 60
-#: Step from the law believed to another one in its standard deviations (at most 2.1 for 16 right models, seeds from
-#: 42200 on), and the share of the critical damping that the other one has.
-MOST_LAW_STEP, LAW_DAMPING = 5.0, 0.05
-#: Chi^2 of the sensor's three scales beside a fit that holds else (right models have 12 at most, see docs/estimate.md).
-MOST_SCALE = 16.0
-#: Quick noise of one part of the window over that of the rest.
-MOST_NOISE_RATIO = 2.0
 
 
 @dataclass
 class Verdict:
-    """What was found.
+    """Faults of model and sensor.
 
-    figures : the statistics behind it
-    by_scale : whether only its scales are against the sensor
-    broken : whether the sensor fails, or the data contradict themselves: nothing can be told then
+    figures : statistics of the tests
+    by_scale : whether the scales are the sensor's only fault
+    broken : whether the sensor fails or the data contradict themselves, so that nothing can be estimated
     """
 
     model: list[str] = field(default_factory=list)
@@ -67,7 +45,7 @@ class Verdict:
 
 
 def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
-    """Test the residuals of a fit; `period` is that of the load in s."""
+    """Test the residuals of a fit; `period` is the load's in s."""
     verdict = Verdict()
     _stuck(problem, fit, verdict)
     _noise_change(fit, verdict)
@@ -76,21 +54,21 @@ def judge(problem: Problem, fit: Fit, period: float) -> Verdict:
     _repeated(problem, fit, period, verdict)
     _other_law(problem, fit, verdict)
     for name, gain, deviation in zip(("fx", "fy", "m"), fit.shared[GAIN], fit.deviation[GAIN], strict=True):
-        excess = (abs(gain - 1.0) - MOST_GAIN) / max(deviation, 1e-9)
+        excess = (abs(gain - 1.0) - tuning.MOST_GAIN) / max(deviation, 1e-9)
         verdict.figures[f"gain_{name}"] = float(gain)
         if excess > 2.0:
             verdict.model.append(f"load {name}: {gain:.2f} times the load believed")
     if not fit.converged:
         verdict.figures["not_converged"] = 1.0
     if verdict.sensor:
-        # with a sensor that is wrong nothing can be said about the model
+        # a wrong sensor allows no verdict on the model
         verdict.model.clear()
     _scale(problem, fit, verdict)
     return verdict
 
 
 def judge_sensor(poses: Poses) -> list[str]:
-    """Return what the poses alone tell against the sensor: a value that stays, noise that changes."""
+    """Return faults of the sensor seen in the poses alone: a constant value, changing noise."""
     found = []
     for i, name in enumerate(COMPONENTS):
         column = poses.q[np.isfinite(poses.q[:, i]), i]
@@ -98,23 +76,23 @@ def judge_sensor(poses: Poses) -> list[str]:
             continue
         ends = np.flatnonzero(np.append(np.diff(column) != 0.0, True))
         longest = int(np.diff(np.append(-1, ends)).max())
-        if longest > STUCK_FOR_CERTAIN:
+        if longest > FEWEST_FOR_SCATTER:
             found.append(f"{name}: the same value {longest} times in a row")
         parts = np.array([noise_level(part[:, None])[0] for part in np.array_split(column, 5)])
         ratio = float(parts.max() / max(float(np.median(parts)), 1e-12))
-        if ratio > MOST_NOISE_RATIO:
+        if ratio > tuning.MOST_RATIO:
             found.append(f"{name}: the noise of one part of the window is {ratio:.1f} times that of the rest")
     return found
 
 
-def foretold(fit: Fit) -> NDArray[np.bool_]:
-    """Return which measurements the model can foretell, shape (n, 3)."""
+def predicted(fit: Fit) -> NDArray[np.bool_]:
+    """Return which measurements the model predicts, shape (n, 3)."""
     there: NDArray[np.bool_] = np.isfinite(fit.point.residual) & (fit.variance < 1.5 * fit.noise**2)
     return there
 
 
 def _colour(fit: Fit, verdict: Verdict) -> None:
-    there = foretold(fit)
+    there = predicted(fit)
     for i, name in enumerate(COMPONENTS):
         quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
         rows = fit.point.residual[there[:, i], i]
@@ -122,26 +100,26 @@ def _colour(fit: Fit, verdict: Verdict) -> None:
             continue
         ratio = float(np.mean(np.minimum(np.abs(rows), 5.0 * quick) ** 2) / quick**2)
         # the ratio's own scatter: mean square and median of third differences
-        limit = 1.0 + (MOST_COLOUR - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
+        limit = 1.0 + (tuning.MOST_RATIO - 1.0) + 4.0 * 2.5 / np.sqrt(len(rows))
         verdict.figures[f"colour_{name}"] = ratio
         if ratio > limit and not verdict.sensor:
             verdict.model.append(f"residual of {name}: {ratio:.2f} times its noise, expected at most {limit:.2f}")
 
 
 def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> None:
-    """Compare what the residuals have in common at the same phase of the load with what differs between periods.
+    """Test whether the residuals repeat with the load (analysis of variance).
 
-    An analysis of variance: what is left over by a wrong law, or a wrong shape of the load, comes again each period;
-    noise and disturbances do not, whatever their colour.
+    Residuals of a wrong law, or of a wrong shape of the load, repeat in each period; noise and disturbances do not,
+    whatever their colour.
     """
-    t, there = problem.window.poses.t, foretold(fit)
+    t, there = problem.window.poses.t, predicted(fit)
     turns = np.floor((t - t[0]) / period).astype(int)
-    phase = np.minimum(((t - t[0]) / period % 1.0 * PHASES).astype(int), PHASES - 1)
+    phase = np.minimum(((t - t[0]) / period % 1.0 * tuning.PHASES).astype(int), tuning.PHASES - 1)
     between, within, cells = 0.0, 0.0, 0
     freedom = 0
     for i in range(3):
         scale = fit.noise[i]
-        for k in range(PHASES):
+        for k in range(tuning.PHASES):
             inside = there[:, i] & (phase == k)
             means = (
                 np.array([fit.point.residual[inside & (turns == turn), i].mean() for turn in np.unique(turns[inside])])
@@ -157,22 +135,22 @@ def _repeated(problem: Problem, fit: Fit, period: float, verdict: Verdict) -> No
         return
     ratio = (between / cells) / (within / freedom)
     verdict.figures["repeated"] = ratio
-    if ratio > MOST_REPEATED and not verdict.sensor:
-        verdict.model.append(f"residuals repeat with the load: {ratio:.1f}, expected at most {MOST_REPEATED:g}")
+    if ratio > tuning.MOST_RATIO and not verdict.sensor:
+        verdict.model.append(f"residuals repeat with the load: {ratio:.1f}, expected at most {tuning.MOST_RATIO:g}")
 
 
 def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Tell how far toward another law the residuals would move the motion (score test, linearised).
+    """Test whether another law explains the residuals (score test, linearised).
 
-    One more unknown mixes the motion of the other law, from the same states, into that of the law believed; all others
-    are eliminated with it.
+    One more unknown mixes the motion of the other law, from the same states, into that of the law believed; all other
+    unknowns are eliminated.
     """
     unknowns = with_other_law(problem.unknowns)
     if unknowns is None or not fit.finished:
         return
     shared = fit.shared.copy()
     stiffness = unknowns.stiffness_of(float(shared[SOFTNESS]))
-    shared[DAMPING] = math.log(LAW_DAMPING * unknowns.critical_damping(stiffness))
+    shared[DAMPING] = math.log(tuning.LAW_DAMPING[0] * unknowns.critical_damping(stiffness))
     prior = problem.mean, problem.deviation
     forward, window = problem.forward.of(unknowns.scene), problem.window
     other = Problem(forward, unknowns, window, prior, problem.horizon, problem.turns, problem.drift)
@@ -184,29 +162,29 @@ def _other_law(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     step, covariance = joint_step(problem, fit, change, np.full(1, NO_PRIOR), np.zeros(1))
     moved = float(step[-1] / math.sqrt(covariance[-1, -1]))
     verdict.figures["law"] = moved
-    if abs(moved) > MOST_LAW_STEP and not verdict.sensor:
+    if abs(moved) > tuning.OUTLYING and not verdict.sensor:
         verdict.model.append(
-            f"residuals like those of another contact law: {moved:.1f}, expected at most {MOST_LAW_STEP:g}"
+            f"residuals like those of another contact law: {moved:.1f}, expected at most {tuning.OUTLYING:g}"
         )
 
 
 def _scale(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Return whether the sensor's scales are other ones; what a wrong model leaves over is told by other tests."""
+    """Test the sensor's scales; other tests find a wrong model."""
     if not fit.finished:
         return
     scales = scales_of(problem, fit)
     verdict.figures["scale"] = scales.chi2
-    if scales.chi2 > MOST_SCALE and not (verdict.sensor or verdict.model):
+    if scales.chi2 > tuning.MOST_SCALE and not (verdict.sensor or verdict.model):
         verdict.by_scale = True
         x, y, theta = scales.scale.tolist()
         verdict.sensor.append(
             f"scales of x, y, theta like {x:.3f}, {y:.3f}, {theta:.3f}: chi^2 {scales.chi2:.0f}, expected at most "
-            f"{MOST_SCALE:g}"
+            f"{tuning.MOST_SCALE:g}"
         )
 
 
 def quick_noise(residual: Array, swing: NDArray[np.int64]) -> float:
-    """Return the standard deviation of one component by the changes between neighbours of the same swing."""
+    """Return the standard deviation of a component by the changes between neighbours in a swing."""
     there = np.isfinite(residual)
     value, part = residual[there], swing[there]
     if len(value) < 10:
@@ -221,14 +199,17 @@ def _stuck(problem: Problem, fit: Fit, verdict: Verdict) -> None:
         column, residual = measured[:, i], fit.point.residual[:, i]
         there = np.isfinite(column)
         value, predicted = column[there], (column - residual)[there]
-        if len(value) < STUCK_ROWS:
+        if len(value) < tuning.STUCK[0]:
             continue
         ends = np.flatnonzero(np.append(np.diff(value) != 0.0, True))
         lengths = np.diff(np.append(-1, ends))
-        for end, length in zip(ends[lengths >= STUCK_ROWS], lengths[lengths >= STUCK_ROWS], strict=True):
+        for end, length in zip(ends[lengths >= tuning.STUCK[0]], lengths[lengths >= tuning.STUCK[0]], strict=True):
             span = predicted[end - length + 1 : end + 1]
             moved = float(np.nanmax(span) - np.nanmin(span)) if np.isfinite(span).any() else 0.0
-            if moved > STUCK_MOTION * max(noise_level(column[there][:, None])[0], 1e-5) or length > STUCK_FOR_CERTAIN:
+            if (
+                moved > tuning.STUCK[1] * max(noise_level(column[there][:, None])[0], 1e-5)
+                or length > FEWEST_FOR_SCATTER
+            ):
                 verdict.sensor.append(f"{name}: the same value {length} times in a row")
                 verdict.broken = True
                 break
@@ -245,13 +226,13 @@ def _noise_change(fit: Fit, verdict: Verdict) -> None:
             continue
         ratio = float(known.max() / np.median(known))
         verdict.figures[f"noise_ratio_{name}"] = ratio
-        if ratio > MOST_NOISE_RATIO:
+        if ratio > tuning.MOST_RATIO:
             verdict.sensor.append(f"{name}: the noise of one part of the window is {ratio:.1f} times that of the rest")
             verdict.broken = True
 
 
 def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
-    """Look for the moment from which on a bias, or a clearance, is another one (score test, linearised)."""
+    """Look for a moment at which a bias or a clearance changes (score test, linearised)."""
     if problem.window.swings < 6:
         return
     best: dict[str, tuple[float, Array]] = {}
@@ -268,19 +249,19 @@ def _change_within(problem: Problem, fit: Fit, verdict: Verdict) -> None:
     (bias, shift), (clearance, growth) = best["bias"], best["clearance"]
     share = max(bias, clearance) / max(_excess(fit), 1e-9)
     verdict.figures["change_share"] = share
-    if max(bias, clearance) < CHANGE_CHI2:
+    if max(bias, clearance) < tuning.CHANGE_CHI2:
         return
     found = len(verdict.sensor) + len(verdict.model)
-    if bias >= clearance and (np.abs(shift) * [1.0, 1.0, 0.2]).max() > CHANGE_M:
+    if bias >= clearance and (np.abs(shift) * [1.0, 1.0, 0.2]).max() > 0.5 * tuning.OBSERVED:
         verdict.sensor.append(f"shifted within the window by {shift[0]:.2g} m, {shift[1]:.2g} m, {shift[2]:.2g} rad")
-    elif clearance > bias and np.abs(growth).max() > CHANGE_M:
+    elif clearance > bias and np.abs(growth).max() > 0.5 * tuning.OBSERVED:
         verdict.model.append(f"machine changed within the window: clearances by {growth[0]:.2g} m, {growth[1]:.2g} m")
-    # what a wrong load or law leaves over looks like a change too, which explains little of it
-    verdict.broken |= len(verdict.sensor) + len(verdict.model) > found and share > CHANGE_SHARE
+    # the residuals of a wrong load or law look like a change too, which explains little of them
+    verdict.broken |= len(verdict.sensor) + len(verdict.model) > found and share > tuning.CHANGE_SHARE
 
 
 def _excess(fit: Fit) -> float:
-    """Return the sum of the residuals' squares beyond their quick noise, in those of the fit's variances."""
+    """Return the sum of squared residuals beyond their quick noise, over the fit's variances."""
     total = 0.0
     for i in range(3):
         quick = quick_noise(fit.point.residual[:, i], fit.point.swing)
@@ -290,7 +271,7 @@ def _excess(fit: Fit) -> float:
 
 
 def _changes(problem: Problem, fit: Fit, columns: NDArray[np.intp]) -> Iterator[tuple[Array, Array]]:
-    """Yield information and score of a change of some shared unknowns from each swing on, all else eliminated."""
+    """Yield information and score of a change of some shared unknowns at each swing, all others eliminated."""
     count = len(columns)
     size = SIZE + OWN * problem.window.swings
     cross, own, score = np.zeros((size, count)), np.zeros((count, count)), np.zeros(count)

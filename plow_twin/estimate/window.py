@@ -1,8 +1,8 @@
-"""Windows for the sliding estimate, formed from samples and poses as they come.
+"""Windows of the sliding estimate, formed from arriving samples and poses.
 
-Which windows there are follows from the stamps alone: each ends at a multiple of the interval and is formed once the
-newest sample of the load is later by the time that late ones are waited for. So the order of arrival within that time
-changes nothing, and the journal gives the same windows as the live node.
+The windows follow from the stamps alone: each ends at a multiple of the interval and is formed once the newest sample
+of the load is later by the waiting time for late data. The order of arrival within that time has no effect, so the
+journal gives the same windows as the live node.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from plow_twin.estimate import tuning
 from plow_twin.estimate.gaps import Gaps
 from plow_twin.estimate.measurements import (
     FEWEST_POSES,
-    LONGEST_GAP_S,
     UNSTATED,
     Deviation,
     Load,
@@ -27,24 +27,20 @@ from plow_twin.estimate.measurements import (
 from plow_twin.model.pairs import PAIR_COUNT
 
 Array = NDArray[np.float64]
-#: A stamp in ns and what was measured.
+#: A stamp in ns and the measured values.
 Row = tuple[int, tuple[float, ...]]
 
-#: Most poses, and gaps, that are kept: more come where the load has stopped, or another clock is ahead by hours.
+#: Bound: poses, and gaps, that are kept; more come where the load has stopped, or another clock is ahead by hours.
 MOST_KEPT = 600_000
-#: Share of the window's full length from which on it is worth an estimate.
-LEAST_SHARE = 0.5
-#: The same of early windows: a load period of a window of ten; and how much longer the next one is.
-EARLY_SHARE, EARLY_GROWTH = 0.1, 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """What was measured in [start_ns, end_ns); times in s count from `start_ns`.
+    """Measurements in [start_ns, end_ns); times in s count from `start_ns`.
 
-    samples, poses : numbers of rows as they came, before any is left out, `poses` those of gaps too
+    samples, poses : numbers of rows received; `poses` counts those of gaps too
     lost : rows left out
-    gaps : None where none were measured
+    gaps : None without measured gaps
     """
 
     start_ns: int
@@ -63,14 +59,13 @@ class Windows:
     Parameters
     ----------
     length_s, interval_s, wait_s : float
-        Full length of a window, distance of their ends, and how long late data are waited for, in s.
+        Full length of a window, distance of their ends, and waiting time for late data, in s.
     poses, load : tuple of 3 float
-        Stated deviations of what is measured; that of the load until another one is stated, that of the poses where
-        they bring no larger one.
+        Stated deviations: of the poses, at least; of the load, until `set_load_deviation` is called.
     gaps : float
         Stated deviation of a gap sensor in m.
     early : bool
-        Form shorter windows too, from `EARLY_SHARE` of the length on, until there are longer ones.
+        Form shorter windows too, from `tuning.WINDOW_SHARES[1]` of the length on, until there are longer ones.
     """
 
     def __init__(
@@ -90,28 +85,30 @@ class Windows:
         self.restart()
 
     def restart(self) -> None:
-        """Forget everything: stamps or machine are other ones from now on."""
+        """Drop all data: stamps or machine change."""
         self._loads: list[Row] = []
         self._poses: deque[tuple[int, tuple[float, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
         self._gaps: deque[tuple[int, tuple[int, ...], tuple[float, ...]]] = deque(maxlen=MOST_KEPT)
+        #: length [s] and rows of poses or gaps of the newest window that was looked at
+        self._left = (0.0, 0)
         self._newest_ns: int | None = None
         self._end_ns: int | None = None
         self._first_ns: int | None = None
 
-    def take_spread(self, deviation: Deviation) -> None:
-        """Take in how well the load is known from here on: Fx, Fy [N], M [N m]."""
+    def set_load_deviation(self, deviation: Deviation) -> None:
+        """Set the deviation of the load from here on: Fx, Fy [N], M [N m]."""
         self._load_deviation = deviation
 
-    def take_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
-        """Take in a measured pose x, y [m], theta [rad], NaN where not measured, with its deviations if known."""
+    def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
+        """Add a measured pose x, y [m], theta [rad], NaN where not measured, with its deviations if known."""
         self._poses.append((stamp_ns, q, deviation))
 
-    def take_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
-        """Take in measured gaps in m of the pairs with these numbers."""
+    def add_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
+        """Add measured gaps in m of the pairs with these numbers."""
         self._gaps.append((stamp_ns, pairs, gaps))
 
-    def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
-        """Take in a sample of the load Fx, Fy [N], M [N m]; return the window that is due now, if one is."""
+    def add_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> Window | None:
+        """Add a sample of the load Fx, Fy [N], M [N m]; return a window if it is due."""
         self._loads.append((stamp_ns, wrench))
         if self._newest_ns is not None and stamp_ns <= self._newest_ns:
             return None
@@ -126,23 +123,38 @@ class Windows:
         self._end_ns = end_ns
         return self._form(end_ns)
 
+    def last(self) -> Window | str:
+        """Return the window that ends with the newest sample, for nothing comes any more; or why there is none."""
+        if self._newest_ns is None:
+            return "got no load"
+        window = self._form(self._newest_ns + 1)
+        if window is not None:
+            return window
+        span_s, rows = self._left
+        least_s = tuning.WINDOW_SHARES[self._early] * self._length_ns * 1e-9
+        return (
+            f"got {span_s:.3g} s of load without a gap and {rows} poses or gaps in them, expected at least "
+            f"{least_s:.3g} s and {FEWEST_POSES}"
+        )
+
     def _early_end(self, stamp_ns: int) -> int:
         """Return the end of the longest early window that is due; they count from the first sample."""
         self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
-        span, end_ns = EARLY_SHARE * self._length_ns, self._first_ns
-        while span < LEAST_SHARE * self._length_ns and self._first_ns + round(span) <= stamp_ns - self._wait_ns:
+        least, early, growth = tuning.WINDOW_SHARES
+        span, end_ns = early * self._length_ns, self._first_ns
+        while span < least * self._length_ns and self._first_ns + round(span) <= stamp_ns - self._wait_ns:
             end_ns = self._first_ns + round(span)
-            span *= EARLY_GROWTH
+            span *= growth
         return end_ns
 
     def _form(self, end_ns: int) -> Window | None:
         start_ns = end_ns - self._length_ns
-        # what is older than this window is in none of those to come
+        # later windows need no older rows
         self._loads = [row for row in self._loads if row[0] >= start_ns]
         self._poses = deque((row for row in self._poses if row[0] >= start_ns), MOST_KEPT)
         self._gaps = deque((row for row in self._gaps if row[0] >= start_ns), MOST_KEPT)
         stamps = np.sort(np.array([row[0] for row in self._loads if row[0] < end_ns], dtype=np.int64))
-        gaps = np.flatnonzero(np.diff(stamps) > LONGEST_GAP_S * 1e9)
+        gaps = np.flatnonzero(np.diff(stamps) > tuning.LONGEST_GAP[0] * 1e9)
         if len(gaps):
             start_ns = int(stamps[gaps[-1] + 1])
         elif len(stamps):
@@ -150,7 +162,8 @@ class Windows:
         poses = [row for row in self._poses if start_ns <= row[0] < end_ns]
         measured = [row for row in self._gaps if start_ns <= row[0] < end_ns]
         most = max(len(poses), len(measured))
-        least = EARLY_SHARE if self._early else LEAST_SHARE
+        self._left = (end_ns - start_ns) * 1e-9, most
+        least = tuning.WINDOW_SHARES[self._early]
         if end_ns - start_ns < least * self._length_ns or most < FEWEST_POSES or len(stamps) < 2:
             return None
         rows = [row for row in self._loads if start_ns <= row[0] < end_ns]

@@ -1,8 +1,8 @@
-"""The sliding estimate in a process of its own, beside whoever takes in the samples and never in his way.
+"""The sliding estimate in its own process, so that it does not delay the samples.
 
-`Worker` is the near side: what it is given it only puts down; a thread hands it on. The far side, `python -m
-plow_twin.estimate.worker`, collects it, estimates each window that is due and sends back what was found. A window that
-became due while another one was computed gives way to a newer one.
+`Worker` is the near side: it queues data, which a thread sends. The far side, `python -m plow_twin.estimate.worker`,
+estimates each window that is due and sends the result back. A window that became due while another was computed gives
+way to a newer one.
 """
 
 from __future__ import annotations
@@ -32,14 +32,15 @@ from plow_twin.estimate.window import Window, Windows
 from plow_twin.model.law_modules import load_laws, loaded_laws
 from plow_twin.model.scene import Scene
 
-#: Interval at which what was put down is handed on [s].
-_HAND_ON_S: Final = 0.05
-#: Most that may wait to be handed on: the far side has stopped reading long before [items].
+#: Bound: interval at which queued data are sent [s].
+_SEND_S: Final = 0.05
+#: Bound: queued items; the far side has stopped reading long before.
 _MOST_WAITING: Final = 1_000_000
-#: How much the far side gives way to all others (`nice`).
+#: Bound: `nice` of the far side.
 _NICE: Final = 10
-#: The shortest slice that Linux gives, and the number of the call that asks for it.
+#: Definition: the shortest slice that Linux gives in ns, and the number of the system call for it.
 _SLICE_NS, _SCHED_SETATTR = 100_000, 314
+#: Bound: time in s for the far side to end.
 _STOP_S: Final = 5.0
 _ESTIMATE_ALONE: Final = Asked()
 
@@ -48,16 +49,16 @@ def _view(contents: dict[Any, Any]) -> MappingProxyType[Any, Any]:
     return MappingProxyType(contents)
 
 
-# a scene keeps its marks in a view, which pickle does not know
+# a scene keeps its marks in a mapping proxy, which pickle does not support
 ForkingPickler.register(MappingProxyType, lambda view: (_view, (dict(view),)))
 
 
 @dataclass(frozen=True)
 class Found:
-    """An estimate of one window: its bounds [ns], how many rows it had, what it started from, and what came out.
+    """The estimate of one window: its bounds [ns], numbers of rows, guess, and result.
 
-    wall_s : how long it took; skipped : windows before it that gave way; restarts : times that all began anew before it
-    text : all of it as JSON, with `forces` and `forecast` where they were asked for, which `also` has too
+    wall_s : duration of the computation; skipped : windows dropped before it; restarts : restarts before it
+    text : the whole answer as JSON, with `forces` and `forecast` if asked for, which `also` holds too
     """
 
     start_ns: int
@@ -74,22 +75,22 @@ class Found:
 
 
 class Worker:
-    """A process that estimates; `take_load`, `take_pose` and `restart` return at once, `poll` what has been found.
+    """A process that estimates; `add_load`, `add_pose` and `restart` return at once, `poll` returns a result.
 
     Parameters
     ----------
     scene : Scene
         The nominal scene.
     windows : Windows
-        What forms the windows, nothing in it yet; the process has a copy.
+        Forms the windows; empty, copied to the process.
     asked : Asked
-        What is wanted beside the estimate.
+        The answers to give beside the estimate.
     """
 
     def __init__(self, scene: Scene, windows: Windows, asked: Asked = _ESTIMATE_ALONE) -> None:
         near, far = Pipe()
         command = [sys.executable, "-m", "plow_twin.estimate.worker", str(far.fileno()), *loaded_laws()]
-        # one thread of linear algebra: it is to take no more than one core
+        # one thread of linear algebra: at most one core
         environment = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), "1")
         self._process = subprocess.Popen(
             command, pass_fds=[far.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, env=environment
@@ -100,53 +101,67 @@ class Worker:
         self._waiting: deque[tuple[Any, ...]] = deque()
         self._restarts = 0
         self._closed = threading.Event()
-        #: why nothing more is estimated; empty: it is
+        #: cause of the end of estimating; empty before
         self.error = ""
-        self._thread = threading.Thread(target=self._hand_on, name="estimate", daemon=True)
+        #: after `finish`, once all is done: why the last window could not be estimated, or empty
+        self.ended: str | None = None
+        self._thread = threading.Thread(target=self._send_queue, name="estimate", daemon=True)
         self._thread.start()
 
-    def take_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> None:
-        """Take in a sample of the load."""
+    def add_load(self, stamp_ns: int, wrench: tuple[float, ...]) -> None:
+        """Queue a sample of the load."""
         self._waiting.append(("load", stamp_ns, wrench))
 
-    def take_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
-        """Take in a measured pose, with its deviations where they are known."""
+    def add_pose(self, stamp_ns: int, q: tuple[float, ...], deviation: tuple[float, ...] = ()) -> None:
+        """Queue a measured pose, with its deviations if known."""
         self._waiting.append(("pose", stamp_ns, q, deviation))
 
-    def take_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
-        """Take in measured gaps of the pairs with these numbers."""
+    def add_gaps(self, stamp_ns: int, pairs: tuple[int, ...], gaps: tuple[float, ...]) -> None:
+        """Queue measured gaps of the pairs with these numbers."""
         self._waiting.append(("gaps", stamp_ns, pairs, gaps))
 
-    def take_spread(self, deviation: Deviation) -> None:
-        """Take in how well the load is known from here on."""
+    def set_load_deviation(self, deviation: Deviation) -> None:
+        """Queue the deviation of the load from here on."""
         self._waiting.append(("spread", deviation))
 
     def restart(self) -> None:
-        """Let the windows begin anew."""
+        """Drop all data and begin new windows."""
         self._restarts += 1
         self._waiting.append(("restart",))
 
+    def finish(self) -> None:
+        """Let the last window be estimated: nothing comes any more. Once that is done `ended` is no longer None."""
+        self._waiting.append(("end",))
+
+    @property
+    def behind(self) -> bool:
+        """Whether much waits to be handed on."""
+        return len(self._waiting) > _MOST_WAITING // 10
+
     def poll(self) -> Found | None:
-        """Return what has been found since the last call, if anything; what was before a restart is dropped."""
-        if self.error:
+        """Return the newest result since the last call, if any; results from before a restart are dropped."""
+        if self.error or self.ended is not None:
             return None
         if len(self._waiting) > _MOST_WAITING:
-            # the thread may be waiting for the far side to read
+            # the thread may wait for the far side to read
             self._process.kill()
             self._fail(f"the estimator did not read for {_MOST_WAITING} samples")
             return None
         try:
             if self._connection.poll():
-                found: Found = self._connection.recv()
+                found: Found | str = self._connection.recv()
+                if isinstance(found, str):
+                    self.ended = found
+                    return None
                 return found if found.restarts == self._restarts else None
         except (EOFError, OSError):
             code = self._process.poll()
-            if code is not None:  # else it is about to end: the next call says so
+            if code is not None:  # else it is about to end, and the next call finds the code
                 self._fail(f"the estimator ended with code {code}")
         return None
 
     def _fail(self, error: str) -> None:
-        """Estimate nothing more; what comes from now on is not kept."""
+        """Stop estimating and drop queued and later data."""
         self.error, self._waiting = error, deque(maxlen=0)
 
     def close(self) -> None:
@@ -161,35 +176,42 @@ class Worker:
         self._thread.join(_STOP_S)
         self._connection.close()
 
-    def _hand_on(self) -> None:
-        while not self._closed.wait(_HAND_ON_S):
-            taken = self._waiting
-            waiting = [taken.popleft() for _ in range(len(taken))]
+    def _send_queue(self) -> None:
+        while not self._closed.wait(_SEND_S):
+            queue = self._waiting
+            waiting = [queue.popleft() for _ in range(len(queue))]
             if waiting:
                 try:
                     self._connection.send(waiting)
-                except OSError:  # `poll` says why
+                except OSError:  # `poll` finds the cause
                     return
 
 
 def serve(connection: Connection) -> None:
-    """Estimate what comes until the other side is gone."""
+    """Estimate until the other side closes the connection."""
     scene, windows, asked = connection.recv()
     warm_up(scene)
     guess: Guess = ()
+    ended: str | None = None
     skipped = restarts = 0
     while True:
         due: Window | None = None
-        while due is None or connection.poll():
+        while ended is None and (due is None or connection.poll()):
             for item in connection.recv():
                 if item[0] == "restart":
                     windows.restart()
                     due, guess, restarts = None, (), restarts + 1
                     continue
-                formed = take(windows, item)
-                if formed is not None:
+                formed = windows.last() if item[0] == "end" else add(windows, item)
+                if item[0] == "end":
+                    ended = formed if isinstance(formed, str) else ""
+                if isinstance(formed, Window):
                     skipped += due is not None
                     due = formed
+        if due is None:
+            connection.send(ended)
+            connection.recv()  # until the other side is gone
+        assert due is not None
         begin = time.perf_counter()
         found = answer(scene, due, guess, asked)
         wall_s = time.perf_counter() - begin
@@ -198,22 +220,22 @@ def serve(connection: Connection) -> None:
         guess, skipped = found.following, 0
 
 
-def take(windows: Windows, item: tuple[Any, ...]) -> Window | None:
-    """Take in one item as `Worker` sends it; return the window that is due, if one is."""
+def add(windows: Windows, item: tuple[Any, ...]) -> Window | None:
+    """Add an item from `Worker`; return a window if it is due."""
     kind, *values = item
     if kind == "load":
-        return windows.take_load(*values)
+        return windows.add_load(*values)
     if kind == "pose":
-        windows.take_pose(*values)
+        windows.add_pose(*values)
     elif kind == "gaps":
-        windows.take_gaps(*values)
+        windows.add_gaps(*values)
     else:
-        windows.take_spread(*values)
+        windows.set_load_deviation(*values)
     return None
 
 
-def _take_short_slices() -> None:
-    """Ask for slices of 0.1 ms: who is due gets its core at their end (Linux 6.12, x86-64; others give longer ones)."""
+def _request_short_slices() -> None:
+    """Ask for slices of 0.1 ms, after which a waiting process gets the core (Linux 6.12, x86-64; else longer ones)."""
     if platform.machine() == "x86_64" and sys.platform == "linux":
         # struct sched_attr: size, policy, flags, nice, priority, runtime [ns], deadline, period
         attributes = struct.pack("IIQiIQQQ", 48, os.SCHED_OTHER, 0, _NICE, 0, _SLICE_NS, 0, 0)
@@ -222,10 +244,10 @@ def _take_short_slices() -> None:
 
 def main() -> None:
     """Run the far side; the arguments are the descriptor of its end, and modules of contact laws."""
-    # Ctrl-C goes to the whole group: the near side decides when this one ends
+    # Ctrl-C goes to the whole group; the near side ends this process
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICE)
-    _take_short_slices()
+    _request_short_slices()
     load_laws(sys.argv[2:])
     try:
         serve(Connection(int(sys.argv[1])))
@@ -234,7 +256,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # what is sent must be of the module as the other side imports it, not of `__main__`
+    # pickled classes must belong to the imported module, not to `__main__`
     from plow_twin.estimate import worker
 
     worker.main()

@@ -1,0 +1,182 @@
+"""How sensitive the estimate is to each chosen number: half and twice of it, on a few held-out truths.
+
+    python benchmark/tuning_sensitivity.py                     # what results/tuning.jsonl lacks
+    python benchmark/tuning_sensitivity.py --number HUBER
+
+Only numbers that an estimate reads are varied in it. The truths have four load periods and seeds on which nothing was
+set; `tools/pages.py` makes the table of `docs/estimation.md` from the result.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+import click
+import numpy as np
+from estimate import RESULTS, load_rows
+from estimate_truths import GROUPS, Truth, draw
+
+from plow_twin.estimate import tuning
+from plow_twin.estimate.estimate import estimate, warm_up
+from plow_twin.estimate.result import NORMAL_P95, State
+
+#: Groups of the truths, one truth each.
+CASES = ("plain", "shift", "exponent", "forces", "hard", "firm")
+SEED, PERIODS = 990100, 4.0
+FACTORS = (0.5, 2.0)
+FILE = RESULTS / "tuning.jsonl"
+
+
+class _Watched(ModuleType):
+    """A module that remembers which of its names are read."""
+
+    read: ClassVar[set[str]] = set()
+
+    def __getattribute__(self, name: str) -> Any:
+        _Watched.read.add(name)
+        return super().__getattribute__(name)
+
+
+def scaled(value: tuning.Value, factor: float, unit: str) -> tuning.Value:
+    """Return a number times a factor, all elements alike; of a quantile the distance from 1."""
+    if isinstance(value, tuple):
+        return tuple(scaled(part, factor, unit) for part in value)
+    if unit == "quantiles":
+        return max(1.0 - factor * (1.0 - float(value)), 0.0)
+    return max(round(factor * value), 1) if isinstance(value, int) else factor * value
+
+
+@contextmanager
+def varied(name: str, value: tuning.Value) -> Iterator[None]:
+    """Give a number another value for a while."""
+    before = getattr(tuning, name)
+    setattr(tuning, name, value)
+    try:
+        yield
+    finally:
+        setattr(tuning, name, before)
+
+
+def run(truth: Truth) -> dict[str, Any]:
+    """Return errors, intervals and states of one estimate; `failed` if it raises."""
+    try:
+        found = estimate(truth.nominal, truth.load, truth.poses, forces=truth.forces)
+    except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
+        return {"failed": f"{type(error).__name__}: {error}"}
+    row: dict[str, Any] = {"model": found.model, "sensor": found.sensor}
+    pairs = ((found.horizontal, found.horizontal_state), (found.vertical, found.vertical_state))
+    for axis, (value, state), true in zip("hv", pairs, truth.clearance.tolist(), strict=True):
+        row[axis] = [value.mean - true, value.p05 - true, value.p95 - true, state.value]
+    return row
+
+
+def known(row: dict[str, Any], axis: str) -> bool:
+    """Return whether a clearance was estimated."""
+    return axis in row and row[axis][3] in (State.ESTIMATED.value, State.ROUGH.value)
+
+
+def verdict(row: dict[str, Any]) -> list[Any]:
+    """Return what is said of a truth beside the numbers."""
+    return [row.get("failed"), row.get("model"), row.get("sensor"), *(row[axis][3] for axis in "hv" if axis in row)]
+
+
+def summary(name: str, factor: float, rows: list[dict[str, Any]]) -> str:
+    """Return the effect of one variation on the clearances and verdicts.
+
+    The largest change of a clearance in its standard deviations, RMSE over that with the chosen value, intervals that
+    hold of those known, and how many verdicts change.
+    """
+    base = {row["group"]: row for row in rows if row["name"] == ""}
+    own = [row for row in rows if row["name"] == name and row["factor"] == factor]
+    if not own:
+        return "not run" if not base or any(name in row["read"] for row in base.values()) else "not read"
+    pairs = np.array([
+        [row[axis][:3], base[row["group"]][axis][:3]]
+        for row in own
+        for axis in "hv"
+        if known(row, axis) and known(base[row["group"]], axis)
+    ])  # fmt: skip
+    changed = sum(verdict(row) != verdict(base[row["group"]]) for row in own)
+    verdicts = f"; {changed} of {len(own)} verdicts change" if changed else ""
+    if not len(pairs):
+        return f"no clearance known{verdicts}"
+    other, chosen = pairs[:, 0], pairs[:, 1]
+    if (other == chosen).all():
+        return f"same{verdicts}"
+    deviation = (chosen[:, 2] - chosen[:, 1]) / (2.0 * NORMAL_P95)
+    shift = float((np.abs(other[:, 0] - chosen[:, 0]) / deviation).max())
+    ratio = float(np.sqrt((other[:, 0] ** 2).sum() / (chosen[:, 0] ** 2).sum()))
+    width = float(np.median((other[:, 2] - other[:, 1]) / (chosen[:, 2] - chosen[:, 1])))
+    inside = int(((other[:, 1] <= 0.0) & (other[:, 2] >= 0.0)).sum())
+    return f"{shift:.2f}; {ratio:.2f}; {width:.2f}; {inside} of {len(pairs)}{verdicts}"
+
+
+def table() -> str:
+    """Return all chosen numbers with what they mean, what they were set on, and their sensitivity."""
+    rows = load_rows(FILE)
+    count = {group: sum(row["group"] == group and row["name"] != "" for row in rows) for group in CASES}
+    varied_in = ", ".join(f"`{group}` {number}" for group, number in count.items() if number)
+    lines = [f"Estimates with a varied number, by group of the truth: {varied_in or 'none yet'}.", ""]
+    lines += ["| number | value | where it acts | set on | half of it | twice |", "|---|---|---|---|---|---|"]
+    for entry in tuning.entries():
+        half, twice = (summary(entry.name, factor, rows) for factor in FACTORS)
+        value = _short(entry.value) if entry.tuned.unit == "1" else f"{_short(entry.value)} {entry.tuned.unit}"
+        cells = (f"`{entry.name}`", value, entry.tuned.meaning, entry.tuned.basis, half, twice)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _short(value: tuning.Value) -> str:
+    if isinstance(value, (tuple, np.ndarray)):
+        return ", ".join(_short(part) for part in value)
+    return f"{value:,}" if isinstance(value, int) else f"{value:g}"
+
+
+@click.command()
+@click.option("--number", "numbers", multiple=True, help="Only these numbers.")
+@click.option("--case", "cases", multiple=True, type=click.Choice(CASES), help="Only these truths.")
+@click.option("--out", type=click.Path(path_type=Path), default=FILE, show_default=True)
+def main(numbers: tuple[str, ...], cases: tuple[str, ...], out: Path) -> None:
+    """Vary the numbers and write one line of JSON an estimate."""
+    done = {(row["group"], row["name"], row["factor"]) for row in load_rows(out)}
+    warm_up(draw(replace(GROUPS["plain"], periods=1.0), 0).nominal)
+    for group in cases or CASES:
+        truth = draw(replace(GROUPS[group], periods=PERIODS), SEED)
+        base, read = watched(truth)
+        if (group, "", 1.0) not in done:
+            write(out, {"group": group, "name": "", "factor": 1.0, "read": read, **base})
+        for entry in tuning.entries():
+            if entry.name not in read or (numbers and entry.name not in numbers):
+                continue
+            for factor in FACTORS:
+                if (group, entry.name, factor) not in done:
+                    with varied(entry.name, scaled(entry.value, factor, entry.tuned.unit)):
+                        row = run(truth)
+                    write(out, {"group": group, "name": entry.name, "factor": factor, **row})
+
+
+def watched(truth: Truth) -> tuple[dict[str, Any], list[str]]:
+    """Run with the chosen values; return which of them were read too."""
+    _Watched.read.clear()
+    before, tuning.__class__ = tuning.__class__, _Watched
+    try:
+        row = run(truth)
+    finally:
+        tuning.__class__ = before
+    return row, sorted(_Watched.read & {entry.name for entry in tuning.entries()})
+
+
+def write(out: Path, row: dict[str, Any]) -> None:
+    """Append a row."""
+    with out.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row) + "\n")
+
+
+if __name__ == "__main__":
+    main()
