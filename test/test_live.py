@@ -6,6 +6,7 @@ import gc
 import json
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -13,6 +14,7 @@ import sys
 import tempfile
 import time
 import tracemalloc
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
@@ -54,7 +56,7 @@ from plow_twin.record.unused import unused_messages
 from plow_twin.record.writer import RunWriter
 from plow_twin.scene_file import load_scene
 from plow_twin.stream.intake import Verdict
-from plow_twin.stream.journal import Gaps, Mark, Parameter, PartOfPose, Pose
+from plow_twin.stream.journal import Gaps, Mark, Parameter, PartOfPose, Pose, Unused
 from plow_twin.stream.limits import pose_limits, value_limits
 from plow_twin.view.run_curves import RunCurves
 
@@ -837,14 +839,16 @@ def test_prometheus_reads_the_numbers_of_the_diagnostics(tmp_path: Path) -> None
             found = dict(line.split() for line in page.read().decode().splitlines() if not line.startswith("#"))
         assert (found["plow_twin_input_samples_used"], found["plow_twin_state_level"]) == ("100.0", "0.0")
         assert "plow_twin_state_scene" not in found  # a text
+        board = (ROOT / "config" / "grafana.json").read_text()
+        shown = set(re.findall(r"plow_twin_\w+", " ".join(_expressions(json.loads(board)))))
+        assert len(shown) > 15 and shown <= found.keys(), shown - found.keys()
         assert run_cli(["live", str(path), "--metrics", str(port), "--quiet"]) == 1  # the port is taken
         assert live.stop() == 0
 
 
-def test_an_older_paho_is_named_with_the_version_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "paho.mqtt.enums", None)  # as in 1.6
-    with pytest.raises(BridgeError, match=r"paho-mqtt: got 2\..*, expected 2.0 or newer"):
-        Mqtt(Access("mqtt://localhost"))
+def _expressions(board: dict[str, Any]) -> list[str]:
+    """Return the queries of a board for Grafana."""
+    return [target["expr"] for panel in board["panels"] for target in panel["targets"]]
 
 
 def test_poses_gaps_and_speeds_that_cannot_be_are_not_used() -> None:
@@ -904,6 +908,152 @@ def test_failed_advances_are_no_success_in_any_view_of_a_run(
     curves = RunCurves.of(RunReader(run))
     assert np.allclose(curves.failed_s, [(0.681, 0.690)]) and curves.failed == 10
     assert replay(run).exit_code == 0
+
+
+def _mistaken(name: str) -> str:
+    """Return a file as a plant engineer may have it, with a mistake."""
+    rows = [_row(index)[1:] for index in range(3000)]
+    lines = {
+        "decimal commas": lambda t, f: f"{t:.3f},{f[0]:.1f},{f[1]:.1f},{f[2]:.1f}".replace(".", ","),
+        "local dates": lambda t, f: f"25.10.2026 02:59:{t:06.3f},{f[0]},{f[1]},{f[2]}",
+        "coarse times": lambda t, f: f"{t:.1f},{f[0]},{f[1]},{f[2]}",
+        "newest first": lambda t, f: f"{100.0 - t},{f[0]},{f[1]},{f[2]}",
+        "swapped": lambda t, f: f"{f[0]},{t},{f[1]},{f[2]}",
+        "days": lambda t, f: f"{45000.0 + t / 86400.0:.9f},{f[0]},{f[1]},{f[2]}",
+        "km/h": lambda t, f: f"{t},{f[0]},{f[1]},{f[2]},7.2",
+        "bars": lambda t, f: f"{t}|{f[0]}|{f[1]}|{f[2]}",
+        "summer time": lambda t, f: f"2026-10-25T02:{59 * (t < 1.0):02d}:{t - (t >= 1.0):09.6f},{f[0]},{f[1]},{f[2]}",
+    }
+    text = "\n".join(lines[name](1e-3 * index, load) for index, load in enumerate(rows))
+    header = {"km/h": "t,fx,fy,m,speed", "bars": "t|fx|fy|m"}.get(name, "t,fx,fy,m")
+    return f"{header}\n{text}\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "said"),
+    [
+        ("decimal commas", 3, "3000 malformed; the first: load has a line without the 4 cells of its header"),
+        ("local dates", 3, "load has no time at 't': got '25.10.2026 02:59:00.000', expected a number or a date"),
+        ("coarse times", 3, "stamps came twice: have the times too few digits?"),
+        ("newest first", 2, "they look like rows from the newest to the oldest: sort the rows by time"),
+        ("swapped", 2, "t: got stamps of which"),
+        ("days", 2, "they look like days of a spreadsheet: write seconds, or dates"),
+        ("km/h", 2, "speed: got 7.2, expected at most 5 m/s, as ploughs reach; they look like km/h"),
+        ("bars", 1, "expected the columns fx, fy, m with commas, semicolons or tabs between them"),
+        ("summer time", 0, "the stamps jumped back (1), and the motion began anew: is it local time"),
+    ],
+)
+def test_a_natural_mistake_in_a_file_is_named(
+    name: str, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "load.csv").write_text(_mistaken(name))
+    assert run_cli(["live", str(tmp_path / "load.csv"), "--scene", "paper", "--quiet"]) == code
+    assert said in capsys.readouterr().err
+
+
+def test_utf16_a_folder_that_is_taken_and_a_threshold_in_kilonewtons_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = _csv(tmp_path / "load.csv", 100)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    words = ["live", str(path), "--scene", "paper", "--quiet", "--set", "alarm_force=[160, 220]"]
+    assert run_cli([*words, "--record", str(tmp_path / "run")]) == 0
+    shown = capsys.readouterr().err
+    assert f"run is not empty: the recording goes to {tmp_path / 'run_2'}" in shown
+    assert "alarm_force: got 160 N, expected some 3.2e+04 N as in the scene; is it in kN?" in shown
+    path.write_text(path.read_text(), encoding="utf-16")
+    assert run_cli(words) == 1
+    assert "load.csv: got UTF-16 text, expected UTF-8" in capsys.readouterr().err
+
+
+def _troubled_rows(seed: int, count: int) -> Iterator[str]:
+    """Yield rows of a file: mostly a load that goes on, and now and then something that is not as usual."""
+    rng = np.random.default_rng(seed)
+    kinds = ["gap", "late", "twice", "stray", "text", "empty", "wild", "pose", "header", "integer", "triple"]
+    stamp = 500.0
+    for row_number in range(count):
+        kind = "back" if row_number == count // 2 else str(rng.choice([*["usual"] * 600, *kinds]))
+        stamp += 5.0 if kind == "gap" else 1e-3
+        load = np.sin(2.0 * stamp) * np.array(PAPER_AMPLITUDE) * (3.0 if kind == "triple" else 1.0)
+        at = {"late": stamp - rng.integers(2, 300) * 1e-3, "stray": stamp + 100.0, "back": stamp - 50.0}.get(
+            kind, stamp
+        )
+        stamp = at if kind == "back" else stamp
+        row = ",".join([f"{at:.6f}", *(f"{value:.3f}" for value in load)]) + ",,,"
+        match kind:
+            case "twice":
+                row += "\n" + row
+            case "text":
+                row = "no numbers at all"
+            case "empty":
+                row = f"{at:.6f},,,,,,"
+            case "wild":
+                row = f"{at:.6f},1e9,0,0,,,"
+            case "pose":
+                row = f"{at:.6f},,,,0.001,,0.002"
+            case "header":
+                row = "t,fx,fy,m,x,y,theta"
+            case "integer":
+                row = f"{int(at)},0,0,0,,,"
+        yield row + "\n"
+
+
+def _recorded(run: Path) -> tuple[list[Any], list[Any]]:
+    """Return journal and outputs of a recording, each output with the number of entries before it.
+
+    Without what the time on the wall decides: the status, and when unused messages are noted.
+    """
+    entries: list[EntryRecord] = []
+    outputs = []
+    for batch in RunReader(run).batches():
+        records = [batch.entries.record(index) for index in range(len(batch.entries))]
+        entries += [record for record in records if not isinstance(record.entry, Unused)]
+        outputs += [part.record(index) for part in batch.outputs for index in range(len(part))]
+    numbers = [record.sequence for record in entries]
+    found = [
+        (bisect_right(numbers, record.sequence), record.topic, record.data)
+        for record in outputs
+        if record.topic != "/status"
+    ]
+    return [record.entry for record in entries], found
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("given", [{}, {"record_outputs": "decimated"}])
+def test_a_file_gives_the_same_journal_outputs_and_counts_in_batches_as_row_by_row(
+    seed: int, given: dict[str, Any], tmp_path: Path
+) -> None:
+    columns = "t,fx,fy,m" if seed % 2 else "t,fx,fy,m,x,y,theta"
+    rows = [line.removesuffix(",,,\n") + "\n" if seed % 2 else line for line in _troubled_rows(seed, 4000)]
+    path = tmp_path / "load.csv"
+    path.write_text(f"{columns}\n{''.join(rows)}")
+    found = []
+    for name in ("together", "single"):
+        values = given | {"record_path": str(tmp_path / name), "alarm_force": [1e3, 1e5]}
+        settings = parameters.settings(values)
+        prepared = Preparation(settings).result(lambda: False)
+        front = BridgeFront(Files([path], follow=False), None, settings, prepared, lambda *_: None, pytest.fail)
+        if name == "single":
+            front.attach(_Onlooker())  # who looks on sees each sample
+        front.run(lambda: False)
+        figures = front.parts()
+        counts = {key: figures["input"][2][key] for key in figures["input"][2] if not key.endswith(("_s", "_ms"))}
+        digest = front.runtime.driver.session.twin.digest()
+        published = front.runtime.publishing
+        found.append((*_recorded(tmp_path / name), counts, digest, published.published, published.latency.count))
+        assert replay(tmp_path / name).exit_code == 0
+    together, single = found
+    assert len(together[0]) == len(single[0]) > 3500
+    for one, other in zip(together, single, strict=True):
+        assert one == other
+
+
+class _Onlooker:
+    """Somebody who looks on and does nothing."""
+
+    def publication(self, published: Any) -> None: ...
+    def part(self, name: str, part: Part) -> None: ...
 
 
 def test_a_stop_before_the_end_of_a_file_is_a_loss(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def _publication(
 
 def _changes(alarms: Alarms, published: Published) -> bool:
     """Tell whether a publication changes a level."""
-    return list(alarms.take(published)) == [0]
+    return list(alarms.feed(published)) == [0]
 
 
 def _levels(alarms: Alarms) -> tuple[Level, Level]:
@@ -76,10 +76,10 @@ def test_a_residual_is_that_at_the_stamp_of_the_pose_early_and_late_alike() -> N
     for stamp_ms in range(0, 100, 10):
         _changes(alarms, moved(stamp_ms))
     # between two publications, where the model was then and not where it is now
-    assert not alarms.take_pose(35 * MS, (0.036, 0.0, 0.0))
+    assert not alarms.feed_pose(35 * MS, (0.036, 0.0, 0.0))
     assert abs(alarms.alarms["residual"].value - 0.001) < 1e-12
     # ahead of the model: it waits for it
-    assert not alarms.take_pose(105 * MS, (0.110, 0.0, 0.0))
+    assert not alarms.feed_pose(105 * MS, (0.110, 0.0, 0.0))
     assert not _changes(alarms, moved(100))
     assert _changes(alarms, moved(110))
     assert alarms.levels["residual"] == (Level.WARN, Level.WARN)
@@ -108,7 +108,7 @@ def test_many_publications_at_once_raise_what_they_raise_one_by_one(names: tuple
     expected = [(index, one.levels) for index, publication in enumerate(run) if _changes(one, publication)]
     found = []
     for first in range(0, len(run), 250):
-        changes = many.take(Published.joined(run[first : first + 250]))
+        changes = many.feed(Published.joined(run[first : first + 250]))
         found += [(first + index, many.levels) for index in changes]
         assert first + 250 < len(run) or many.alarms == one.alarms
     assert found == expected and bool(names) == bool(expected)

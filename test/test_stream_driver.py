@@ -359,7 +359,7 @@ def test_whatever_comes_single_calls_of_the_session_give_the_bits_of_the_driver_
     for call in _troubled(3, 3000):
         for published in calls(*call):
             follow()
-            same = single.outputs.take()
+            same = single.outputs.pop()
             assert len(same.rows) == len(published.rows)
             if len(published.rows):
                 sent = [(topic, bytes(data)) for topic, data in messages.write(published)]

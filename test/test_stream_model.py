@@ -59,7 +59,7 @@ def _again(scene: Scene, entries: list[Entry]) -> list[Entry]:
         found = from_message(to_message(entry, ""))
         assert found == entry
         session.apply(found)  # type: ignore[arg-type]
-        session.outputs.take()
+        session.outputs.pop()
     session.close()
     return emitted
 

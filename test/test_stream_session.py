@@ -62,7 +62,7 @@ class Run:
     def apply(self, entries: list[Entry], take: bool = True) -> Run:
         for entry in entries:
             self.session.apply(entry)
-            if take and len((published := self.session.outputs.take()).rows):
+            if take and len((published := self.session.outputs.pop()).rows):
                 self.publications.append(published)
         return self
 

@@ -30,7 +30,7 @@ from plow_twin.stream.journal import (
     Spread,
     whole_pose,
 )
-from plow_twin.stream.session import Session
+from plow_twin.stream.session import Series, Session
 
 #: Published topics, by base name.
 ESTIMATE, WINDOW_FORCES, FORECAST = ESTIMATES
@@ -72,19 +72,38 @@ class Estimation:
         """Why nothing more is estimated; empty: it is."""
         return self._worker.error
 
+    def finish(self) -> None:
+        """Let the last window be estimated: the source has ended."""
+        self._worker.finish()
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is estimated any more: the last window has been, or the process has failed."""
+        return self._worker.ended is not None or bool(self.error)
+
+    @property
+    def shortage(self) -> str:
+        """Why nothing was estimated at all; empty: something was, or the source has not ended."""
+        return "" if self.count else self._worker.ended or ""
+
+    @property
+    def behind(self) -> bool:
+        """Whether much waits to be read by the estimate."""
+        return self._worker.behind
+
     def take(self, entry: Entry) -> None:
         """Hand an entry that the session has accepted to the estimate."""
         match entry:
             case Sample(stamp_ns, wrench):
-                self._worker.take_load(stamp_ns, wrench)
+                self._worker.add_load(stamp_ns, wrench)
             case Pose(stamp_ns, pose, deviation):
-                self._worker.take_pose(stamp_ns, pose, deviation)
+                self._worker.add_pose(stamp_ns, pose, deviation)
             case PartOfPose(stamp_ns) as part:
-                self._worker.take_pose(stamp_ns, whole_pose(part))
+                self._worker.add_pose(stamp_ns, whole_pose(part))
             case Gaps(stamp_ns, pairs, gaps):
-                self._worker.take_gaps(stamp_ns, pairs, gaps)
+                self._worker.add_gaps(stamp_ns, pairs, gaps)
             case Spread(_, deviation):
-                self._worker.take_spread(deviation)
+                self._worker.set_load_deviation(deviation)
             case SetWear(stamp_ns):
                 self._worker.restart()
                 self._forget()
@@ -99,6 +118,11 @@ class Estimation:
                 self._worker.restart()
                 if self._follows:
                     self._forget()
+
+    def take_series(self, series: Series) -> None:
+        """Hand samples that have been applied at once to the estimate."""
+        for stamp_ns, wrench in zip(series.stamps.tolist(), series.wrench.tolist(), strict=True):
+            self._worker.add_load(stamp_ns, tuple(wrench))
 
     def poll(self, session: Session) -> dict[str, plain.JointState]:
         """Hand an estimate that has come to the session; return its messages by topic; empty without an estimate.

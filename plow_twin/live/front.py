@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Protocol
@@ -11,19 +13,21 @@ from typing import Any, Final, Protocol
 from plow_twin.errors import UnitError
 from plow_twin.live import diagnostics
 from plow_twin.live.bridge.feeder import Feeder
-from plow_twin.live.bridge.source import BATCH, Bridge, BridgeError, Reporting
+from plow_twin.live.bridge.source import Bridge, BridgeError, Messages, Reporting
 from plow_twin.live.load_model import read_load_model
 from plow_twin.live.parameters import Settings
 from plow_twin.live.part import Part
 from plow_twin.live.runtime import Runtime
 from plow_twin.live.solver_start import Prepared
 from plow_twin.live.timer import Timer
+from plow_twin.record.alarms import ALARMS, alarms_message
 from plow_twin.record.map_file import OPCUA
 from plow_twin.record.mapping import Role, read_map, stamps_by, with_units
 from plow_twin.record.messages import DiagnosticStatus, JointState, Message
-from plow_twin.record.sources import Arrived
+from plow_twin.record.sources import Columns
 from plow_twin.record.times import time_text
 from plow_twin.record.unit_check import CHECKED, check_units
+from plow_twin.stream.intake import Verdict
 from plow_twin.stream.outputs import Published
 from plow_twin.stream.topics import TOPICS
 
@@ -31,6 +35,8 @@ NAME: Final = "/plow_twin"
 #: Longest wait for a message [s]: a request to stop is seen within it.
 _POLL_S: Final = 0.1
 _REPORT_S: Final = 1.0
+#: Share of the samples from which on a likely cause is named why they are not used.
+_MANY: Final = 0.01
 
 #: Receives `status`, `alarms` or a part of the diagnostics by name, with level, message and values.
 Say = Callable[[str, Part], None]
@@ -91,9 +97,9 @@ class BridgeFront:
         model = read_load_model(mapping)
         self.roles = _roles(bridge, mapping, settings.excitation_source, model is not None, units)
         bridge.start([role.topic for role in self.roles.values()], stamps_by(self.roles.values()))
-        self._first = list(_first_messages(bridge)) if bridge.ends else []
+        self._first = deque(_first_messages(bridge) if bridge.ends else ())
         try:
-            check_units(self._first, self.roles, prepared.scene, "input")
+            check_units(chain.from_iterable(self._first), self.roles, prepared.scene, "input")
         except UnitError:
             bridge.close()
             raise
@@ -103,12 +109,18 @@ class BridgeFront:
         self._health = diagnostics.Health()
         #: what has its turn while the source is read
         self.timers: list[Timer] = []
-        self._watcher: Watcher | None = None
+        self._watchers: list[Watcher] = []
+        #: further parts of the diagnostics, by name
+        self.more_parts: dict[str, Callable[[], Part]] = {}
 
     def attach(self, watcher: Watcher) -> None:
         """Let somebody look on from now on."""
-        self._watcher = watcher
-        self.runtime.publishing.watch = watcher.publication
+        self._watchers.append(watcher)
+        self.runtime.publishing.watch = self._published
+
+    def _published(self, published: Published) -> None:
+        for watcher in self._watchers:
+            watcher.publication(published)
 
     def now_ns(self) -> int:
         """Return the system's time, or that of the samples where they bring their own [ns]."""
@@ -126,8 +138,8 @@ class BridgeFront:
 
     def _tell(self, name: str, part: Part) -> None:
         self._say(name, part)
-        if self._watcher is not None:
-            self._watcher.part(name, part)
+        for watcher in self._watchers:
+            watcher.part(name, part)
 
     def look_for_senders(self, topic: str) -> None:
         """Do nothing: the feeder knows its sender."""
@@ -158,7 +170,7 @@ class BridgeFront:
         runtime, bridge = self.runtime, self._bridge
         lost: list[str] = []
         try:
-            self._feeder.begin(self._first)
+            self._feeder.begin(chain.from_iterable(self._first))
             runtime.start()
             runtime.activate()
             self._loop(stop_asked, time.monotonic() + seconds)
@@ -176,12 +188,41 @@ class BridgeFront:
             return [f"no sample came on {topic}"]
         if stopped and self._bridge.ends and (self._first or not self._bridge.finished):
             return [f"stopped before the end of {topic}"]
+        estimation = self.runtime.estimation
+        if estimation is not None and self._bridge.finished:
+            if not estimation.done:
+                return ["stopped before the estimate of the last window"]
+            return [f"estimate: {estimation.shortage}"] if estimation.shortage else []
         return []
+
+    def causes(self) -> list[str]:
+        """Return, in words, likely causes of samples that were not used or began the motion anew."""
+        counts, found = self.runtime.driver.intake.counts, []
+        many = _MANY * max(1, sum(counts.values()))
+        if self._feeder.unfit:
+            found.append(f"{counts[Verdict.MALFORMED]} malformed; the first: {self._feeder.unfit}")
+        if counts[Verdict.DUPLICATE] > many:
+            found.append(f"{counts[Verdict.DUPLICATE]} stamps came twice: have the times too few digits?")
+        if counts[Verdict.IMPLAUSIBLE] > many:
+            most = self.runtime.driver.intake.limits
+            force = "" if most is None else f" (forces to {most.largest[0]:.3g} N, by {most.fastest[0]:.3g} N/s)"
+            found.append(
+                f"{counts[Verdict.IMPLAUSIBLE]} loads are larger or change faster than plausible{force}: "
+                "is the unit of load or time another one? Else set limit_force and its like"
+            )
+        jumps = counts[Verdict.JUMP_BACK]
+        if jumps and self._bridge.ends:
+            found.append(
+                f"the stamps jumped back ({jumps}), and the motion began anew: is it local time, where summer time "
+                "ends? Expected UTC, or stamps with their offset"
+            )
+        return found
 
     def parts(self) -> dict[str, Part]:
         """Return the diagnostics by part."""
         parts = self._health.parts("active", "", self.runtime, time.monotonic_ns())
-        return parts | ({"source": self._bridge.part()} if isinstance(self._bridge, Reporting) else {})
+        parts |= {"source": self._bridge.part()} if isinstance(self._bridge, Reporting) else {}
+        return parts | {name: part() for name, part in self.more_parts.items()}
 
     def _loop(self, stop_asked: Callable[[], bool], give_up: float) -> None:
         inputs, bridge, trouble = self.runtime.inputs, self._bridge, ""
@@ -195,28 +236,37 @@ class BridgeFront:
                 trouble = bridge.trouble
                 self.say_error(trouble or "the source is connected again")
             inputs.publishers |= dict.fromkeys(self._connected, int(bridge.connected))
-            if messages:
+            if len(messages):
                 if not bridge.ends:
-                    inputs.waited(len(messages), (time.time_ns() - messages[0].log_time_ns) * 1e-9)
+                    inputs.waited(len(messages), (time.time_ns() - next(iter(messages)).log_time_ns) * 1e-9)
                 self._feeder.feed(messages)
             for timer in periodic:
                 timer.look()
         if self._settings.publish_mode == "fixed_rate":
             self.runtime.publish_due()
+        estimation = self.runtime.estimation
+        if estimation is not None and bridge.finished and not stop_asked():
+            inputs.ended = True
+            estimation.finish()
+            while not (estimation.done or stop_asked() or time.monotonic() >= give_up):
+                time.sleep(_POLL_S)
+                for timer in periodic:
+                    timer.look()
         self.changed()
-        if self._watcher is not None:
-            for name, part in self.parts().items():
-                self._watcher.part(name, part)
+        for name, part in self.parts().items() if self._watchers else ():
+            for watcher in self._watchers:
+                watcher.part(name, part)
 
-    def _messages(self, timeout_s: float) -> list[Arrived]:
+    def _messages(self, timeout_s: float) -> Messages:
         """Return the next messages: first those that the check of units has read already."""
         if not self._first:
             return self._bridge.poll(timeout_s)
-        messages, self._first = self._first[:BATCH], self._first[BATCH:]
-        return messages
+        return self._first.popleft()
 
     def _report(self) -> None:
         self.changed()
+        # sent on change of a level only, but their values are of interest
+        self.send(ALARMS, alarms_message(self.runtime.alarms, self.name, self._settings.hardware_id))
         for name, part in self.parts().items():
             self._tell(name, part)
 
@@ -225,12 +275,12 @@ def _load_role(roles: Mapping[str, Role]) -> str:
     return "drive" if "drive" in roles else "excitation"
 
 
-def _first_messages(bridge: Bridge) -> Iterator[Arrived]:
+def _first_messages(bridge: Bridge) -> Iterator[Messages]:
     """Yield the messages that the check of units looks at."""
     count = 0
-    while count < CHECKED and (found := bridge.poll(0.0)):
+    while count < CHECKED and len(found := bridge.poll(0.0)):
         count += len(found)
-        yield from found
+        yield found
 
 
 def _roles(
@@ -250,7 +300,12 @@ def _roles(
     if source == "excitation" and not {"drive", "excitation"} & roles.keys():
         # whatever stands there: it may be no text at all
         there = "; ".join(f"{topic} ({str(kind)[:120]})" for topic, kind in (topics or {}).items())
-        raise BridgeError(f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m")
+        single = any(isinstance(kind, Columns) and len(kind.names) == 1 for kind in (topics or {}).values())
+        between = " with commas, semicolons or tabs between them" if single else ""
+        setup = "" if topics is None else "; plow-twin setup FILE writes a mapping"
+        raise BridgeError(
+            f"excitation: got no load by names or mapping in {there}, expected the columns fx, fy, m{between}{setup}"
+        )
     return with_units(roles, units)
 
 

@@ -61,6 +61,8 @@ class Inputs:
         self.depth = depth
         #: whether samples are taken
         self.active = False
+        #: whether the source has ended
+        self.ended = False
         #: whether the journal is open: with a clock, or with the first sample
         self.started = False
         #: senders of the selected source
@@ -98,6 +100,8 @@ class Inputs:
 
     def silent(self) -> list[str]:
         """Return the optional inputs that have been heard and are silent now."""
+        if self.ended:
+            return []
         now_ns = time.monotonic_ns()
         return [topic for topic, heard_ns in self._heard_ns.items() if now_ns - heard_ns > _SILENT_NS]
 

@@ -192,6 +192,19 @@ class Settings:
     wear_save_period: float = _number(10.0, "s", 0.1, 3600.0, Effect.CONFIGURE, "interval at which the wear is saved")
     frame_id: str = _plain("slide_frame", Effect.CONFIGURE, "frame of all outputs: centre of the slide, x right, y up")
     child_frame_id: str = _plain("head_frame", Effect.CONFIGURE, "frame of the head in head_state")
+    marker_rate: float = _number(
+        0.0,
+        "Hz",
+        0.0,
+        100.0,
+        Effect.CONFIGURE,
+        "rate of the topic markers: walls, pads and forces for RViz; needs visualization_msgs; 0: off; the node only",
+    )
+    tf: bool = _plain(
+        False,
+        Effect.CONFIGURE,
+        "with the markers, the head's pose on /tf, from frame_id to child_frame_id; needs tf2_msgs; the node only",
+    )
     record_path: str = _plain(
         "",
         Effect.CONFIGURE,

@@ -16,6 +16,7 @@ from plow_twin.solve.totals import summary
 from plow_twin.stream.alarms import Alarms
 from plow_twin.stream.health import DurationHistogram
 from plow_twin.stream.outputs import Published, Rows
+from plow_twin.stream.session import Series
 
 if TYPE_CHECKING:
     from plow_twin.live.recording import Recording
@@ -110,6 +111,8 @@ class Publishing:
         self.held_frames = self.corrected_frames = 0
         #: steady time at which the samples of the next publication were received [ns]; 0: it answers no message
         self.received_ns = 0
+        #: stamp of the sample of a series whose alarms are being said [ns]
+        self.series_ns: int | None = None
         self._newest: Rows | None = None
         #: takes each publication beside the front, where somebody watches
         self.watch: Callable[[Published], object] | None = None
@@ -118,6 +121,11 @@ class Publishing:
     def q(self) -> NDArray[np.float64] | None:
         """Newest pose that was published: x, y [m], theta [rad]."""
         return None if self._newest is None else self._newest["q"][0]
+
+    @property
+    def newest(self) -> Rows | None:
+        """Newest row that was published, shape (1,); the next one takes its place."""
+        return self._newest
 
     @property
     def memory(self) -> Mapping[str, memoryview]:
@@ -146,7 +154,7 @@ class Publishing:
         if marked:
             self.held_frames += held
             self.corrected_frames += int(rows["corrected"][0])
-        changed = list(self.alarms.take(published))
+        changed = list(self.alarms.feed(published))
         if self.received_ns and not self._front.follows_samples:
             self.age.add((time.time_ns() - stamp_ns) * 1e-9)
         if self.recording:
@@ -155,6 +163,33 @@ class Publishing:
             self.watch(published)
         if changed:
             yield from self.alarms_changed(stamp_ns)
+
+    def series(self, series: Series, journal: Callable[[Series], object]) -> Iterator[Outgoing]:
+        """Journal and record samples that were applied at once, and yield the messages of alarms, each at its place.
+
+        Of the motion no messages are sent.
+        """
+        published, begin = series.published, 0
+        if not len(published.rows):
+            journal(series)
+            return
+        stamps = series.stamps
+        self.latency.add((time.monotonic_ns() - self.received_ns) * 1e-9, len(stamps))
+        self._newest = published.rows[-1:]
+        self.published += len(stamps)
+        for row in self.alarms.feed(published):
+            part, begin = series.part(begin, row + 1), row + 1
+            self._record(part, journal)
+            self.series_ns = stamps.item(row)
+            yield from self.alarms_changed(self.series_ns)
+        self.series_ns = None
+        self._record(series.part(begin, len(stamps)) if begin else series, journal)
+
+    def _record(self, series: Series, journal: Callable[[Series], object]) -> None:
+        if len(series.stamps):
+            journal(series)
+            if self.recording:
+                self.recording.publications(series.published)
 
     def alarms_changed(self, stamp_ns: int) -> Iterator[Outgoing]:
         """Yield the alarms, a level of which has changed."""

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from plow_twin.live.parameters import Settings
 from plow_twin.model.scene import Scene
 from plow_twin.record.decimation import Decimation
@@ -20,7 +22,7 @@ from plow_twin.record.writer import in_free_folder
 from plow_twin.scene_file import dump_scene
 from plow_twin.stream.journal import Entry
 from plow_twin.stream.outputs import Published
-from plow_twin.stream.session import Session
+from plow_twin.stream.session import Series, Session
 
 _QUEUE_SIZE: Final = 20_000
 
@@ -77,6 +79,8 @@ class Recording:
             now_ns=clock or time.time_ns,
             on_error=on_error,
         )
+        #: number of the entry before the publication of each sample of the newest series
+        self._series = np.zeros(0, np.int64)
         self._recorder = in_free_folder(Path(settings.record_path), make)
         #: takes a journal entry; a loss is counted by the recorder
         self.journal: Callable[[Entry], bool] = self._recorder.journal
@@ -100,6 +104,20 @@ class Recording:
             stamp_ns = int(published.rows["stamp_ns"][0])
             for topic, message in marks(published, self._frame_id).items():
                 self.message(topic, stamp_ns, message)
+
+    def series(self, series: Series) -> None:
+        """Take the journal of samples that were applied at once."""
+        self._series = self._recorder.series(series)
+
+    def publications(self, published: Published) -> None:
+        """Take the publications after each sample of the newest series."""
+        if self._decimation.keeps_all:
+            self._recorder.publications(published, self._series)
+            return
+        for number, sequence in enumerate(self._series.tolist()):
+            wanted = self._decimation.take(published.at(number))
+            if wanted is not None:
+                self._recorder.publications(wanted, np.array([sequence]))
 
     def message(self, topic: str, stamp_ns: int, message: Message) -> None:
         """Take another message that has been published on the topic of that base name."""

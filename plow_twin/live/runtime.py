@@ -14,6 +14,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 
+import numpy as np
+from numpy.typing import NDArray
+
 from plow_twin.errors import ArgumentError
 from plow_twin.live.file_root import outside
 from plow_twin.live.inputs import Inputs
@@ -31,7 +34,7 @@ from plow_twin.stream.intake import Verdict
 from plow_twin.stream.journal import Entry, Gaps, PartOfPose, Pose
 from plow_twin.stream.limits import Limits, excitation_limits, pose_limits, value_limits
 from plow_twin.stream.model_changes import changed_scene, changed_twin
-from plow_twin.stream.session import Session
+from plow_twin.stream.session import Series, Session
 
 if TYPE_CHECKING:
     from plow_twin.estimate.follow import Follower
@@ -185,6 +188,11 @@ class Runtime:
         """The twin, where it follows measurements."""
         found: Follower | None = cast(Any, self.driver.session.following)
         return found
+
+    @property
+    def reads_at_once(self) -> bool:
+        """Whether samples may be applied and published many at once: they bring their time, and no message is sent."""
+        return self._front.follows_samples and not self._front.sends_motion
 
     @property
     def recorder_state(self) -> str:
@@ -362,6 +370,26 @@ class Runtime:
             yield from self.publishing.messages(published)
         self._advanced(len(arrived))
 
+    def step_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64]) -> Iterator[Outgoing]:
+        """Use many samples of a source with its own time, as `step`; stamps [ns], shape (n,), wrenches (n, 3)."""
+        if self._start_due or self.publishing.watch is not None or self.settings.record_ring:
+            # who looks on sees each sample; a ring is written with the state after the sample of its alarm
+            yield from self.step(list(zip(stamps.tolist(), map(tuple, wrench.tolist()), strict=True)))
+            return
+        self.publishing.received_ns = now_ns = time.monotonic_ns()
+        for found in self.driver.series(stamps, wrench, now_ns):
+            if isinstance(found, Series):
+                yield from self.publishing.series(found, self._journal_series)
+            else:
+                yield from self.publishing.messages(found)
+        self._advanced(len(stamps))
+
+    def _journal_series(self, series: Series) -> None:
+        if self.recording:
+            self.recording.series(series)
+        if self.estimation:
+            self.estimation.take_series(series)
+
     def _send(self, outgoing: Iterable[Outgoing]) -> None:
         for topic, message in outgoing:
             self._front.send(topic, message)
@@ -442,7 +470,7 @@ class Runtime:
             self.driver.session.apply(PartOfPose(stamp_ns, known, tuple(pose[index] for index in known)))
             return
         self.driver.session.apply(Pose(stamp_ns, pose, deviation))
-        if self.alarms.take_pose(stamp_ns, pose):
+        if self.alarms.feed_pose(stamp_ns, pose):
             self._send(self.publishing.alarms_changed(stamp_ns))
 
     def take_gaps(self, stamp_ns: int, gaps: Mapping[int, float]) -> None:
@@ -487,24 +515,26 @@ class Runtime:
     @property
     def stamp_ns(self) -> int:
         """Return the time that the model has reached, or the present one before the first sample [ns]."""
-        stamp_ns = self.driver.session.stamp_ns
+        stamp_ns = self.publishing.series_ns or self.driver.session.stamp_ns
         return self._front.now_ns() if stamp_ns is None else stamp_ns
 
     def _advanced(self, count: int = 1) -> None:
-        if self.recording:
-            if self.recording.wants_snapshot:
-                self._renew_recording()
-            if self._front.follows_samples:
-                # nothing is late: a pause, bounded by the number of samples, lets the recorder's thread catch up
-                pauses = count
-                while pauses and self.recording.behind:
-                    time.sleep(_CATCH_UP_S)
-                    pauses -= 1
+        if self.recording and self.recording.wants_snapshot:
+            self._renew_recording()
+        if self._front.follows_samples:
+            # nothing is late: a pause, bounded by the number of samples, lets recorder and estimate catch up
+            while count and self._behind:
+                time.sleep(_CATCH_UP_S)
+                count -= 1
         unsteady = self.driver.unsteady(time.monotonic_ns())
         seen = (self.driver.state, tuple(self.inputs.other_senders()), unsteady)
         if seen != self._seen:
             self._seen = seen
             self._front.changed()
+
+    @property
+    def _behind(self) -> bool:
+        return bool((self.recording and self.recording.behind) or (self.estimation and self.estimation.behind))
 
     def _renew_recording(self) -> None:
         assert self.recording is not None

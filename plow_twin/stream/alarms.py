@@ -1,6 +1,6 @@
 """Alarms on publications: two levels, hysteresis, minimum duration, latched until acknowledged.
 
-They follow from the publications and the acknowledgements alone, so that a replay gives the same ones.
+They follow from the publications and the acknowledgements alone, so a replay gives the same alarms.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, Published, Rows
 HYSTERESIS: Final = 0.95
 #: The rate of change of the clearance is that over this time [ns]: its steps of a tenth of a second say little.
 RATE_SPAN_NS: Final = 10 * NS_PER_S
-#: Poses of the model are kept for a measured one that is late by so much [ns].
+#: Time for which poses of the model are kept for late measured poses [ns].
 _KEPT_NS: Final = 2 * NS_PER_S
 _PRUNED: Final = 500
 _MOST_WAITING: Final = 1000
@@ -42,13 +42,13 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Thresholds:
-    """From which value on there is a warning and an error; 0: never."""
+    """Values from which on there is a warning and an error; 0: never."""
 
     warn: float = 0.0
     error: float = 0.0
 
     def level(self, value: float, before: Level) -> Level:
-        """Return the level of a value; one that is left must be left clearly."""
+        """Return the level of a value, with hysteresis."""
         found = Level.NONE
         for level, threshold in ((Level.WARN, self.warn), (Level.ERROR, self.error)):
             bound = threshold * HYSTERESIS if before >= level else threshold
@@ -85,11 +85,8 @@ class Alarm:
         thresholds = (self.thresholds.warn, self.thresholds.error)
         self.lowest = min((found for found in thresholds if found > 0.0), default=math.inf)
 
-    def take(self, value: float, stamp_ns: int, duration_ns: int) -> bool:
-        """Take in a value; a level higher than the present one must last for `duration_ns` first.
-
-        True when the level has changed.
-        """
+    def feed(self, value: float, stamp_ns: int, duration_ns: int) -> bool:
+        """Judge a value; return whether the level has changed. A higher level must last for `duration_ns` first."""
         self.value = value
         before = self.level
         if not before and value < self.lowest:
@@ -111,7 +108,7 @@ class Alarm:
         return True
 
     def stays(self, values: NDArray[np.float64]) -> bool:
-        """Return whether none of these values can change a level."""
+        """Return whether these values can change no level."""
         if self.level or self.lowest == math.inf:  # without a threshold there is no level
             return not self.level
         return float(values.max(initial=-math.inf)) < self.lowest
@@ -126,7 +123,7 @@ class _Model:
         self._waiting: list[tuple[int, float, float]] = []
 
     def add(self, stamp_ns: int, x: float, y: float) -> list[tuple[int, float]]:
-        """Take in where the model is; return stamps and residuals [m] of the poses that have waited for it."""
+        """Add the model's pose; return stamps and residuals [m] of the measured poses that waited for it."""
         place = bisect_left(self._stamps_ns, stamp_ns)
         # late samples have been worked in: the motion after them is computed again
         del self._stamps_ns[place:], self._q[place:]
@@ -178,20 +175,20 @@ class Alarms:
         #: names of those that the latest take has latched at a higher level
         self.raised: list[str] = []
 
-    def take(self, published: Published) -> Iterator[int]:
+    def feed(self, published: Published) -> Iterator[int]:
         """Judge publications; yield the number of each row that has changed a level, right after it.
 
-        What had no sample says nothing of the machine.
+        Rows without a sample are not judged.
         """
-        if len(published.rows) > 1 and self._take_quiet(published):
+        if len(published.rows) > 1 and self._feed_quiet(published):
             return
         slow = {int(found["row"]): found for found in published.slow} if len(published.slow) else {}
         for number in range(len(published.rows)):
-            if self._take_one(published.rows, number, slow.get(number)):
+            if self._feed_row(published.rows, number, slow.get(number)):
                 yield number
 
-    def _take_one(self, rows: Rows, number: int, slow: np.void | None) -> bool:
-        """Take in one row, and its slow part if it has one; True when a level has changed."""
+    def _feed_row(self, rows: Rows, number: int, slow: np.void | None) -> bool:
+        """Judge a row, and its slow part if it has one; return whether a level has changed."""
         stamp_ns, _, held, samples, x, y, force, _ = summary(rows, number)
         if held and not samples:
             return False
@@ -226,7 +223,7 @@ class Alarms:
         """Whether measured poses matter."""
         return self._model is not None
 
-    def _take_quiet(self, published: Published) -> bool:
+    def _feed_quiet(self, published: Published) -> bool:
         """Judge many rows at once and return True; False, and nothing is judged, where a row may change a level."""
         rows, slow = published
         growth = self.alarms.get("clearance_rate")
@@ -248,11 +245,11 @@ class Alarms:
         newest = {name: float(found[-1].max()) for name, found in values.items() if len(found)}
         for name, value in (newest | ({"clearance_rate": rate} if stamps_ns else {})).items():
             if name in self.alarms:
-                self.alarms[name].take(value, int(rows["stamp_ns"][-1]), self._duration_ns)
+                self.alarms[name].feed(value, int(rows["stamp_ns"][-1]), self._duration_ns)
         return True
 
-    def take_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
-        """Take in a measured pose (x, y [m], theta [rad]); True when a level has changed."""
+    def feed_pose(self, stamp_ns: int, pose: Sequence[float]) -> bool:
+        """Judge a measured pose (x, y [m], theta [rad]); return whether a level has changed."""
         found = None if self._model is None else self._model.residual(stamp_ns, pose[0], pose[1])
         if found is None:
             return False
@@ -264,13 +261,13 @@ class Alarms:
         if alarm is None:
             return False
         latched = alarm.latched
-        changed = alarm.take(value, stamp_ns, self._duration_ns)
+        changed = alarm.feed(value, stamp_ns, self._duration_ns)
         if alarm.latched > latched:
             self.raised.append(name)
         return changed
 
     def _growth(self, stamp_ns: int, clearance: float) -> float:
-        """Return by how much the clearance has grown a second [m/s] over the span, or 0 while it has not lasted."""
+        """Return the growth rate of the clearance [m/s] over the span, 0 until it has passed."""
         if self._clearances and stamp_ns <= self._clearances[-1][0]:
             self._clearances.clear()
         self._clearances.append((stamp_ns, clearance))
@@ -291,7 +288,7 @@ class Alarms:
         return max((max(levels) for levels in self.levels.values()), default=Level.NONE)
 
     def acknowledge(self) -> list[str]:
-        """Let go what is latched; return the names of the alarms that are still there."""
+        """Release latched alarms; return the names of those still present."""
         for alarm in self.alarms.values():
             alarm.latched = alarm.level
             if not alarm.level:

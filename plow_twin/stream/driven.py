@@ -1,4 +1,4 @@
-"""What a session drives: a twin, and one that follows measurements too."""
+"""Interfaces for a session: a twin, and a twin that follows measurements."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from plow_twin.run.twin import Advanced
 
 Array = NDArray[np.float64]
 
-#: Poses that are kept for later at most: those of ten seconds at 1 kHz. Estimates are always kept.
+#: Most poses kept for later: ten seconds at 1 kHz. Estimates are always kept.
 MOST_MEASURED: Final = 10_000
 
 
 class Driven(Protocol):
-    """A twin, as far as a session needs it: `plow_twin.run.twin.Twin` says what each part does."""
+    """The part of a twin that a session needs; `plow_twin.run.twin.Twin` documents it."""
 
     @property
     def scene(self) -> Scene: ...  # noqa: D102
@@ -53,19 +53,19 @@ class Driven(Protocol):
 
 @runtime_checkable
 class Following(Driven, Protocol):
-    """A twin that follows measurements; its rows tell more (`followed` in `plow_twin.solve.state.ROW`)."""
+    """A twin that follows measurements; its rows have more columns (`followed` in `plow_twin.solve.state.ROW`)."""
 
     #: poses and estimates that it has taken in
     taken: int
 
     def take_pose(self, t: float, q: ArrayLike, known: float = ...) -> None:
-        """Take in a pose measured at model time `t` in s, shape (3,), NaN where it was not; it acts from `known` on."""
+        """Add a pose measured at model time `t` in s, shape (3,), NaN where not measured; it acts from `known` on."""
 
     def take_estimate(self, text: str, t: float) -> None:
-        """Take in an estimate, JSON, that is known from model time `t` in s on."""
+        """Add an estimate, JSON, known from model time `t` in s on."""
 
     def follow_parameters(self) -> None:
-        """Go on with one twin that no pose moves, from where the median twin stands."""
+        """Continue with a single twin from the state of the median twin, without corrections by poses."""
 
     def end_spans(self, ends: NDArray[np.int64], begins: bool) -> None:
         """Say which rows of the next `advance_rows` are published, and whether their span begins with the first."""

@@ -1,4 +1,4 @@
-"""What to do with arriving samples and with silence: the one place where intake, hold policy and session meet."""
+"""Handles arriving samples and silence: intake, hold policy and session meet here."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from enum import Enum
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plow_twin.model.pairs import PAIR_COUNT
 from plow_twin.stream.failures import Failures
@@ -33,7 +34,7 @@ from plow_twin.stream.journal import (
     Unload,
 )
 from plow_twin.stream.outputs import NOTHING, Published, Rows
-from plow_twin.stream.session import Session
+from plow_twin.stream.session import Series, Session
 from plow_twin.stream.steps import Steps
 
 #: Stamp [ns] and wrench (Fx, Fy [N], M [N m]) of a sample that has arrived.
@@ -43,13 +44,13 @@ Arrival = tuple[int, tuple[float, float, float]]
 _LARGEST_HOLD_NS: Final = NS_PER_S
 #: Silence is looked for at least this often [ns]: the policy may change.
 _LONGEST_QUIET_NS: Final = NS_PER_S // 10
-#: At most so many resets by jumps in that time [ns]: clocks out of step must not reset the model for ever.
+#: Most resets by jumps of the clock in that time [ns]: two clocks out of step must not reset the model for ever.
 _MOST_RESETS: Final = 5
 _RESET_WINDOW_NS: Final = 10 * NS_PER_S
 
 
 class StreamState(Enum):
-    """What the stream is doing."""
+    """State of the stream."""
 
     WAITING = "waiting for the first sample"
     RUNNING = "running"
@@ -60,9 +61,9 @@ class StreamState(Enum):
 
 @dataclass
 class Policy:
-    """What may change at run time.
+    """Settings that may change at run time.
 
-    After `excitation_timeout_s` without a sample the model goes on by the steady clock, that far behind it, so that a
+    After `excitation_timeout_s` without a sample the model advances by the steady clock, that far behind it, so that a
     sample late by less is still used. `hold` is `hold` (the last load stays) or `zero` (it falls to zero within the
     first call); after `hold_limit_s` of it the model stands still. After `failure_limit` failed advances in a row the
     model is reset (`Failures.wants_restart`); 0: never.
@@ -136,19 +137,62 @@ class Driver:
                     yield published
                 continue
             for settled in self._steps.settle(stamp_ns, wrench, now_ns, self.session.stamp_ns):
-                yield from self._take_in(run, *settled[:2], now_ns)
+                yield from self._use_samples(run, *settled[:2], now_ns)
         if run or self._newest_ns is None:
             yield from self._use(run, now_ns)
 
+    def series(
+        self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], now_ns: int
+    ) -> Iterator[Published | Series]:
+        """Use many samples in order of arrival, stamps (n,) [ns] and wrenches (n, 3), as `samples` does.
+
+        Samples that go on from one to the next are applied at once; the caller journals and publishes a `Series` before
+        it asks for more. All others take the way of `samples`, with the same outcome.
+        """
+        run: list[Sample] = []
+        goes_on = self.intake.go_on(stamps, wrench)
+        ends = np.append(np.flatnonzero(~goes_on) + 1, len(stamps))
+        place = 0
+        while place < len(stamps):
+            arrival: Arrival = stamps.item(place), tuple(wrench[place].tolist())
+            if run and self._may_go_on(*arrival):
+                yield from self._use(run, now_ns)
+            if run or not self._may_go_on(*arrival):
+                for settled in self._steps.settle(*arrival, now_ns, self.session.stamp_ns):
+                    yield from self._use_samples(run, *settled[:2], now_ns)
+                place += 1
+                continue
+            end = int(ends[np.searchsorted(ends, place, side="right")])
+            here = slice(place, end)
+            found = self.session.apply_series(stamps[here], wrench[here], each=self.every_sample)
+            if found is None:
+                rows = zip(stamps[here].tolist(), map(tuple, wrench[here].tolist()), strict=True)
+                yield from self.samples(rows, now_ns)
+            else:
+                newest_ns, newest = stamps.item(end - 1), tuple(wrench[end - 1].tolist())
+                self.intake.accept(newest_ns, newest, end - place)
+                self._newest_ns, self._received_ns, self._zeroed = newest_ns, now_ns, False
+                self._advanced(now_ns)
+                self.failed.end()
+                self.state = StreamState.RUNNING
+                yield found
+            place = end
+        if run or self._newest_ns is None:
+            yield from self._use(run, now_ns)
+
+    def _may_go_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
+        """Return whether nothing speaks against a sample."""
+        reached_ns = self.session.stamp_ns
+        return not (reached_ns is None or self._steps.waits) and self.intake.goes_on(stamp_ns, wrench, reached_ns)
+
     def _goes_on(self, stamp_ns: int, wrench: tuple[float, float, float]) -> bool:
         """Accept a sample against which nothing speaks; False: it has to be judged."""
-        reached_ns = self.session.stamp_ns
-        if reached_ns is None or self._steps.waits or not self.intake.goes_on(stamp_ns, wrench, reached_ns):
-            return False
-        self.intake.accept(stamp_ns, wrench)
-        return True
+        found = self._may_go_on(stamp_ns, wrench)
+        if found:
+            self.intake.accept(stamp_ns, wrench)
+        return found
 
-    def _take_in(
+    def _use_samples(
         self, run: list[Sample], stamp_ns: int, wrench: tuple[float, float, float], now_ns: int
     ) -> Iterator[Published]:
         """Judge a sample, and add it to those that are applied together, `run`, which are applied first where due."""
@@ -174,7 +218,7 @@ class Driver:
 
     def due(self) -> Published:
         """Return the publication of all advances since the last one."""
-        return self.session.outputs.take()
+        return self.session.outputs.pop()
 
     def silence(self, now_ns: int) -> Published:
         """Go on under the hold policy when the excitation has been silent for too long; called at intervals."""
@@ -184,7 +228,7 @@ class Driver:
         jumped = self._steps.unopposed(now_ns, timeout_ns)
         if jumped is not None:
             run: list[Sample] = []
-            return Published.joined([*self._take_in(run, *jumped[:2], now_ns), *self._use(run, now_ns)])
+            return Published.joined([*self._use_samples(run, *jumped[:2], now_ns), *self._use(run, now_ns)])
         silent_ns = now_ns - self._received_ns - timeout_ns
         if silent_ns <= 0:
             return NOTHING
@@ -225,7 +269,7 @@ class Driver:
         if not verdict.used:
             return NOTHING
         if verdict.resets:
-            # the model starts anew: on the clock itself
+            # the model restarts, on the clock itself
             stamp_ns += self._behind_ns
             self._behind_ns = 0
             self.clock.restart()
@@ -267,7 +311,7 @@ class Driver:
         return snapshot
 
     def restore(self, stamp_ns: int, snapshot: Snapshot) -> None:
-        """Go back to the motion of a snapshot; the next sample is that of its time, whatever its stamp."""
+        """Go back to the motion of a snapshot; the next sample counts at its time, whatever its stamp."""
         self.failed.end()
         self.session.apply(Restore(stamp_ns, snapshot.data))
         self._begin_again()
@@ -287,7 +331,7 @@ class Driver:
             self.session.apply(SetModel(stamp_ns, json.dumps(dict(changes))))
 
     def set_wear(self, stamp_ns: int, depth_m: Sequence[float], reason: str) -> None:
-        """Set the wear depth of each pad [m]: other pads, or a measurement; the motion starts anew.
+        """Set the wear depth of each pad [m]: other pads, or a measurement; the motion restarts.
 
         Raises
         ------
@@ -309,7 +353,7 @@ class Driver:
         return refused or self._steps.unsteady(now_ns)
 
     def reset(self, stamp_ns: int, reason: str) -> None:
-        """Put the motion back to its initial state, the wear stays; the next sample starts the time anew."""
+        """Reset the motion to its initial state and keep the wear; the next sample restarts the time."""
         self._restart_model(stamp_ns, reason, None)
         self.intake.restart()
         self.clock.restart()

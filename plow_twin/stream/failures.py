@@ -1,4 +1,4 @@
-"""Advances that failed: counted, journalled by stretches, and when the model begins anew after them."""
+"""Failed advances: counted, journalled by stretches; after some in a row the model restarts."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ class Failures:
     Parameters
     ----------
     emit
-        Receives a `Failed` at the first advance of a stretch, and another one at its end.
+        Receives a `Failed` at the first advance of a stretch, and a second at its end.
     """
 
     def __init__(self, emit: Callable[[Failed], object]) -> None:
         self._emit = emit
-        #: failed advances, and stretches of them
+        #: failed advances, and stretches of failed advances
         self.count = self.stretches = 0
         #: why the newest one failed; empty without a failure
         self.reason = ""
         #: stamps of the first and the last advance of the newest stretch [ns]
         self.since_ns = self.until_ns = 0
-        #: whether the motion began anew after the newest stretch
+        #: whether the motion restarted after the newest stretch
         self.restarts = False
         self._in_a_row = 0
         #: length of the stretch before the newest restart, and the stamp of that [ns]
@@ -47,13 +47,13 @@ class Failures:
             self._emit(Failed(stamp_ns, stamp_ns, 1, reason))
 
     def end(self) -> None:
-        """End the stretch, if there is one: an advance did not fail, or the motion begins anew."""
+        """End a stretch, if there is one: an advance succeeded, or the motion restarts."""
         if self._in_a_row > 1:
             self._emit(Failed(self.until_ns, self.since_ns, self._in_a_row - 1, self.reason))
         self._in_a_row = 0
 
     def wants_restart(self, limit: int) -> bool:
-        """Return whether the model should begin anew, after `limit` failed advances in a row; 0: never.
+        """Return whether the model should restart, after `limit` failed advances in a row; 0: never.
 
         Where it failed again at once after a restart, the next one waits twice as long as the stretch before it: the
         number of restarts grows as the logarithm of the time, and at most half of the time in which the model could
@@ -65,7 +65,7 @@ class Failures:
         return self.until_ns - self.since_ns >= (2 * self._before_ns if at_once else 0)
 
     def restarted(self) -> str:
-        """Take note that the model begins anew; return the reason."""
+        """Note that the model restarts; return the reason."""
         self.restarts = True
         self._before_ns, self._restarted_ns = self.until_ns - self.since_ns, self.until_ns
         return f"{self._in_a_row} failed advances: {self.reason}"

@@ -28,21 +28,21 @@ class DurationHistogram:
         """Number of durations seen."""
         return sum(self._counts)
 
-    def add(self, duration_s: float) -> None:
-        """Count one duration [s]; outside the range it falls into the end bin, a negative one is ignored."""
+    def add(self, duration_s: float, count: int = 1) -> None:
+        """Count a duration [s]; outside the range it falls into the end bin, a negative one is ignored."""
         if not duration_s >= 0.0:
             return
         if duration_s > self.largest_s:
             self.largest_s = duration_s
         index = int(math.log10(duration_s / _LOWEST_S) * _BINS_PER_DECADE) if duration_s > _LOWEST_S else 0
-        self._counts[index if index < _BINS else -1] += 1
+        self._counts[index if index < _BINS else -1] += count
 
     def quantile(self, share: float) -> float:
         """Return the duration [s] that the given share of all does not exceed; NaN without one."""
         return self._quantile(np.array(self._counts), share)
 
     def recent(self, share: float) -> float:
-        """Return the same of those since the last call of this method."""
+        """Return these figures since the last call of this method."""
         counts = np.array(self._counts)
         before, self._counted = self._counted, counts
         return self._quantile(counts - before, share)
@@ -62,7 +62,7 @@ class Periods:
     Parameters
     ----------
     period_s
-        What the loop is to keep [s].
+        Budget of the loop [s].
     """
 
     def __init__(self, period_s: float) -> None:
@@ -73,7 +73,7 @@ class Periods:
         self._recent: list[float] = []
 
     def begin(self) -> None:
-        """Begin anew: the next turn has no predecessor."""
+        """Reset: the next turn has no predecessor."""
         self._before_s = math.nan
 
     def turn(self, now_s: float) -> None:

@@ -1,7 +1,7 @@
-"""What a session remembers of its last seconds, so that a late sample can be worked in: snapshots and all since.
+"""The last seconds of a session, for late samples: snapshots and all entries since the oldest of them.
 
-What can be worked in follows from the journal alone, however many samples are advanced at once: a call of many has one
-snapshot, and notes where calls of single samples have theirs, so that all agree on what is too old.
+The age at which a sample is too old follows from the journal alone. A call with many samples makes one snapshot, but
+notes the stamps at which single samples would have made theirs, so both have the same limit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from plow_twin.stream.journal import Sample, Travel
 
-#: Snapshots in the time remembered: going back costs the samples between two of them on top.
+#: Snapshots in the time remembered; going back computes the samples since a snapshot again.
 SNAPSHOTS: Final = 100
 
 
@@ -73,20 +73,20 @@ class History:
         return self._stamps_ns[index : index + 1] == [stamp_ns]
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Drop all."""
         for part in (self._snapshots, self._kept_ns, self._samples, self._stamps_ns, self._travels):
             part.clear()
         self._later.clear()
         self._newest_kept_ns, self._due = None, True
 
     def add(self, stamps_ns: NDArray[np.int64], wrench: NDArray[np.float64]) -> None:
-        """Take in samples, shapes (n,), (n, 3), that have been applied; nobody may write to the arrays any more."""
+        """Add applied samples, shapes (n,), (n, 3); the arrays must not change any more."""
         if not self._span_ns:
             return
         self._later.append((stamps_ns, wrench))
         last_ns = self._kept_ns[-1] if self._kept_ns else None
         if last_ns is not None and stamps_ns.item(-1) // self._spacing_ns == last_ns // self._spacing_ns:
-            return  # as nearly always, for stamps do not fall
+            return  # the usual case, since stamps rise
         cells = stamps_ns // self._spacing_ns
         begins = np.ones(len(cells), bool)
         begins[1:] = cells[1:] != cells[:-1]
@@ -136,7 +136,7 @@ class History:
         self._later.clear()
 
     def add_travel(self, travel: Travel) -> None:
-        """Take in a speed that has been applied; of those with one stamp the last one counts."""
+        """Add an applied speed; the last of equal stamps counts."""
         if not self._span_ns:
             return
         place = bisect_right(self._travels, travel.stamp_ns, key=lambda item: item.stamp_ns)

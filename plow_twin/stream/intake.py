@@ -10,6 +10,9 @@ from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from plow_twin.stream.limits import Limits
 
 NS_PER_S = 1_000_000_000
@@ -27,7 +30,7 @@ class KnownStamps(Protocol):
 
 
 class Verdict(Enum):
-    """What became of one arriving sample; the value is the name of its counter."""
+    """Result of the judgement of a sample; the value is the name of its counter."""
 
     ACCEPTED = "accepted"
     #: accepted after a reset: the stamps stepped back by more than `jump_back_s`
@@ -83,7 +86,7 @@ class Intake:
     expected_rate_hz
         Rate of the samples [Hz], from which gaps in the stamps are counted as missing samples; 0: not known.
     limits
-        What the values can be at most; None: anything finite.
+        Largest values; None: any finite value.
     on_unused
         Receives reason, stamp [ns] and values of each sample that is not used.
     """
@@ -153,7 +156,7 @@ class Intake:
         reached_ns
             Time that the model has reached [ns], None before its first sample.
         history
-            What a late sample can be worked into.
+            The past, for late samples.
         may_reset
             Whether a step of the sender's clock may reset the model now; to where the stamps were before the last one
             it always may, or a single wrong stamp could keep all right ones out.
@@ -197,11 +200,19 @@ class Intake:
             return False
         return self.limits.keep(self._newest_values, values, (stamp_ns - newest_ns) * 1e-9)
 
-    def accept(self, stamp_ns: int, values: Sequence[float]) -> None:
-        """Count a sample that `goes_on`."""
+    def go_on(self, stamps_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return of each of many samples after the first whether it `goes_on` once the one before it is accepted."""
+        if self.limits is None:
+            return np.zeros(len(stamps_ns) - 1, bool)
+        ahead_ns = np.diff(stamps_ns)
+        near = (ahead_ns > 0) & (ahead_ns <= self.jump_forward_s * NS_PER_S)
+        return near & self.limits.kept(values, ahead_ns * 1e-9)
+
+    def accept(self, stamp_ns: int, values: Sequence[float], count: int = 1) -> None:
+        """Count a sample that `goes_on`, or the last of `count` of them."""
         self.returned = False
-        self.counts[Verdict.ACCEPTED] += 1
-        self._since_first += 1
+        self.counts[Verdict.ACCEPTED] += count
+        self._since_first += count
         self._newest_ns, self._newest_values = stamp_ns, values
 
     def refuse(self, verdict: Verdict, stamp_ns: int = 0, values: Sequence[float] = ()) -> None:
@@ -212,7 +223,7 @@ class Intake:
         self._on_unused(verdict, stamp_ns, values)
 
     def restart(self) -> None:
-        """Forget the newest stamp: the next sample is a first one. The counts go on."""
+        """Drop the newest stamp: the next sample counts as the first. The counts are kept."""
         self._missing_before = self.missing
         self._newest_ns = None
 
@@ -235,7 +246,7 @@ class Intake:
             return Verdict.JUMP_FORWARD
         if ahead_ns > 0:
             return Verdict.IMPLAUSIBLE if self._too_fast(stamp_ns, values) else Verdict.ACCEPTED
-        # against the sender's own stamps: how far the hold policy went ahead says nothing of its clock
+        # against the sender's own stamps: the hold policy runs ahead of its clock
         if newest_ns - stamp_ns > self.jump_back_s * NS_PER_S:
             return Verdict.JUMP_BACK
         if history is not None and history.oldest_ns is not None and stamp_ns > history.oldest_ns:

@@ -1,4 +1,4 @@
-"""What the twin accepted, in order of use: all that a second run needs to repeat the first one exactly.
+"""Entries that the twin accepted, in order of use: a second run repeats the first exactly from them.
 
 Stamps are integer nanoseconds on the clock of the samples; they are never rounded through a float.
 """
@@ -16,7 +16,7 @@ ParameterValue = bool | int | float | str
 class Sample:
     """Advance to `stamp_ns` with the load linear from the previous sample.
 
-    A stamp behind the time reached is that of a late sample, which is worked in at its place.
+    A stamp behind the time reached belongs to a late sample, which is worked in at its place.
     `wrench` is Fx, Fy [N] and M [N m] about the cavity's centre, gravity not included.
     """
 
@@ -65,9 +65,9 @@ class SetWear:
 
 @dataclass(frozen=True)
 class SetModel:
-    """Numbers of the scene are other ones from here on: `changes` is JSON, numbers by key of the scene file.
+    """Numbers of the scene change from here on: `changes` is JSON, numbers by key of the scene file.
 
-    All that differ from the scene of the run; pose, rates and wear go on. Contacts have the history of a start there.
+    All numbers that differ from the scene of the run; pose, rates and wear are kept. Contacts start without history.
     """
 
     stamp_ns: int
@@ -76,7 +76,7 @@ class SetModel:
 
 @dataclass(frozen=True)
 class Restore:
-    """The motion is that of the snapshot `data` from here on; the next stamp is that of its time. The wear stays."""
+    """The motion continues from the snapshot `data`; the next stamp belongs to its time. The wear stays."""
 
     stamp_ns: int
     data: bytes
@@ -84,7 +84,7 @@ class Restore:
 
 @dataclass(frozen=True)
 class Mark:
-    """Somebody has marked this place."""
+    """A mark set by the operator."""
 
     stamp_ns: int
     text: str
@@ -154,7 +154,7 @@ class Unused:
     """`count` messages of `sender` came on the input `topic` and were not used; kept for a dispute, moves nothing.
 
     `reason` is that of the counters `dropped_<reason>`, or `not_followed`, or `lost`: sent and never arrived (a `count`
-    below 0: so many of them came after all). `stamps_ns` and `values` have an item for each message in order of
+    below 0: that many arrived after all). `stamps_ns` and `values` have an item for each message in order of
     arrival, the first ones only where there were too many at once; an unreadable message has no values and stamp 0.
     A value need not be finite.
     """

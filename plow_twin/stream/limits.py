@@ -1,4 +1,4 @@
-"""What a measured value can be at most, and how fast it can change: anything beyond is a fault of the measurement."""
+"""Largest size and rate of measured values; anything beyond is a fault of the measurement."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from operator import gt, sub
 from typing import Final
 
+import numpy as np
+from numpy.typing import NDArray
+
 from plow_twin.model.geometry import half_diagonal
 from plow_twin.model.loads import compile_loads
 from plow_twin.model.scene import Scene
 
-#: A measured load may be so many times the largest that the scene's own loads and the head's weight come to.
+#: Largest measured load over the sum of the scene's largest loads and the head's weight.
 _MARGIN: Final = 10.0
 #: A load may change by its largest value within this time [s]: a millisecond's impact passes.
 _SHORTEST_S: Final = 1e-3
@@ -35,6 +38,15 @@ class Limits:
             if not (abs(value) <= largest and abs(value - old) <= fastest * duration_s):
                 return False
         return True
+
+    def kept(self, values: NDArray[np.float64], duration_s: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return of each of many rows (n, k) after the first whether it would `keep` after the row before it, (n-1,).
+
+        `duration_s`, shape (n-1,), are the times between them in s.
+        """
+        within = np.abs(values[1:]) <= np.array(self.largest)
+        steady = np.abs(np.diff(values, axis=0)) <= np.array(self.fastest) * duration_s[:, None]
+        return np.asarray((within & steady).all(axis=1))
 
     def too_fast(self, before: Sequence[float], values: Sequence[float], duration_s: float) -> bool:
         """Return whether a value has changed faster than it can."""

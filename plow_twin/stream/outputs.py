@@ -35,7 +35,7 @@ _ON_SIDES: Final = np.array(
     [np.flatnonzero(side) for side in (NORMAL_X < 0.0, NORMAL_X > 0.0, NORMAL_Y > 0.0, NORMAL_Y < 0.0)]
 )
 _STATE_SIZE: Final = 4 * PAIR_COUNT
-#: What changes slowly: clearances under `CLEARANCE_NAMES` [m], growth of each pad's wear [m/s].
+#: Slowly changing values: clearances under `CLEARANCE_NAMES` [m], growth of each pad's wear [m/s].
 SLOW: Final = np.dtype(
     [
         ("stamp_ns", "i8"),
@@ -55,14 +55,16 @@ FOLLOWED_FIELDS: Final = (
 )  # fmt: skip
 #: Fields of the motion at a row's time.
 _MOTION: Final = ("t", "stamp_ns", "held", "q", "v", "penetration", "rate", "force", "wear_depth", *FOLLOWED_FIELDS)
-#: Where `known_clearance` stands in `clearance`.
+#: Fields whose sum `summary` finds finite or not.
+_SUMMED: Final = ("q", "v", "penetration", "rate", "force", "impulse", "peak")
+#: Places of `known_clearance` in `clearance`.
 _KNOWN: Final = np.array([0, len(_CLEARANCES), len(_CLEARANCES) + 1, 1, len(_CLEARANCES) + 2, len(_CLEARANCES) + 3])
 #: Rows made at once: numpy takes as long for one as for some.
 _STOCK: Final = 256
 
 
 class Published(NamedTuple):
-    """What is published: records of type `ROW`, shape (n,), and of type `SLOW`, shape (m,), with some of them."""
+    """A publication: records of type `ROW`, shape (n,), and for some of them of type `SLOW`, shape (m,)."""
 
     rows: Rows
     slow: Rows
@@ -70,11 +72,12 @@ class Published(NamedTuple):
     @property
     def finite(self) -> bool:
         """Whether every number is finite."""
-        for number in range(len(self.rows)):
-            if not summary(self.rows, number)[-1]:
-                return False
-        return not len(self.slow) or all(
-            bool(np.isfinite(self.slow[name]).all()) for name in ("clearance", "wear_rate")
+        if len(self.rows) == 1:
+            rows_finite = summary(self.rows, 0)[-1]
+        else:
+            rows_finite = all(bool(np.isfinite(self.rows[name]).all()) for name in _SUMMED)
+        return rows_finite and (
+            not len(self.slow) or all(bool(np.isfinite(self.slow[name]).all()) for name in ("clearance", "wear_rate"))
         )
 
     @property
@@ -116,13 +119,13 @@ def _numbered_from(slow: Rows, first: int) -> Rows:
 
 
 class Stock:
-    """New rows, each used once, so that a publication never changes for those who keep it."""
+    """New rows, each used once, so that a kept publication never changes."""
 
     def __init__(self) -> None:
         self._rows, self._used = _NO_ROWS, 0
 
-    def take(self, count: int) -> Rows:
-        """Return some rows."""
+    def new(self, count: int) -> Rows:
+        """Return unused rows."""
         if self._used + count > len(self._rows):
             self._rows, self._used = np.zeros(max(count, _STOCK), ROW), 0
         begin, self._used = self._used, self._used + count
@@ -171,11 +174,11 @@ class Outputs:
         #: stamp and pad depths of the last slow part; None before the first
         self._slow_ns: int | None = None
         self._slow_wear_depth = np.zeros(PAIR_COUNT)
-        #: from when on the motion published has been computed again [ns], while the window says that it is corrected
+        #: stamp from which on the published motion was computed again [ns], while the window is marked as corrected
         self._corrected_ns = 0
         #: of before that: the window, if it had an advance to show
         self._before: Rows | None = None
-        #: what an estimate adds to the clearances and their points, as in `CLEARANCE_NAMES`; None: nothing is estimated
+        #: shift of the clearances and their quantiles by an estimate, as in `CLEARANCE_NAMES`; None without an estimate
         self._shift: Array | None = None
 
     def set_shift(self, shift: Sequence[float]) -> None:
@@ -193,11 +196,11 @@ class Outputs:
         self._scene = scene
 
     def clear_shift(self) -> None:
-        """Let the clearances be those of the model again."""
+        """Publish the clearances of the model again."""
         self._shift = None
 
     def add(self, rows: Rows, stamps: NDArray[np.int64], taken: NDArray[np.int64], *, held: bool = False) -> Published:
-        """Take in advances, and publish after some of them.
+        """Add advances, and publish after some of them.
 
         Parameters
         ----------
@@ -206,7 +209,7 @@ class Outputs:
         stamps : ndarray of int64, shape (n,)
             Their stamps [ns].
         taken : ndarray of int64, shape (m,)
-            Rising numbers of those after which there is a publication; without a good advance it has the stamp 0.
+            Rising numbers of advances after which to publish; without a good advance a publication has the stamp 0.
         held : bool
             Whether they were computed without samples.
 
@@ -221,18 +224,18 @@ class Outputs:
         chosen = rows if len(taken) == len(rows) else rows[taken]
         return Published(chosen, self._slow(chosen))
 
-    def take(self) -> Published:
+    def pop(self) -> Published:
         """Publish all advances since the publication before; nothing without an advance."""
         if not self._waits:
             return NOTHING
-        rows, self._waits = self._stock.take(1), 0
+        rows, self._waits = self._stock.new(1), 0
         publish_window(self._window, rows)
         return Published(rows, self._slow(rows))
 
     def correct(self, stamp_ns: int, oldest_ns: int) -> int:
-        """Note that all from `stamp_ns` on is computed again; return from when on it is since the last publication.
+        """Note that all from `stamp_ns` on is computed again; return the first such stamp since the last publication.
 
-        That is later than `oldest_ns`: earlier corrections stay as they are.
+        It is later than `oldest_ns`: earlier corrections stay as they are.
         """
         window = self._window[0]
         if not window["corrected"] or self._corrected_ns <= oldest_ns:
@@ -244,9 +247,9 @@ class Outputs:
         return self._corrected_ns
 
     def begin_correction(self) -> None:
-        """Let impulses and peaks begin here, at the time that `correct` returned.
+        """Begin impulses and peaks here, at the time that `correct` returned.
 
-        What has been published up to here is not published again, even if each advance from here on should fail.
+        Advances published before are not published again, even if each later advance fails.
         """
         self._clear()
         if self._before is not None:
@@ -260,13 +263,19 @@ class Outputs:
         return bool(self._waits)
 
     @property
+    def is_clear(self) -> bool:
+        """Whether the next publication tells of the advances to come alone, and bears no mark."""
+        window = self._window
+        return not (self._waits or window["corrected"][0] or window["marked"][0])
+
+    @property
     def makes(self) -> NDArray[np.int64]:
         """Touches of each pair so far, shape (8,)."""
         makes: NDArray[np.int64] = self._window["makes"][0].copy()
         return makes
 
     def restart(self) -> None:
-        """Forget all that has not been published; the count of touches goes on."""
+        """Drop all that has not been published; the count of touches is kept."""
         self._clear()
         self._window["corrected"] = 0
         self._slow_ns = self._before = None

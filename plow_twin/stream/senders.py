@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-#: Silence after which another sender is followed, where nobody can ask for a switch [ns].
+#: Silence after which another sender is followed, if no switch can be requested [ns].
 _SILENT_NS = 10_000_000_000
 #: Senders whose numbers are remembered; the oldest is forgotten.
 _MOST_SENDERS = 64
@@ -39,8 +39,11 @@ class Senders:
         """Take note that messages of a sender before the first sample heard may be no loss."""
         self._before |= {sender}
 
-    def hear(self, sender: bytes, number: int) -> bool:
-        """Take in the arrival of sample `number` (from 1) of a sender; True when that sender is followed."""
+    def hear(self, sender: bytes, number: int, count: int = 1) -> bool:
+        """Add the arrival of sample `number` (from 1) of a sender, or of `count` from there on.
+
+        Return whether that sender is followed.
+        """
         expected = self._next.get(sender)
         if expected is None:
             expected = number if sender in self._before else 1
@@ -53,13 +56,13 @@ class Senders:
             # a number that comes after all is no loss any more
             self.lost += number - expected if number >= expected else -1 if self.lost else 0
         else:
-            self.ignored += 1
+            self.ignored += count
             self._other = sender
-        self._next[sender] = number + 1 if number >= expected else expected
+        self._next[sender] = number + count if number >= expected else expected
         return followed
 
     def alive(self, present: Collection[bytes]) -> None:
-        """Take note of the senders that there are; when the one followed has gone, the next one heard is followed.
+        """Note the present senders; when the followed sender has gone, the next sender heard is followed.
 
         One that has not been in such a list yet may be on its way into it: it has not gone.
         """
@@ -95,7 +98,7 @@ class OneSender:
         self._listed: set[bytes] = set()
 
     def hear(self, sender: bytes, now_ns: int) -> bool:
-        """Take in the arrival of a message at a steady time [ns]; True when its sender is followed."""
+        """Add the arrival of a message at a steady time [ns]; return whether its sender is followed."""
         if self.followed is None or now_ns - self._heard_ns > _SILENT_NS:
             self.followed = sender
         if sender != self.followed:

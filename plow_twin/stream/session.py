@@ -1,4 +1,4 @@
-"""The deterministic machine that the live node and a replay both drive: entries of the journal in, motion out."""
+"""The deterministic core of the live node and of a replay: entries of the journal in, motion out."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ from plow_twin.stream.journal import (
 from plow_twin.stream.model_changes import changed_scene, changed_twin, read_changes
 from plow_twin.stream.outputs import NONE, NOTHING, THE_ONE, Outputs, Published, Rows, Stock
 
-#: A digest follows each so many advances.
+#: Advances between digests.
 DIGEST_INTERVAL: Final = 100
 #: Is a stamp known, origin, stamp reached, advances, held, speed along the face, number of speeds to come.
 _HEADER: Final = struct.Struct("<?qqq?dq")
 _TRAVEL: Final = struct.Struct("<qd")
-#: How far ahead of the time reached a pose may be. A bag that is played fast brings poses before their load; those
-#: further ahead are of another clock.
+#: Largest lead of a pose over the time reached. A bag that is played fast brings poses before their load; a larger lead
+#: comes from another clock.
 _AHEAD_NS: Final = 3_600_000_000_000
 _WEAR_SIZE: Final = 8 * PAIR_COUNT
 _NO_LOAD: Final = np.zeros((1, 3))
@@ -64,9 +64,9 @@ def _ignore(entry: Entry) -> None:
 
 
 class _Measured(NamedTuple):
-    """A pose or an estimate that the twin has taken in: its number, the time reached then and its stamp [ns].
+    """A pose or an estimate given to the twin: its number, the time reached then and its stamp [ns].
 
-    It is known from the model time `known` [s] on, however far a late sample goes back before it.
+    It is known from the model time `known` [s] on, also after going back before it for a late sample.
     """
 
     number: int
@@ -77,9 +77,9 @@ class _Measured(NamedTuple):
 
 
 class Applied(NamedTuple):
-    """What became of samples.
+    """Result of applying samples.
 
-    A row of each, what is published, the digests asked for, how many advances failed, and how many samples were late.
+    A row of each, the publications, the digests asked for, and the numbers of failed advances and late samples.
     """
 
     rows: Rows
@@ -89,23 +89,63 @@ class Applied(NamedTuple):
     late: int = 0
 
 
+class Series(NamedTuple):
+    """Samples that have been applied at once, and are not in the journal yet.
+
+    Stamps [ns], shape (n,), and wrenches (n, 3); what is published, a row after each sample or nothing; the digests,
+    and after how many samples each stands, shape (m,).
+    """
+
+    stamps: NDArray[np.int64]
+    wrench: NDArray[np.float64]
+    published: Published
+    digests: Sequence[str]
+    digest_after: NDArray[np.int64]
+
+    def part(self, begin: int, end: int) -> Series:
+        """Return some of the samples, with what follows each."""
+        marked = (self.digest_after > begin) & (self.digest_after <= end)
+        published = self.published
+        if len(published.rows):
+            published = published.of(np.arange(begin, end))
+        return Series(
+            self.stamps[begin:end],
+            self.wrench[begin:end],
+            published,
+            [self.digests[place] for place in np.flatnonzero(marked).tolist()],
+            self.digest_after[marked] - begin,
+        )
+
+    def entries(self) -> Iterator[Sample | Digest]:
+        """Yield the entries of the journal."""
+        digests = dict(zip(self.digest_after.tolist(), self.digests, strict=True))
+        for number, (stamp_ns, wrench) in enumerate(zip(self.stamps.tolist(), self.wrench.tolist(), strict=True), 1):
+            yield Sample(stamp_ns, tuple(wrench))
+            if number in digests:
+                yield Digest(stamp_ns, digests[number])
+
+
+class _UndoneError(Exception):
+    """An advance failed, and the twin stands where it was before the samples."""
+
+
 class Session:
     """One run of a twin under a journal.
 
     The same entries in the same order give the same motion, the same publications (`outputs`) and the same digests, bit
-    for bit, whatever the clock did meanwhile. Model time is (stamp - origin), the origin being the first stamp.
+    for bit, whatever the clock does. Model time is (stamp - origin), the origin being the first stamp.
 
     Motion and wear are two states: a `Reset` puts back the motion and keeps the wear, only `SetWear` sets it. While the
-    load is held or taken away (`Hold`, `Unload`) nothing wears: what the load does then is not known. With the scene's
-    own loads it is known, and a `Hold` only says how far to go.
+    load is held or taken away (`Hold`, `Unload`) nothing wears, since the load is unknown. With the scene's own
+    loads it is known, and a `Hold` is only a time to reach.
 
     A sample whose stamp lies behind the time reached is late: the session goes back to the newest snapshot before it,
-    works it in and runs again up to the newest sample; what was computed without a sample after that one is dropped.
+    works it in and runs again up to the newest sample; motion without samples after that one is dropped.
 
     Parameters
     ----------
     twin
-        The twin to drive; nobody else may advance it. One that follows gets the measured poses and the estimates.
+        The twin to drive; only the session may advance it. A following twin gets the measured poses and the estimates.
     origin_ns
         Stamp of model time 0, or None: the first stamp.
     on_entry
@@ -113,7 +153,7 @@ class Session:
         advance that it covers. An entry that the twin then refuses (a number is not finite) has been emitted: a replay
         refuses it too.
     rollback_span_s
-        How much older than the newest sample a late one may be [s]; 0: late samples are refused.
+        Largest age of a late sample before the newest one [s]; 0: late samples are refused.
     wear_depth
         Wear depth of each pad to begin with [m], shape (8,); None: the scene's.
     """
@@ -128,7 +168,7 @@ class Session:
         wear_depth: Sequence[float] | None = None,
     ) -> None:
         self._use(twin)
-        #: what it has taken in since the earliest state that is kept
+        #: poses and estimates since the earliest state that is kept
         self._measured: deque[_Measured] = deque()
         #: poses too far ahead, and those that a late sample would find no more
         self.poses_dropped = 0
@@ -140,10 +180,10 @@ class Session:
         self.stamp_ns: int | None = None
         self.outputs = Outputs(twin.scene)
         self._stock = Stock()
-        #: the latest advance, while nobody has asked for the wear at its end
+        #: the latest advance, until the wear at its end is read
         self._row: Rows | None = None
         scene, self._sampled = twin.scene, twin.excitation == "sampled"
-        #: what late samples can be worked into
+        #: the past, for late samples
         self.history = History(round(rollback_span_s * 1e9) if self._sampled else 0)
         self.wear_depth = np.zeros(PAIR_COUNT)
         if scene.wear is not None:
@@ -152,7 +192,7 @@ class Session:
             self.wear_depth[:] = wear_depth
             twin.reset(twin.time, wear_depth=self.wear_depth)
         self._largest_error_m = 0.0
-        #: whether the motion goes on without samples
+        #: whether the motion advances without samples
         self.held = False
         self._wears = scene.wear is not None and scene.wear.coefficient_m2_n != 0.0
         self._speed = scene.wear.travel_speed_m_s if scene.wear is not None else 0.0
@@ -178,8 +218,8 @@ class Session:
     def apply(self, entry: Entry) -> Rows | None:
         """Emit one entry, apply it, and return the row of the advance that it made, shape (1,), if it made one.
 
-        `outputs` publishes it when it is asked to. A digest or a loss says something about a journal and changes
-        nothing: it is not emitted again.
+        `outputs` publishes it when it is asked to. A digest or a loss describes a journal and changes nothing: it
+        is not emitted again.
 
         Raises
         ------
@@ -202,7 +242,7 @@ class Session:
             case SetWear(_, depth):
                 self._on_entry(entry)
                 self._restart(np.array(depth))
-                # what was estimated was of other pads
+                # the estimate was of other pads
                 self.outputs.clear_shift()
             case Estimated(shift=shift):
                 self._on_entry(entry)
@@ -237,7 +277,7 @@ class Session:
         return None
 
     def parts(self, samples: Sequence[Sample], *, each: bool = False) -> Iterator[Sequence[Sample]]:
-        """Yield the parts of samples that `apply_samples` takes at once; the one before has to be applied by then.
+        """Yield the parts of samples for `apply_samples`; each part must be applied before the next.
 
         Late samples are one part; of others there are as many as the digests allow, or one where `each` is published.
 
@@ -259,7 +299,7 @@ class Session:
             samples = samples[count:]
 
     def apply_samples(self, samples: Sequence[Sample], *, each: bool = False) -> Applied:
-        """Emit one of the `parts` of samples and apply it; the bits are the same, however many there are at once.
+        """Emit one of the `parts` of samples and apply it; the bits do not depend on their number.
 
         Parameters
         ----------
@@ -281,13 +321,44 @@ class Session:
             self._on_entry(sample)
         if late:
             applied = self._work_in(first_ns, samples)
-            applied = applied._replace(published=self.outputs.take() if each else NOTHING, late=late)
+            applied = applied._replace(published=self.outputs.pop() if each else NOTHING, late=late)
         else:
             applied = self._run(samples, THE_ONE if each else NONE)
             if each and applied.failed and not applied.published.rows["stamp_ns"][0]:
                 applied = applied._replace(published=NOTHING)
         self._count(len(samples))
         return applied
+
+    def apply_series(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, each: bool) -> Series | None:
+        """Apply samples at once, the first not late; nothing is emitted: the caller journals the series.
+
+        Parameters
+        ----------
+        stamps : ndarray of int64, shape (n,)
+            Rising [ns].
+        wrench : ndarray, shape (n, 3)
+            Fx, Fy [N] and M [N m] at each, finite.
+        each : bool
+            Whether there is a publication after each; else `outputs` sums up.
+
+        Returns
+        -------
+        Series or None
+            None, and nothing has changed, where the samples are to be applied one by one: an advance fails, a number
+            is not finite, or something else happens on the way.
+        """
+        if self.stamp_ns is None or self.held or self._travels or not (self.outputs.is_clear or not each):
+            return None
+        count = len(stamps)
+        first = DIGEST_INTERVAL - self._advances % DIGEST_INTERVAL
+        marks = np.arange(first, count + 1, DIGEST_INTERVAL)
+        taken = np.arange(count) if each else NONE
+        try:
+            found = self._advance(stamps, wrench, self._stock.new(count), taken, marks, undo=self.twin.snapshot())
+        except _UndoneError:
+            return None
+        self._advances += count
+        return Series(stamps, wrench, found.published, found.digests, marks)
 
     @property
     def wear_depth(self) -> NDArray[np.float64]:
@@ -317,11 +388,11 @@ class Session:
         wrench : ndarray, shape (n, 3)
             Fx, Fy [N] and M [N m] at each.
         rows : ndarray of `ROW`, shape (n,), or None
-            Receives the rows; None: nothing is read out, and `outputs` is told nothing.
+            Receives the rows; None: nothing is read out, and `outputs` gets nothing.
         taken : ndarray of int64
             As of `Outputs.add`.
         marks : ndarray of int64, shape (m,)
-            Rising numbers from 1 to n: a digest is wanted after so many samples.
+            Rising numbers from 1 to n: counts of samples after which a digest is made.
 
         Raises
         ------
@@ -359,7 +430,7 @@ class Session:
                 continue
             if travel is not None:
                 end = int(np.searchsorted(stamps, travel.stamp_ns, side="right"))
-            if resumed:  # what was computed without a sample is behind the first one: nobody goes back into it
+            if resumed:  # going back never reaches the motion without samples before the first one
                 end = begin + 1
             here = slice(begin, end)
             chosen = taken[(taken >= begin) & (taken < end)] - begin
@@ -377,7 +448,7 @@ class Session:
         return Applied(parts[-1].rows if rows is None else rows, published, digests, sum(part.failed for part in parts))
 
     def emit(self, entry: Entry) -> None:
-        """Emit an entry that says something of the present state and changes nothing."""
+        """Emit an entry that describes the present state and changes nothing."""
         self._on_entry(entry)
 
     def check_model(self, changes: Mapping[str, float]) -> None:
@@ -390,7 +461,7 @@ class Session:
         return largest
 
     def renew(self) -> Snapshot:
-        """Return the exact state for a journal that goes on from here, and forget what was before it."""
+        """Return the exact state for a journal that goes on from here, and drop the past."""
         snapshot = self.snapshot()
         self._forget()
         return snapshot
@@ -409,7 +480,7 @@ class Session:
         )
         travels = b"".join(_TRAVEL.pack(travel.stamp_ns, travel.speed_m_s) for travel in self._travels)
         stamp_ns = self.stamp_ns if self.stamp_ns is not None else self.origin_ns or 0
-        # the changes of the model come last: most runs have none
+        # the changes of the model come last: most runs do not have them
         changes = json.dumps(self.changes).encode() if self.changes else b""
         data = header + travels + self.wear_depth.tobytes() + self.outputs.state() + self.twin.snapshot() + changes
         return Snapshot(stamp_ns, data)
@@ -418,7 +489,7 @@ class Session:
         """Advance to samples."""
         stamps = np.array([sample.stamp_ns for sample in samples], np.int64)
         wrench = np.array([sample.wrench for sample in samples])
-        rows = self._stock.take(len(samples))
+        rows = self._stock.new(len(samples))
         if self.held or self._travels:
             return self._advance_in_pieces(stamps, wrench, rows, taken, NONE)
         return self._advance(stamps, wrench, rows, taken, NONE)
@@ -432,8 +503,12 @@ class Session:
         marks: NDArray[np.int64],
         *,
         resumed: bool = False,
+        undo: bytes | None = None,
     ) -> Applied:
-        """Advance to samples between which nothing else happens; `resumed`: the first since a time without samples."""
+        """Advance to samples between which nothing else happens; `resumed`: the first since a time without samples.
+
+        Where an advance fails the twin goes back to the snapshot `undo`, if there is one, with an `_UndoneError`.
+        """
         origin_ns = self._begin(int(stamps[0])) if self.origin_ns is None else self.origin_ns
         if self.history.is_due and not resumed:
             before_ns = int(stamps[0]) - 1 if self.stamp_ns is None else self.stamp_ns
@@ -443,6 +518,9 @@ class Session:
         times = np.empty(len(stamps))
         model_times(stamps, origin_ns, times)
         failed, digests = self.twin.advance_rows(times, wrench, rows, marks)
+        if undo is not None and (failed or not _all_finite(rows)):
+            self.twin.restore(undo)
+            raise _UndoneError
         self.origin_ns, self.stamp_ns = origin_ns, stamps.item(-1)
         self.history.add(stamps, wrench)
         if rows is None:
@@ -454,7 +532,7 @@ class Session:
         return Applied(rows, self.outputs.add(rows, stamps, taken), digests, failed)
 
     def _follow(self, stamp_ns: int, entry: Pose | PartOfPose | Estimated, known: float = -math.inf) -> None:
-        """Let the twin that follows, if it is one, take in what was measured; before the first sample nothing moves."""
+        """Give a measurement to a following twin; before the first sample nothing moves."""
         if self.following is None or self.origin_ns is None:
             return
         time = (stamp_ns - self.origin_ns) * 1e-9
@@ -497,7 +575,7 @@ class Session:
     def _work_in(self, stamp_ns: int, late: Sequence[Sample], *travels: Travel) -> Applied:
         """Go back to before a late stamp, and run again with late samples and speeds.
 
-        The next publication tells of all from the first stamp worked in since the one before it.
+        The next publication covers all from the first stamp worked in since the publication before.
         """
         corrected_ns = self.outputs.correct(stamp_ns, self.history.oldest_ns or 0)
         again = self._rewind(corrected_ns, *travels)
@@ -518,7 +596,7 @@ class Session:
         self._restore(data)
         self._advances, self.outputs.slow_before = advances, slow
         if self.following is not None:
-            # each as early as it was known: what is published decides how far one goes back, and may change no motion
+            # each as early as it was known: going back depends on publications, which must not change the motion
             measured, self._measured = self._measured, deque()
             for one in measured:
                 if one.number > self.following.taken:
@@ -552,7 +630,7 @@ class Session:
     def _move(self, stamps: NDArray[np.int64], wrench: NDArray[np.float64], *, held: bool) -> Rows:
         """Advance to a stamp, shape (1,), that is no sample's."""
         assert self.origin_ns is not None
-        rows = self._stock.take(1)
+        rows = self._stock.new(1)
         if self.following is not None:
             self.following.end_spans(NONE, begins=not self.outputs.waits)
         self.twin.advance_rows(np.multiply(stamps - self.origin_ns, 1e-9), wrench, rows)
@@ -570,23 +648,23 @@ class Session:
                 self.twin.set_travel_speed(0.0)
 
     def _resume_wear(self) -> bool:
-        """Let the load wear again; return whether it did not."""
+        """Let the load wear again; return whether wear was off."""
         held, self.held = self.held, False
         if held and self._wears:
             self.twin.set_travel_speed(self._speed)
         return held
 
     def _apply_travel(self, travel: Travel) -> None:
-        """Take over a speed: now, once its stamp is reached, or back at its stamp."""
+        """Apply a speed: now, once its stamp is reached, or back at its stamp."""
         newest_ns, oldest_ns = self.history.newest_sample_ns, self.history.oldest_ns
         if not self._wears:
             self._speed = travel.speed_m_s
         elif self.stamp_ns is None:
-            self._take_speed(travel.speed_m_s)  # from the first sample on: nobody goes back to before it
+            self._use_speed(travel.speed_m_s)  # from the first sample on: nothing goes back before it
         elif travel.stamp_ns > self.stamp_ns:
             insort(self._travels, travel, key=lambda item: item.stamp_ns)
         elif oldest_ns is not None and travel.stamp_ns <= oldest_ns:
-            # too old to be worked in at its place: it acts from the newest sample on, or from the one state kept
+            # too old for its place: it acts from the newest sample on, or from the only state kept
             self._set_speed(Travel(oldest_ns if newest_ns is None else newest_ns, travel.speed_m_s))
         elif newest_ns is None or oldest_ns is None or travel.stamp_ns >= newest_ns:
             self._set_speed(travel)
@@ -595,15 +673,15 @@ class Session:
 
     def _set_speed(self, travel: Travel) -> None:
         self.history.add_travel(travel)
-        self._take_speed(travel.speed_m_s)
+        self._use_speed(travel.speed_m_s)
 
-    def _take_speed(self, speed_m_s: float) -> None:
+    def _use_speed(self, speed_m_s: float) -> None:
         self._speed = speed_m_s
         if not self.held:
             self.twin.set_travel_speed(self._speed)
 
     def _count(self, advances: int) -> None:
-        """Count advances, and emit a digest after each so many."""
+        """Count advances, and emit a digest every `DIGEST_INTERVAL`."""
         before, self._advances = self._advances, self._advances + advances
         if before // DIGEST_INTERVAL != self._advances // DIGEST_INTERVAL and self.stamp_ns is not None:
             self._on_entry(Digest(self.stamp_ns, self.twin.digest()))
@@ -613,13 +691,13 @@ class Session:
             self.history.add_snapshot(self.stamp_ns, self.snapshot().data, kept=kept)
 
     def _forget(self) -> None:
-        """Forget all before the present state."""
+        """Drop all before the present state."""
         self._forget_past()
         if not self.held:
             self._remember()
 
     def _forget_past(self) -> None:
-        """Let nobody go back to what was."""
+        """Drop the past."""
         self.history.clear()
         self._measured.clear()
 
@@ -636,11 +714,11 @@ class Session:
         self.origin_ns = self.stamp_ns = None
 
     def _begin(self, stamp_ns: int) -> int:
-        """Return the stamp of model time 0 when the motion goes on from its present time at `stamp_ns`."""
+        """Return the stamp of model time 0 if the motion continues from its present time at `stamp_ns`."""
         return stamp_ns - round(self.twin.time * 1e9)
 
     def _change_model(self, changes: dict[str, float]) -> None:
-        """Go on with other numbers of the scene; the contacts begin anew, what is remembered is forgotten."""
+        """Change numbers of the scene; contacts start without history and the past is dropped."""
         before, speed = self.twin, 0.0 if self.held else self._speed
         self._use(self._changed_twin(changes))
         self._carry(before)
@@ -652,7 +730,7 @@ class Session:
         self._forget()
 
     def _changed_twin(self, changes: Mapping[str, float]) -> Driven:
-        """Return a twin of other numbers that can go on at the speeds that are set and to come."""
+        """Return a twin of other numbers that allows the speeds that are set and to come."""
         found = changed_twin(self.twin, self._scene, changes)
         for speed in (self._speed, *(travel.speed_m_s for travel in self._travels)):
             check_travel_speed(found.scene, speed)
@@ -666,7 +744,7 @@ class Session:
             self.twin.advance(before.time, before.wrench)
 
     def _restore_motion(self, data: bytes) -> None:
-        """Take over the motion of a snapshot; wear, model, speed along the face and counts stay as they are."""
+        """Restore the motion of a snapshot; wear, model, speed along the face and counts stay."""
         self._resume_wear()
         for travel in self._travels:
             self._set_speed(travel)
@@ -708,6 +786,10 @@ class Session:
         self.origin_ns = origin_ns if known else self.origin_ns
         self.stamp_ns = stamp_ns if known else None
         self._advances, self.held, self._speed = advances, held, speed
+
+
+def _all_finite(rows: Rows | None) -> bool:
+    return rows is None or (Published(rows, NOTHING.slow).finite and bool(np.isfinite(rows["wear_depth"]).all()))
 
 
 def wear_in(snapshot: bytes) -> tuple[float, ...]:

@@ -16,12 +16,12 @@ Timed = tuple[int, tuple[float, float, float], int]
 
 
 class Steps:
-    """Keep back a sample whose stamp jumps until the next one goes on from it: a single wrong stamp moves nothing.
+    """Keep a sample whose stamp jumps until the next sample confirms it: a single wrong stamp moves nothing.
 
     Parameters
     ----------
     intake
-        What judges the samples; a stray one is counted there.
+        Judges the samples, and counts stray ones.
     """
 
     def __init__(self, intake: Intake) -> None:
@@ -39,7 +39,7 @@ class Steps:
     def settle(
         self, stamp_ns: int, wrench: tuple[float, float, float], now_ns: int, reached_ns: int | None
     ) -> tuple[Timed, ...]:
-        """Take in a sample; return those that can be judged now, in order of arrival."""
+        """Add a sample; return those that can be judged now, in order of arrival."""
         jumped, jumps = self._jumped, self._intake.jumps(stamp_ns, reached_ns)
         arrival = stamp_ns, wrench, now_ns
         if jumped is None or stamp_ns <= 0:  # an unstamped sample decides nothing

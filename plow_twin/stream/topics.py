@@ -17,7 +17,7 @@ from plow_twin.stream.outputs import CLEARANCE_NAMES, PAD_NAMES, SLOW, Published
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 STATUS: Final = "diagnostic_msgs/msg/DiagnosticStatus"
-#: Messages that a publisher keeps for readers: a reader that looks once a second at 1 kHz misses none.
+#: Depth of a publisher's history: a reader that looks once a second at 1 kHz misses no message.
 _DEPTH: Final = 1000
 
 
@@ -49,7 +49,7 @@ class Topic:
     cadence : Cadence
         When it is sent.
     content : str
-        What its message holds, in words and with units.
+        Content of its message, with units.
     cumulative : bool
         Whether its message depends on the publication before: a replay cannot compare it after a lost message.
     latched : bool
@@ -195,5 +195,5 @@ def topics_of(*cadences: Cadence) -> tuple[Topic, ...]:
 
 
 def names_of(*cadences: Cadence) -> tuple[str, ...]:
-    """Return the base names of the same topics."""
+    """Return the base names of these topics."""
     return tuple(topic.name for topic in topics_of(*cadences))

@@ -1,0 +1,64 @@
+"""Rows a second at which `plow-twin live` takes a CSV file that ends, without and with a recording.
+
+python benchmark/file_rate.py [--rows N]
+
+Prints one line of JSON for each case: rows a second of CPU, the start of the process left out, and of the time on the
+clock.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Final
+
+#: Rows of the file by which the time of the start is measured.
+FEW: Final = 1000
+
+
+def write_load(path: Path, rows: int) -> None:
+    """Write a load of the preset's size at 1 kHz."""
+    with path.open("w") as file:
+        file.write("t,fx,fy,m\n")
+        for index in range(rows):
+            phase = math.sin(2e-3 * index)
+            file.write(f"{1.7e9 + 1e-3 * index:.3f},{3e4 * phase:.1f},{-1e4 * phase:.1f},{-4e4 * phase:.1f}\n")
+
+
+def measure(path: Path, *options: str) -> tuple[float, float]:
+    """Return CPU and time on the clock of a run [s]."""
+    command = [sys.executable, "-m", "plow_twin", "live", str(path), "--scene", "paper", "--quiet", *options]
+    before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    subprocess.run(command, check=True)
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime - before.ru_utime - before.ru_stime, time.monotonic() - begin
+
+
+def main() -> None:
+    """Print the rates."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rows", type=int, default=1_000_000)
+    rows = parser.parse_args().rows
+    with tempfile.TemporaryDirectory() as folder:
+        few, many = Path(folder, "few.csv"), Path(folder, "many.csv")
+        write_load(few, FEW)
+        write_load(many, rows)
+        measure(few)  # compiles the solver where it must
+        for outputs in ("", "none", "all"):
+            options = ["--set", f"record_outputs={outputs}", "--record"] if outputs else []
+            start = measure(few, *options, *[f"{folder}/few_{outputs}"][: len(options)])
+            whole = measure(many, *options, *[f"{folder}/many_{outputs}"][: len(options)])
+            cpu, wall = ((rows - FEW) / (whole[place] - start[place]) for place in (0, 1))
+            found = {"recorded": outputs or "nothing", "rows_per_cpu_s": round(cpu), "rows_per_s": round(wall)}
+            print(json.dumps(found), flush=True)
+
+
+if __name__ == "__main__":
+    main()
