@@ -97,7 +97,7 @@ def kernel(
 
 
 def save_or_warn(dispatcher: Any) -> None:
-    """Warn where the disk does not take the cache: a compiled kernel works without it."""
+    """Warn if the cache cannot be written: a compiled kernel works without it."""
     cache = dispatcher._cache
     save = cache.save_overload
 

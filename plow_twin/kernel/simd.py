@@ -31,7 +31,7 @@ def _operation(function: Callable[..., Any]) -> Callable[..., Any]:
 class Lanes(types.Type):
     """Numba's type of eight float64."""
 
-    #: what LLVM may do to sums
+    #: changes that LLVM may make to sums
     flags: tuple[str, ...] = _FLAGS
 
     def __init__(self, name: str = "Lanes") -> None:
@@ -39,7 +39,7 @@ class Lanes(types.Type):
 
 
 class ExactLanes(Lanes):
-    """The same, but each operation is rounded as it is written: what surrounds it moves no bit."""
+    """The same, but each operation is rounded as written: the surrounding code changes no bit."""
 
     flags = ()
 

@@ -1,1 +1,1 @@
-"""Motions from start to end, one or many, offline or live: what a user of the library calls."""
+"""Calls of the library's user: motions from start to end, single or in batches, offline or live."""

@@ -1,4 +1,4 @@
-"""What an advance of a twin gives: views of the rows that the kernels write, of one time, of many, of many twins."""
+"""Results of advances: views of the rows that the kernels write, at a time, at many times, of many twins."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class _View:
 
 
 class Advance(_View):
-    """What the head does at a time, and what happened since the advance before: a view of one row.
+    """State at a time, and sums since the advance before: a view of a row.
 
     Attributes
     ----------

@@ -30,25 +30,24 @@ __all__ = ["TwinBatch"]
 
 _Array = NDArray[np.float64]
 _NO_MARKS = np.zeros(0, np.int64)
-#: Terms without which a scene computes the same as with them, where their numbers are zero.
+#: Terms that have no effect if their numbers are zero.
 _OPTIONAL = ("hysteretic", "wear", "sliding", "running_in", "offset", "free", "slip")
 
 
 class TwinBatch:
-    """Heads that are advanced in time together, each under its own sampled load: a live ensemble.
+    """Twins that are advanced together, each under its own sampled load: a live ensemble.
 
     Parameters
     ----------
     scenes : sequence of Scene
-        One for each twin; their own loads are not used. The contact laws must have the same terms: all with C d', all
-        ramped, or all without damping or with lambda, and exponents that are all 1, all integers of at least 2, or all
-        fractions.
+        One for each twin; the scenes' loads are not used. All contact laws must have the same terms: C d', a ramp, or
+        lambda (zero without damping), and exponents that are all 1, all integers of at least 2, or all fractions.
     tol : float
         As for `Twin`.
     start : float
         Model time of the scenes' initial states in s.
     workers : int, optional
-        Threads; one by default, for a call that advances by a sample takes less than it costs to wake a second one.
+        Threads; 1 by default, since waking a second thread costs more than an advance by one sample.
     max_steps : int
         As for `Twin`.
     max_wall_s : float
@@ -63,8 +62,8 @@ class TwinBatch:
     -----
     At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: all twins stand as before the call.
     Where every contact has exponent 1 and no scene has wear, friction, support, locks, an offset centre of mass or
-    overdamped contact, twins advance eight to a SIMD vector: each has the same bits alone and in any batch, and those
-    of a `Twin` to the tolerance. Other members have the bits of a `Twin` with the same terms.
+    overdamped contact, twins advance eight to a SIMD vector: each has the same bits alone and in any batch, equal to
+    those of a `Twin` to the tolerance. Other members have the bits of a `Twin` with the same terms.
     """
 
     def __init__(
@@ -202,17 +201,17 @@ class TwinBatch:
         self._wrench = np.zeros((len(self), 3))
 
     def begin_beside(self, snapshot: bytes, moved: ArrayLike, *, again: bool = False) -> None:
-        """Go on a little beside where one sampled twin stands, with its contacts, last sample and travel speed.
+        """Displace all twins from the state of a sampled twin, with its contacts, last sample and travel speed.
 
         Parameters
         ----------
         snapshot : bytes
-            Of a `Twin` with `excitation="sampled"` whose scene has the record of state of these.
+            Snapshot of a `Twin` with `excitation="sampled"` whose scene has the same layout of state.
         moved : array_like, shape (m, 6)
-            What is added to x, y [m], theta [rad] and their rates, for each twin.
+            Displacement of x, y [m], theta [rad] and their rates for each twin.
         again : bool
-            These went beside the twin before: the damping that a contact under way has read at its touch stays what
-            each has read, and is that of the first one for those that are displaced.
+            The twins were displaced from that twin before. The damping set at the touch of a lasting contact is kept by
+            each; displaced twins take it from the first.
 
         Raises
         ------
@@ -244,7 +243,7 @@ class TwinBatch:
         which : array_like of int, shape (k,)
             Their numbers.
         q, v : array_like, shape (k, 3)
-            Poses x, y [m], theta [rad] and their rates. A contact that goes on keeps the damping of its touch.
+            Poses x, y [m], theta [rad] and their rates. A lasting contact keeps the damping of its touch.
         """
         index = np.asarray(which, dtype=np.int64)
         poses, rates = np.asarray(q, dtype=np.float64), np.asarray(v, dtype=np.float64)
@@ -272,7 +271,7 @@ class TwinBatch:
                 self._params["wear_per_impulse"][index] = wear_rate(scene.wear, speed)
 
     def snapshot(self) -> bytes:
-        """Return the exact state as bytes, to be restored by twins of the same scenes and tolerance."""
+        """Return the exact state as bytes, for twins of the same scenes and tolerance."""
         return self._states.tobytes() + self._wrench.tobytes() + self._params["wear_per_impulse"].tobytes()
 
     def restore(self, data: bytes) -> None:
@@ -281,7 +280,7 @@ class TwinBatch:
         Parameters
         ----------
         data : bytes
-            Of twins of the same scenes and tolerance.
+            Snapshot of twins of the same scenes and tolerance.
 
         Raises
         ------
@@ -335,7 +334,7 @@ class TwinBatch:
             raise (LimitError if late else RunInterrupted)(message, None, self.time) from None
 
     def _stop(self, begun: Sequence[Future[None]]) -> None:
-        """End what other threads still do, within a slice of work."""
+        """Stop the other threads within a slice of work."""
         for worker in self._workers:
             worker.pace.stopped = True
         wait(begun)
@@ -348,7 +347,7 @@ class TwinBatch:
 
 
 class _Worker(NamedTuple):
-    """What each thread has for itself."""
+    """The data of a thread."""
 
     parts: Parts
     work: NDArray[np.void]
@@ -365,7 +364,7 @@ class _Worker(NamedTuple):
         return _Worker(parts, work, new_records(TOTALS, 1), Pace(state_type(terms), stiff, max_wall_s), None)
 
     def with_lanes(self, batch: TwinBatch, terms: Terms, members: range) -> _Worker:
-        """Return the same with lanes for some twins."""
+        """Return a worker with lanes for some twins."""
         found = LaneTwins(batch._params, batch._states, terms, members, self.work, batch._max_steps)
         return self._replace(lanes=found)
 
@@ -381,12 +380,12 @@ class _Worker(NamedTuple):
 
 
 def _merge(compiled: Sequence[CompiledScene]) -> Terms:
-    """Return the terms that some member has.
+    """Return the terms of all members together.
 
     Raises
     ------
     ArgumentError
-        Where the members' laws do not have the same terms.
+        If the terms of the members' laws differ.
     """
     first = compiled[0].parts.terms
     merged = first

@@ -1,4 +1,4 @@
-"""The balance of energy and momentum of one run, from what the solver summed up."""
+"""The balance of energy and momentum of a run, from the sums of the solver."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """The balance of energy and momentum of a run: forces evaluated anew and integrated, against the change of state.
+    """The balance of energy and momentum of a run: integrated forces against the change of state.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class EnergyBalance:
     support_work_j : float
         Energy taken by the springs and dampers under a frame that gives way in J.
     dissipated_j : float
-        What of `contact_work_j` is not stored at the end, in J.
+        Part of `contact_work_j` that is not stored at the end, in J.
     turnover_j : float
         Integral of the magnitudes of all powers in J.
     imbalance_j : float

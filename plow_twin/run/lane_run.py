@@ -16,7 +16,7 @@ from plow_twin.solve.lanes.record import new_lanes
 from plow_twin.solve.modes import settle_many
 from plow_twin.solve.state import EVENT, HARMONIC, STATE, TOTALS, Status, Work, first_of, new_records
 
-#: Steps that each lane takes in the first slice.
+#: Steps of each lane in the first slice.
 _FIRST_SLICE: Final = 256
 #: Steps that the loop of a single scene takes at most when a lane needs one of another method: a call takes as long as
 #: some thirty steps.
@@ -79,10 +79,10 @@ class LaneRun:
         )  # fmt: skip
         self._size = next_slice(self._size, _time.perf_counter() - begin)
         for index in waiting[self.status[waiting] == OTHER_METHOD].tolist():
-            self._take_other_steps(index, work)
+            self._step_otherwise(index, work)
         return waiting[np.isin(self.status[waiting], _UNDER_WAY)]
 
-    def _take_other_steps(self, index: int, work: Work) -> None:
+    def _step_otherwise(self, index: int, work: Work) -> None:
         """Let the loop of a single scene take some steps of a member."""
         members = self._members
         state, totals = self.states.view(np.recarray)[index], self.totals.view(np.recarray)[index]
@@ -97,7 +97,7 @@ class LaneRun:
 
 
 def _joined(compiled: Sequence[CompiledScene], members: Sequence[int]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """Return the harmonics of all members in one array; shape (m, 2): where those of each begin, and their number."""
+    """Return the harmonics of all members in one array; shape (m, 2): first place and number of each member."""
     parts, extent, begin = [np.zeros(0, HARMONIC)], np.zeros((len(compiled), 2), np.int64), 0
     known: dict[int, tuple[int, int]] = {}
     for index in members:

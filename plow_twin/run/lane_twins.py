@@ -28,7 +28,7 @@ class LaneTwins:
     params, states : ndarray of records, shape (m,)
         Of all twins of a batch.
     terms : Terms
-        Of all of them.
+        Of all twins.
     members : range
         Those that advance here.
     work : ndarray of `WORK`, shape (1,)
@@ -62,7 +62,7 @@ class LaneTwins:
     ) -> None:
         """Advance to all times; `alone` advances one twin to one of them by other methods.
 
-        `wrench` and `rows` are those of `Samples`.
+        `wrench` and `rows` are as in `Samples`.
         """
         if not len(times):
             return

@@ -19,7 +19,7 @@ from plow_twin.solve.state import EVENT, TOTALS, Log, State, Status, Totals, Wor
 Array = NDArray[np.float64]
 
 _FIRST_LOG: Final = 4096
-#: Steps after which a run gives up with a named error, unless its caller says otherwise.
+#: Steps after which a run ends with an error, by default.
 BUDGET: Final = 10**8
 #: Work between two looks at the clock in s, and steps before the first: explicit ones take microseconds.
 _SLICE_S: Final = 0.02
@@ -96,7 +96,7 @@ def run_events(
 
 
 def next_slice(size: int, took_s: float) -> int:
-    """Return the steps of the next slice of a run, from those of the last one and the time that it took."""
+    """Return the steps of the next slice of a run, from the steps and the time of the last one."""
     return max(1, int(size * min(4.0, max(0.1, _SLICE_S / max(took_s, 1e-6)))))
 
 
@@ -115,7 +115,7 @@ def run_fixed(
     done, size = np.zeros(1, np.int64), _FIRST_SLICE
     while True:
         begin = _time.perf_counter()
-        # the row at the end of a slice is written again by the next one, unless it is due
+        # the next slice writes the row at the end of this slice again, unless it is due
         allowed = min(steps, budget, steps if look is None else int(done[0]) + size)
         code = int(fixed_step.integrate_fixed(
             compiled.params, compiled.parts, motion.state, motion.totals, motion.log, z, done, allowed, dt, euler,

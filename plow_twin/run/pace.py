@@ -1,4 +1,4 @@
-"""Advances in slices of work: between two of them limits are kept and Ctrl-C is seen."""
+"""Work in slices, between which limits are checked and Ctrl-C is handled."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from plow_twin.errors import ArgumentError
 from plow_twin.solve.state import PACE, first_of, new_records
 
-#: Seconds after which a call gives up with a named error, unless its caller says otherwise.
+#: Seconds after which a call ends with an error, by default.
 MOST_SECONDS: Final = 3600.0
 #: Steps of a slice: explicit ones take microseconds, implicit ones up to a millisecond.
 _SLICE, _SLICE_IMPLICIT = 2048, 64
 
 
 class OutOfTimeError(Exception):
-    """The wall-clock time of a call is used up, or it was told to stop."""
+    """The wall-clock time of a call is used up, or it was stopped."""
 
 
 class Pace:
@@ -37,7 +37,7 @@ class Pace:
     def __init__(self, state_type: np.dtype[np.void], implicit: bool, max_wall_s: float) -> None:
         self._records = new_records(PACE, 1)
         self.record = first_of(self._records)
-        #: the same for calls: of a record numba asks for an attribute, which numpy looks up in Python
+        #: the record for calls: numba asks a scalar record for an attribute, which numpy looks up in Python
         self.argument = self._records[0]
         #: advances that have failed in the last call, shape (1,): a view of the record
         self.failed = self._records["failed"]
@@ -50,12 +50,12 @@ class Pace:
         self.stopped = False
 
     def run(self, work: Callable[..., bool], arguments: tuple[Any, ...] = ()) -> None:
-        """Do slices of `work` until it says that all is done.
+        """Do slices of `work` until all is done.
 
         Raises
         ------
         OutOfTimeError
-            At the limit of time, or when `stopped` was set meanwhile; `record` says how far the work has come.
+            At the limit of time, or when `stopped` was set meanwhile; `record` holds the progress.
         """
         self._bytes[:] = self._start
         begin = _time.perf_counter()
@@ -66,7 +66,7 @@ class Pace:
 
 def check_limits(max_steps: int, max_wall_s: float) -> None:
     """Raise `ArgumentError` for limits that no call can have."""
-    # a number that is no integer would compile kernels of its own
+    # a float would compile further kernels
     if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or not max_steps >= 1:
         raise ArgumentError(f"max_steps: got {max_steps!r}, expected an integer >= 1")
     if not max_wall_s > 0.0:

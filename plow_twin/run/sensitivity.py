@@ -1,8 +1,8 @@
-"""How an error grows along a motion: what a tolerance is worth, and until when.
+"""Growth of errors along a motion, which shows how long a tolerance holds.
 
 Displaced motions are followed beside the motion itself, over short stretches, from states close to it. Their
-differences are the columns of the fundamental matrix; what a touch or a separation does to a displacement (the jump of
-the variational equations, saltation) is in them, since each shadow has its own events.
+differences are the columns of the fundamental matrix. They include the jumps at touches and separations (saltation),
+since each shadow has its own events.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _STRETCHES: Final = 200
 _MOST_KEPT: Final = 256
 #: Change of a parameter that is no length, in shares of it.
 _RELATIVE_CHANGE: Final = 1e-6
-#: Walls are at least so many displacements away where a stretch begins. Where that leaves too little of them the one
-#: before goes on, unless so many in a row did.
+#: Least distance from walls at the beginning of a stretch, in displacements. If this leaves too small a displacement,
+#: the stretch before is continued, at most so often in a row.
 _CLEAR_OF_WALLS: Final = 100.0
 _MOST_MERGED: Final = 20
 #: Steps of one shadow over one stretch.
@@ -73,7 +73,7 @@ class Sensitivity:
 
     @property
     def trusted(self) -> bool:
-        """Whether the tolerance means what it says for the whole motion."""
+        """Whether the tolerance holds for the whole motion."""
         return bool(self.growth.max() <= TRUSTED_GROWTH)
 
     def good_until(self, accuracy: float) -> float:
@@ -161,7 +161,7 @@ def refuse_support(scene: Scene) -> None:
 
 
 class StretchProduct:
-    """What the fundamental matrices of one stretch of a motion after the other come to.
+    """The product of the fundamental matrices of consecutive stretches.
 
     Parameters
     ----------
@@ -186,19 +186,19 @@ class StretchProduct:
         self._since, self._basis = np.zeros((0, size, size)), np.eye(size)
 
     def look(self, matrix: Array, changes: Array) -> None:
-        """Tell where the motion is within a stretch: `matrix` is its fundamental matrix so far.
+        """Update the public numbers within a stretch, of which `matrix` is the fundamental matrix so far.
 
-        `changes`, shape (p, k), is what the parameters did in it. Growth is that of places alone: in the middle of an
-        impact a stiff contact makes of any displacement a large difference of velocities, which is gone after it.
+        `changes`, shape (p, k), is the effect of the parameters in it. Growth counts places alone: in the middle of an
+        impact a stiff contact turns any displacement into a large, passing difference of velocities.
         """
         self._grown = matrix @ np.concatenate([self._since, np.eye(len(matrix))[None]])
         self.growth = _largest(self._grown[:, : len(matrix) // 2])
         self.total, self.rows = matrix @ self._total, self._rows @ matrix.T + changes
 
     def add(self, matrix: Array, changes: Array) -> Array:
-        """Go on by a stretch, with the numbers of `look` at its end.
+        """Multiply by a whole stretch.
 
-        Returns the logarithms of what it stretched a basis by, shape (k,).
+        Returns the logarithms of the factors by which it stretched a basis, shape (k,).
         """
         self.look(matrix, changes)
         self.growth = _largest(self._grown)
@@ -235,7 +235,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
         When a shadow could not be followed.
     """
     refuse_support(scene)
-    # finer than the displacement by so much that the difference keeps five digits
+    # five digits finer than the displacement
     fine = min(max(SHADOW_TOLERANCE, TOLERANCE_RANGE[0]), tol)
     compiled, known = compile_scene(scene, fine), sensitivity_parameters(scene)
     for path in parameters:
@@ -265,7 +265,7 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
             depths, scale[0], held=held, reads_speed=bool(compiled.params.damping_number >= 0.0)
         )
         if possible is None and merged < _MOST_MERGED:
-            # what grows meanwhile is told, though no stretch begins here
+            # growth is reported, although no stretch begins here
             merged += 1
             product.look(matrix, changes)
         else:
@@ -286,14 +286,14 @@ def sensitivity_of(scene: Scene, t_end: float, tol: float, parameters: Sequence[
 
 
 def _ends(t_end: float) -> list[float]:
-    """Return where stretches end: not evenly, so that they keep no pace with what is periodic."""
+    """Return the ends of stretches, at uneven distances so that they do not align with a period."""
     ends = np.arange(1, _STRETCHES + 1, dtype=np.float64)
     ends[:-1] += 0.4 * (np.mod(ends[:-1] * 0.5 * (math.sqrt(5.0) - 1.0), 1.0) - 0.5)
     return [*(ends[:-1] / _STRETCHES * t_end).tolist(), t_end]
 
 
 def scale_of(compiled: CompiledScene) -> Array:
-    """Return what makes places and rates shares of the clearance, shape (6,)."""
+    """Return factors that make places and rates shares of the clearance, shape (6,)."""
     params, length = compiled.params, geometry.length_scale(compiled.scene)
     place = np.array([1.0, 1.0, 1.0 / float(params.radius)]) * length
     scale: Array = np.concatenate([place, place * float(params.velocity_tolerance / params.position_tolerance)])
@@ -303,7 +303,7 @@ def scale_of(compiled: CompiledScene) -> Array:
 def displacement_beside(
     penetration: Array, length: float, *, held: bool = False, reads_speed: bool = False
 ) -> float | None:
-    """Return by how much shadows may be displaced, in shares of the clearance, for a stretch that begins here.
+    """Return the largest displacement of shadows, in shares of the clearance, for a stretch that begins here.
 
     A spring makes a large velocity of a place that is displaced in its contact, as no step of the solver does: no
     stretch begins there. Where a damper holds the head, a displacement stays, and a small one is as good.
@@ -332,7 +332,7 @@ def displacement_beside(
 
 
 def free_places(scene: Scene) -> NDArray[np.int64]:
-    """Return the indices of what can differ: places and rates of the degrees of freedom that are not locked."""
+    """Return the indices of places and rates of the free degrees of freedom."""
     places = [index for index, name in enumerate(DOF_NAMES) if name not in scene.locked]
     return np.array(places + [3 + index for index in places], dtype=np.int64)
 
@@ -347,7 +347,7 @@ def _beside(
 ) -> list[State]:
     """Return a state and its shadows: for each free place or rate one beside it by `moved`, for each changed scene one.
 
-    Those of changed scenes are not displaced; a damping that was read at a touch is that of their own, in `before`.
+    Shadows of changed scenes are not displaced; they keep the damping set at a touch, from `before`.
     """
     start = _pose_and_rate(_follow(compiled, state, float(state.time), work))
     states = [state]

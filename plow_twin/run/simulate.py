@@ -7,8 +7,9 @@ import time as _time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from numbers import Real
-from typing import Any, Final, Literal, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ from plow_twin.run.sensitivity import Sensitivity, sensitivity_of
 from plow_twin.solve.compiled_scene import CompiledScene, compile_scene
 from plow_twin.solve.energy_balance import new_balance
 from plow_twin.solve.state import EVENT, OFF, Status, Totals, new_work
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Method = Literal["events", "rk4", "euler"]
 Array = NDArray[np.float64]
@@ -85,6 +89,28 @@ class Result:
     sensitivity: Sensitivity | None = None
     frame: Array | None = None
 
+    def plot(self, title: str = "") -> Figure:
+        """Draw pose and contact forces over time.
+
+        Parameters
+        ----------
+        title : str
+            Title of the figure; by default the length of the motion and its changes of contact.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Notebooks show it; `savefig` writes it.
+
+        Raises
+        ------
+        ModuleNotFoundError
+            matplotlib (extra `view` or `study`) is not installed.
+        """
+        # found by name, as pandas finds its plotting backend: a simulation depends on no picture
+        drawn: Figure = import_module("plow_twin.view.motion").plot_motion(self, title)
+        return drawn
+
     def _repr_html_(self) -> str:
         """Return the statistics of the contacts as a table, which notebooks show."""
         duration = float(self.t[-1]) if len(self.t) else 0.0
@@ -140,7 +166,7 @@ def simulate(
     on_progress : callable, optional
         Called with the share of the motion that is done, 0..1, some fifty times a second.
     sensitivity : bool or sequence of str
-        Follow displaced motions too, and say what the tolerance is worth (`Result.sensitivity`); some ten times the
+        Follow displaced motions too, which shows whether the tolerance holds (`Result.sensitivity`); some ten times the
         work of the run. Paths of parameters (`sensitivity_parameters`) give the derivatives by them too. Warns with
         `ToleranceWarning` where errors grow too much for it.
 
@@ -154,9 +180,9 @@ def simulate(
     ArgumentError
         For an argument that cannot be used.
     SolverError
-        When the motion could not be continued; says when and why.
+        When the motion could not be continued, with time and cause.
     LimitError
-        At one of the limits; says where the run stood, `result` holds the motion up to there.
+        At a limit; `result` holds the motion up to there.
     RunInterrupted
         After Ctrl-C, likewise; it is a `KeyboardInterrupt` too.
     """
@@ -199,7 +225,7 @@ class _StoppedError(Exception):
 
 
 class _Watch:
-    """What happens between two slices of a run: limits are kept, progress is told."""
+    """Check limits and report progress between slices of a run."""
 
     def __init__(
         self, t_end: float, max_steps: int, max_wall_s: float, on_progress: Callable[[float], None] | None

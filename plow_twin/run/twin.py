@@ -44,7 +44,7 @@ __all__ = ["Advance", "AdvanceSeries", "Status", "Twin"]
 
 #: Steps one advance may take before it gives up.
 DEFAULT_BUDGET = 50_000_000
-#: The kernel by what the types of its arguments follow from: numba takes milliseconds to look at these.
+#: The compiled kernels, by a key that determines the types of their arguments; numba's dispatch takes milliseconds.
 _entries: dict[tuple[Any, ...], Callable[..., bool]] = {}
 _NO_MARKS = np.zeros(0, np.int64)
 #: Fewest evaluations that an advance can be bounded to: four Runge-Kutta steps.
@@ -65,22 +65,20 @@ class Twin:
     start : float
         Model time of the scene's initial state in s.
     max_evaluations : int, optional
-        For hard real-time: an advance evaluates the equations of motion at most so often (an order of the series counts
-        as one). Where that is not enough the rest of the way is taken by a few Runge-Kutta steps, and
-        `error_estimate_m` of the advance is not zero. At least `LEAST_EVALUATIONS`.
+        For hard real-time: most evaluations of the equations of motion in an advance (an order of the series counts as
+        one). Beyond them a few Runge-Kutta steps complete the advance, and its `error_estimate_m` is not zero. At
+        least `LEAST_EVALUATIONS`.
     max_steps : int
-        An advance takes at most so many steps; where that is not enough it ends with the status `BUDGET`, and nothing
-        moved.
+        Most steps of an advance; beyond them it ends with the status `BUDGET` and moves nothing.
     max_wall_s : float
         Seconds that a call for advances may take.
 
     Notes
     -----
-    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: the twin stands after the last advance
-    that was done, whose rows are the error's `result`, as if no more had been asked for.
+    At `max_wall_s` a call raises `LimitError`, after Ctrl-C `RunInterrupted`: the twin has the state after the
+    last complete advance; the error's `result` holds the rows up to there.
 
-    The motion does not depend on the times at which it is asked for, but a sample ends a step: the same samples give
-    the same bits.
+    The motion does not depend on the times of output, but a sample ends a step: the same samples give the same bits.
     """
 
     def __init__(
@@ -177,7 +175,7 @@ class Twin:
         Returns
         -------
         Advance
-            State at `t`, and what happened since the advance before. With a `status` other than `OK` nothing moved.
+            State at `t`, and sums since the advance before. With a `status` other than `OK` nothing moved.
 
         Raises
         ------
@@ -238,7 +236,7 @@ class Twin:
         rows : ndarray of `ROW`, shape (n,), or None
             Receives a row for each time. Without rows the motion is the same, and no forces are computed for output.
         marks : ndarray of int64, shape (m,)
-            Rising numbers from 1 to n: a digest is wanted after so many advances.
+            Rising numbers from 1 to n: counts of advances after which a digest is made.
 
         Returns
         -------
@@ -288,7 +286,7 @@ class Twin:
         wear_depth: ArrayLike | None = None,
         pose: tuple[ArrayLike, ArrayLike] | None = None,
     ) -> None:
-        """Go back to the scene's initial state at model time `t`, or begin at another one there.
+        """Restart at model time `t` from the scene's initial state or another state.
 
         Parameters
         ----------
@@ -297,7 +295,7 @@ class Twin:
         wear_depth : array_like, shape (8,), optional
             Wear depth of each pad in m, at least 0. Without it the scene's initial one.
         pose : tuple of array_like, shapes (3,) and (3,), optional
-            x, y [m], theta [rad] and their rates to begin with. Without it those of the scene.
+            x, y [m], theta [rad] and their rates at the start; the scene's by default.
 
         Raises
         ------
@@ -330,7 +328,7 @@ class Twin:
         Raises
         ------
         ArgumentError
-            For a speed that is not finite, or beyond what the damping allows (`check_travel_speed`).
+            For a speed that is not finite, or beyond the limit by the damping (`check_travel_speed`).
         """
         check_travel_speed(self.scene, float(speed_m_s))
         if self._parts.terms.wear is not None:
@@ -338,7 +336,7 @@ class Twin:
             self._set_wear_rate(abs(float(speed_m_s)))
 
     def snapshot(self) -> bytes:
-        """Return the exact state as bytes, to be restored by a twin of the same scene, tolerance and excitation."""
+        """Return the exact state as bytes, for a twin of the same scene, tolerance and excitation."""
         return self._state.tobytes() + self._wrench.tobytes() + np.float64(self._travel_speed).tobytes()
 
     def restore(self, data: bytes) -> None:
@@ -347,7 +345,7 @@ class Twin:
         Parameters
         ----------
         data : bytes
-            Of a twin of the same scene, tolerance and excitation.
+            Snapshot of a twin of the same scene, tolerance and excitation.
 
         Raises
         ------
@@ -380,7 +378,7 @@ class Twin:
         Returns
         -------
         str
-            For `OUT_OF_RANGE` the limit of the model, and how far the head went beyond it.
+            For `OUT_OF_RANGE`, the limit of the model and the distance of the head beyond it.
         """
         if status != Status.OUT_OF_RANGE:
             return Status(status).text
@@ -429,7 +427,7 @@ class Twin:
         return _entries[key]
 
     def _digests(self, states: NDArray[np.void], wrench: NDArray[np.float64]) -> list[str]:
-        """Return what `digest` would be at some states with their last samples, shape (m, 3)."""
+        """Return the digests of some states with their last samples, shape (m, 3)."""
         size = states.itemsize
         rows = np.empty((len(states), size + 32), np.uint8)  # as `snapshot` lays them out
         rows[:, :size] = states.view(np.uint8).reshape(len(states), size)
@@ -472,7 +470,7 @@ class Twin:
 
 
 class Advanced(NamedTuple):
-    """How many advances of a call failed, and the digests at its marks."""
+    """Number of failed advances of a call, and its digests."""
 
     failed: int
     digests: list[str]
@@ -498,7 +496,7 @@ def _digest(snapshot: bytes | memoryview) -> str:
 
 
 def _bounded(max_evaluations: int | None, order: int, max_steps: int) -> tuple[int, Bound | None]:
-    """Return the steps of the series that an advance may take, and what is kept for its coarse end."""
+    """Return the steps of the series that an advance may take, and the evaluations kept for its coarse end."""
     if max_evaluations is None:
         return max_steps, None
     if isinstance(max_evaluations, bool) or not max_evaluations >= LEAST_EVALUATIONS:

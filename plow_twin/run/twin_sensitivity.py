@@ -27,14 +27,14 @@ from plow_twin.solve.state import Status
 
 Array = NDArray[np.float64]
 
-#: Stretches begin anew after so many s, or sooner when a shadow is so many displacements away.
+#: Length of a stretch in s; it ends sooner if a shadow is that many displacements away.
 _STRETCH_S, _FAR = 0.1, 100.0
-#: Where a contact is in the way of a new one, the stretch under way goes on for so many s.
+#: Longest stretch in s, if a contact prevents a new one.
 _LONGEST_S = 0.5
 
 
 class TwinSensitivity:
-    """The derivatives of a twin's state by where it began and by parameters, kept up to date as it is advanced.
+    """The derivatives of a twin's state by its initial state and parameters, updated with each advance.
 
     Parameters
     ----------
@@ -46,13 +46,12 @@ class TwinSensitivity:
     Attributes
     ----------
     t : float
-        Model time in s of all that is told: that of the last whole stretch, some 0.1 s behind, 0.5 s at most
-        where a contact lasts.
+        Model time of these numbers in s: the end of the last whole stretch, some 0.1 s behind, at most 0.5 s during a
+        contact.
     from_start : ndarray, shape (k, k)
-        Derivatives of the state at `t` by that at the beginning, of the k / 2 free degrees of freedom: places, then
-        rates.
+        Derivatives of the state at `t` by the initial state, of the k / 2 free degrees of freedom: places, then rates.
     by_parameter : dict of str to ndarray, shape (k,)
-        Derivatives of the state at `t` by the parameters, the beginning unchanged.
+        Derivatives of the state at `t` by the parameters at constant initial state.
     growth : float
         Largest factor by which an error made at any time before has grown at `t`, as `Sensitivity.growth`.
     exponent : float
@@ -143,7 +142,7 @@ class TwinSensitivity:
         return told
 
     def _end(self, t: float, matrix: Array, changes: Array) -> None:
-        """End a stretch: `matrix` is its fundamental matrix, `changes` what the parameters did in it, scaled."""
+        """End a stretch: `matrix` is its fundamental matrix, `changes` the scaled effect of the parameters in it."""
         self._logs += self._product.add(matrix, changes / np.array([one.change for one in self._changed])[:, None])
         self.t = t
         self._start()
