@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Sample:
-    """One run: seconds taken, poses (rows, 3) or None, and what was counted."""
+    """One run: seconds taken, poses (rows, 3) or None, and counts."""
 
     wall_s: float
     q: Array | None = None
@@ -47,7 +47,7 @@ class Row:
     steps: int | None = None
     evaluations: int | None = None
     events: int | None = None
-    #: what the section is about: members beyond the listed error, times real time, share of a core, error in
+    #: figures of the section: members beyond the listed error, times real time, share of a core, error in
     #: tolerances, ratio of times, kernels compiled
     value: float | None = None
     #: growth of a small displacement at t = 0 (random scenes, ensemble)

@@ -4,7 +4,7 @@
     python benchmark/estimate.py --group plain --group hard --truths 20
 
 Each truth is written as soon as it is done, and what the file holds already is not run again: a long benchmark can be
-stopped, and gone on with. Thresholds of `plow_twin/estimate/verdict.py` were set on other seeds; the table of
+stopped, and gone on with. Thresholds of `plow_twin/estimate/tuning.py` were set on other seeds; the table of
 the pages is made by `tools/pages.py` from the seeds of `estimate_pages.TRUTHS`.
 """
 
@@ -62,7 +62,7 @@ def run_one(name: str, seed: int, periods: float | None = None) -> dict[str, Any
 
 
 def summary(name: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of a group; errors and coverage of what was not withdrawn."""
+    """Return the figures of a group; errors and coverage of the estimates that were not withdrawn."""
     out: dict[str, Any] = {"group": name, "truths": len(rows)}
     expected = GROUPS[name]
     out["as_expected"] = np.mean([(row["model"], row["sensor"]) == (expected.model, expected.sensor) for row in rows])

@@ -1,4 +1,4 @@
-"""What the estimate beside a live node takes of a core: `answer` on windows of 32 s each 10 s, with 256 twins.
+"""Share of a core that the estimate beside a live node takes: `answer` on windows of 32 s each 10 s, with 256 twins.
 
     python benchmark/estimate_live.py
 
@@ -38,9 +38,9 @@ def shares(truth: Truth, load: Load, members: int) -> list[float]:
     pose = next(poses, None)
     for t, wrench in zip(load.t, load.wrench, strict=True):
         while pose is not None and pose[0] <= t:
-            windows.take_pose(round(pose[0] * 1e9), tuple(pose[1].tolist()))
+            windows.add_pose(round(pose[0] * 1e9), tuple(pose[1].tolist()))
             pose = next(poses, None)
-        window = windows.take_load(round(t * 1e9), tuple(wrench.tolist()))
+        window = windows.add_load(round(t * 1e9), tuple(wrench.tolist()))
         if window is None or window.end_ns - window.start_ns < 0.9e9 * WINDOW_S:
             continue
         begin = time.process_time()

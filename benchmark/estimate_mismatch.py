@@ -271,7 +271,7 @@ def _telemetry(kind: Kind, fine: Array, believed: Array) -> tuple[Array, Array]:
         return knots, np.stack([np.interp(knots, fine, column) for column in believed.T], axis=1)
     rows = round(kind.averaged_s / _FINE)
     count = len(fine) // rows
-    # stamped in the middle of what is averaged
+    # stamped in the middle of the averaged span
     middle = fine[: count * rows].reshape(count, rows).mean(axis=1)
     return middle, believed[: count * rows].reshape(count, rows, 3).mean(axis=1)
 

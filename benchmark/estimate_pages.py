@@ -106,7 +106,7 @@ def coverage(held: Sequence[bool]) -> str:
 
 
 def mismatch() -> str:
-    """Return what is published of machines that differ from the model, before and with the step beside the fit."""
+    """Return the estimates of machines that differ from the model, before and with the step beside the fit."""
     now, before = (load_rows(RESULTS / f"estimate_mismatch{name}.jsonl") for name in ("", "_before"))
     lines = [
         "| what differs | clearances | published before | published | interval below 4 mm | RMSE [mm] | "

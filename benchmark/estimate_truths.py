@@ -1,4 +1,4 @@
-"""Synthetic truths for the estimate: a scene, its motion, and what a sensor and a load telemetry make of it.
+"""Synthetic truths for the estimate: a scene, its motion, and the readings of a sensor and a load telemetry.
 
 The truth is simulated at a tolerance and with a load sampling of its own; in the groups outside the model its law, the
 shape of its load, its sensor or its machine is another one than the estimate believes.
@@ -225,7 +225,7 @@ def _motion(scene: Scene, group: Group, times: Array, end: float) -> tuple[Array
 
 
 def _cells(group: Group, rng: np.random.Generator, force: Array, end: float) -> ContactForces:
-    """Return what load cells make of the true forces, (n, 8) each `_FINE` s."""
+    """Return the readings of load cells for the true forces, (n, 8) each `_FINE` s."""
     t = np.arange(0.0, end, 1.0 / group.forces_hz)
     late = np.maximum(t - group.forces_delay_s * rng.uniform(), 0.0)
     true = np.stack([np.interp(late, _FINE * np.arange(len(column)), column) for column in force.T], axis=1)

@@ -14,6 +14,7 @@ import lives
 import measured_pages
 import month
 import targets
+import tuning_sensitivity
 from bench_scenes import ROOT
 from cases import Row, read_rows
 from ensemble_rows import core_row
@@ -67,7 +68,7 @@ def located() -> str:
 
 
 def work() -> str:
-    """Return what one core does."""
+    """Return the throughput of one core."""
     rows = solver_rows()
     (one,) = [row for row in rows if row.section == "sampled_load" and "256" not in row.scene]
     many = [row for row in rows if row.section == "sampled_load" and "256" in row.scene]
@@ -158,6 +159,7 @@ FIGURES: dict[str, Callable[[], str]] = {
     "speed": speed, "located": located, "work": work, "missed": missed,
     "random_scenes": random_scenes, "siconos": siconos, "lives": life_table, "month": month_table,
     "follow": follow_table, **estimate_pages.FIGURES, **measured_pages.FIGURES,
+    "tuning": tuning_sensitivity.table,
     **{name: stored(name) for name in ("live_node", "replay", "estimate_forces", "estimate_scales", "estimate_live")},
 }  # fmt: skip
 

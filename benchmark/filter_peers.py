@@ -4,7 +4,7 @@
 
 State of both: pose, its rate, the clearances, softness, damping, load gains, the sensor's bias and delay. Both move
 their points with the project's own solver, know the sensor's noise, and begin at the nominal scene with the prior of
-the estimate. Rows are appended to `results/filter_peers.jsonl`, what it holds already is not run again.
+the estimate. Rows are appended to `results/filter_peers.jsonl`; rows already there are not run again.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ class Members:
 
 
 def seen(point: Array) -> Array:
-    """Return the pose that the sensor tells at a state: late, and with its bias."""
+    """Return the pose that the sensor shows at a state: late, and with its bias."""
     unknown = point[_FIRST:]
     pose: Array = point[:3] + unknown[7:10] - point[3:6] * unknown[10]
     return pose
@@ -194,7 +194,7 @@ def run_one(name: str, method: str, seed: int) -> dict[str, Any]:
     try:
         for t, q in zip(truth.poses.t[1:], truth.poses.q[1:], strict=True):
             one.predict(float(t) - one.now)
-            # a component that was not measured tells nothing
+            # a component that was not measured carries no information
             there = np.isfinite(q)
             one.update(np.where(there, q, 0.0), np.diag(np.where(there, noise, 1e3) ** 2))
     except np.linalg.LinAlgError as error:

@@ -1,4 +1,4 @@
-"""Forces with intervals: do they hold the true peaks and impulses, and what do 256 twins under 1 kHz samples cost.
+"""Forces with intervals: coverage of the true peaks and impulses, and the cost of 256 twins under 1 kHz samples.
 
 python benchmark/force_intervals.py --truths 6 --seed 7000
 """

@@ -17,7 +17,7 @@ import numpy as np
 from bench_scenes import T_END
 from cases import Array, Sample, timed
 
-#: How long an event that has just fired is not looked for [s]; heyoka's own choice takes in the next touch of a pair.
+#: Time for which an event that has just fired is not searched again [s]; heyoka's default hides the next touch.
 _COOLDOWN = 1e-7
 #: Parameters after the modes of the pairs: both clearances.
 _GX, _GY = 8, 9
@@ -38,7 +38,7 @@ def _pairs(p: Array, state: Sequence[Any], hy: Any) -> list[tuple[Any, ...]]:
 
 
 def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tuple[Any, Any]]]:
-    """Return the rates of the state, and for each pair what turns positive at a touch and negative where it pulls."""
+    """Return the rates of the state, and for each pair a function positive in contact, negative where it would pull."""
     import heyoka as hy
 
     names = ("x", "y", "th", "vx", "vy", "om")
@@ -55,7 +55,7 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
             force = hy.par[i] * law
         else:
             law = 1.0 + p[10] * rate
-            # a base of 1 where the pair does not act: the power of a negative number is none
+            # a base of 1 where the pair does not act: a negative number has no real power
             force = hy.par[i] * p[8] * (hy.par[i] * d + (1.0 - hy.par[i])) ** p[9] * law
             d = d - begin
         fx, fy, torque = fx + along_x * force, fy + along_y * force, torque + arm * force
@@ -70,7 +70,7 @@ def _equations(p: Array, begin: float) -> tuple[list[tuple[Any, Any]], list[tupl
 
 
 def _begin_of(tol: float) -> float:
-    """Return the penetration in m at which a force d^1.5 begins: its impulse until there is what a touch loses."""
+    """Return the penetration in m at which a force d^1.5 begins: a touch loses its impulse up to there."""
     return min(1e-6, max(1e-9, 1e-4 * math.pow(tol, 2.0 / 3.0)))
 
 
@@ -119,7 +119,7 @@ def _integrator(numbers: tuple[float, ...], tol: float) -> Any:
 
 
 def prepare(p: Array, tol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare a run of a bench scene; what compiling takes is not timed."""
+    """Prepare a run of a bench scene; compiling is not timed."""
     integrator, inside = _integrator(tuple(p.tolist()), tol)
     grid = np.arange(round(T_END / output_dt) + 1) * output_dt
 

@@ -2,7 +2,7 @@
 
     python benchmark/kernel_profile.py bench_kv 1e-3 [--seconds 5]
 
-perf names what it finds by /tmp/perf-<pid>.map, which is written here from the object code of each library.
+perf takes symbols from /tmp/perf-<pid>.map, which is written here from the object code of each library.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def reach(ladder: Sequence[Row], level: float) -> Reached | None:
 
 
 def fastest(rows: Sequence[Row], scene: str, output_s: float, level: float, member: Member) -> Reached | None:
-    """Return what the fastest solver of a group needs for an error of at most `level`."""
+    """Return the time of the fastest solver of a group for an error of at most `level`."""
     times = [reach(ladder, level) for ladder in ladders(rows, scene, output_s, member)]
     return min((time for time in times if time is not None), key=lambda time: time.wall_ms, default=None)
 

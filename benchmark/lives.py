@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plow_twin import Clearance, Scene, Wear, load_scene
-from plow_twin.estimate import life
+from plow_twin.estimate import life, tuning
 from plow_twin.estimate.coefficient import History, coefficient
 from plow_twin.estimate.forecast import HOUR_S, Plan, forecast, with_clearances
 from plow_twin.model.scene import Harmonic
@@ -51,11 +51,12 @@ def truth(rng: np.random.Generator) -> tuple[Scene, float, life.Path]:
     nominal = replace(paper, clearance=clearance, wear=Wear(1e-15, 0.015, 2.0, prior_m2_n=PRIOR))
     low, high = np.log(PRIOR)
     known = float(np.exp(rng.normal(0.5 * (low + high), (high - low) / 3.2897)))
-    step, life.LARGEST_CHANGE = life.LARGEST_CHANGE, life.LARGEST_CHANGE / 4.0
+    jump = tuning.JUMP
+    tuning.JUMP = (jump[0] / 4.0, jump[1])
     try:
         path = life.wear_path(replace(nominal, loads=loads), limits(nominal), np.inf)
     finally:
-        life.LARGEST_CHANGE = step
+        tuning.JUMP = jump
     return nominal, known, path
 
 
@@ -137,7 +138,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.option("--seed", default=1000, show_default=True, help="First seed.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "lives.jsonl", show_default=True)
 def main(lives: int, seed: int, out: Path) -> None:
-    """Run the lives; each is written as soon as it is done, and what is there is not run again."""
+    """Run the lives; each is written as soon as it is done, and lives in the file are not run again."""
     rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
     for number in range(seed, seed + lives):
         if any(row["seed"] == number for row in rows):

@@ -216,7 +216,7 @@ def integrate(p: Array, rtol: float, output_dt: float, q: Array) -> tuple[int, i
 
 
 def prepare(p: Array, rtol: float, output_dt: float) -> Callable[[], Sample]:
-    """Prepare a run; what compiling takes is not timed."""
+    """Prepare a run; compiling is not timed."""
     q = np.zeros((round(T_END / output_dt) + 1, 3))
     integrate(p, 1e-3, 1.0, np.zeros((1, 3)))
 

@@ -65,7 +65,7 @@ class Impacts:
         self.half = np.random.default_rng(1).permutation(len(self.before)) % 2
 
     def missed(self, found: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """Return the norm of what the velocities miss in m/s, omega by the radius of gyration."""
+        """Return the norm of the velocities' error in m/s, omega by the radius of gyration."""
         return np.asarray(np.linalg.norm((found - self.after[chosen])[:, 3:] * [1.0, 1.0, GYRATION], axis=1))
 
     def fit(self, start: EllipseContact, names: tuple[str, ...], chosen: np.ndarray) -> EllipseContact:
@@ -112,7 +112,7 @@ class Impacts:
         return errors(np.concatenate(missed))
 
     def floor(self) -> dict[str, Any]:
-        """Return what any impulse at the lowest point leaves."""
+        """Return the error that remains with the best impulse at the lowest point."""
         arm, up = contact_arms(self.before[:, 2])
         change = (self.after - self.before)[:, 3:] * [-1.0, 1.0, GYRATION]
         rows = np.zeros((len(change), 3, 2))
@@ -223,7 +223,7 @@ RIGID = {
 
 
 def by_law(impacts: Impacts) -> dict[str, Any]:
-    """Return the errors of each law with each friction, all numbers fitted, and of what was added to one of them."""
+    """Return the errors of each law with each friction, all numbers fitted, and of additions to one of them."""
     found: dict[str, Any] = {"any impulse at the point": impacts.floor()}
     for name, model in RIGID.items():
         found[f"rigid: {name}"] = impacts.rigid(model)
@@ -275,7 +275,7 @@ TWO_AT_ONCE_S = 1e-3
 
 
 class Square:
-    """The measured drops and what a block with a marker makes of them."""
+    """The measured drops and their simulation by a block with a marker."""
 
     def __init__(self, drops: Drops) -> None:
         self.drops, self.usable = drops, np.array(drops.usable())

@@ -28,7 +28,7 @@ _CREEP = 0.005
 
 @dataclass(frozen=True)
 class Machine:
-    """What a scene does not tell.
+    """Properties of the machine that a scene lacks.
 
     Attributes
     ----------

@@ -19,7 +19,7 @@ from estimate_truths import PERIOD, cutting
 from numpy.typing import NDArray
 
 from plow_twin import Clearance, Contact, Scene, Table, Wear, load_scene, simulate
-from plow_twin.estimate import life
+from plow_twin.estimate import life, tuning
 from plow_twin.estimate.answer import under_load
 from plow_twin.estimate.coefficient import History, coefficient
 from plow_twin.estimate.estimate import estimate
@@ -47,7 +47,7 @@ _BROAD, _NOISE = np.array([8e3, 4e3, 1.1e4]), np.array([5e-4, 5e-4, 2e-3])
 
 @dataclass(frozen=True, eq=False)
 class Machine:
-    """What is believed of a machine, and what is true of it."""
+    """Belief about a machine, and its true values."""
 
     believed: Scene
     scene: Scene
@@ -75,7 +75,7 @@ def load_of(one: Machine, rng: np.random.Generator, span: float) -> tuple[Array,
 
 
 def visit(one: Machine, worn: Scene, rng: np.random.Generator) -> tuple[Load, Poses]:
-    """Return what is measured of a worn machine: the load believed, and the poses that the sensor tells."""
+    """Return the measurements of a worn machine: the load as believed, and the poses that the sensor shows."""
     t, believed = load_of(one, rng, _SPAN)
     motion = simulate(replace(worn, loads=(Table("cutting", t, believed * one.gain),)), _SPAN, _FINE, 1e-6)
     at = np.arange(0.0, _SPAN, _POSE_STEP)
@@ -118,15 +118,15 @@ def one_month(seed: int, day_m: float) -> dict[str, Any]:
 
 def true_path(one: Machine, rng: np.random.Generator, day_m: float) -> life.Path:
     """Return the path of the true wear over the month, in finer steps and with longer means than an estimate's."""
-    step, periods = life.LARGEST_CHANGE, life.MEAN_PERIODS
-    life.LARGEST_CHANGE, life.MEAN_PERIODS = step / 4.0, 4 * periods
+    jump, periods = tuning.JUMP, tuning.MEAN_PERIODS
+    tuning.JUMP, tuning.MEAN_PERIODS = (jump[0] / 4.0, jump[1]), (periods[0], 4 * periods[1])
     try:
-        t, believed = load_of(one, rng, (life.SETTLE_PERIODS + life.MEAN_PERIODS + 1) * PERIOD)
+        t, believed = load_of(one, rng, (sum(tuning.MEAN_PERIODS) + 1) * PERIOD)
         scene = replace(one.scene, loads=(Table("cutting", t, believed * one.gain),), wear=one.believed.wear)
         most = one.coefficient_m2_n * float(DAYS[-1]) * day_m / PAD_AREA_M2
         return life.wear_path(scene, (np.inf, np.inf), most)
     finally:
-        life.LARGEST_CHANGE, life.MEAN_PERIODS = step, periods
+        tuning.JUMP, tuning.MEAN_PERIODS = jump, periods
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
@@ -151,7 +151,7 @@ def summary(rows: list[dict[str, Any]]) -> str:
 @click.option("--day-km", default=75.0, show_default=True, help="Way along the face in a day: 300 passes of 250 m.")
 @click.option("--out", type=click.Path(path_type=Path), default=RESULTS / "month.jsonl", show_default=True)
 def main(truths: int, seed: int, day_km: float, out: Path) -> None:
-    """Run the months; each is written as soon as it is done, and what is there is not run again."""
+    """Run the months; each is written as soon as it is done, and months in the file are not run again."""
     rows = [json.loads(line) for line in out.read_text(encoding="utf-8").splitlines()] if out.exists() else []
     rows = [row for row in rows if row["day_m"] == 1e3 * day_km]
     for number in range(seed, seed + truths):

@@ -14,7 +14,7 @@ FLAGS = ("-O3", "-march=native", "-std=gnu11", "-Wall")
 
 
 class NotInstalled(Exception):
-    """Something that a peer needs is missing; the message says what."""
+    """Something that a peer needs is missing; the message names it."""
 
 
 def compile_c(source: str, libraries: Sequence[str], flags: Sequence[str] = FLAGS) -> str:

@@ -88,7 +88,7 @@ def _draw_lives(panel: Any, lives: Sequence[dict[str, Any]]) -> None:
 
 
 def main() -> None:
-    """Draw what the results hold."""
+    """Draw the results."""
     path = RESULTS.parent.parent / "docs" / "images" / "estimate.png"
     draw(fresh(load_rows(RESULTS / "estimate.jsonl")), load_rows(RESULTS / "lives.jsonl"), path)
 

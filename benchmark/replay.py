@@ -1,4 +1,4 @@
-"""Replay beside plain reading of the same file, and what a recording costs: `python benchmark/replay.py [SECONDS]`.
+"""Replay beside plain reading of the same file, and the cost of a recording: `python benchmark/replay.py [SECONDS]`.
 
 Records the paper's head at 1 kHz with all outputs, then prints size, replay multiples (all messages, digests alone),
 what bounds them (the motion alone, decompressing alone), the same for a drawing thinned as that of an hour, and the
@@ -51,7 +51,7 @@ def record(folder: Path, seconds: float, outputs: bool) -> int:
     for index in range(round(1000 * seconds)):
         fx, fy, moment = (np.sin(2e-3 * index) * _AMPLITUDE).tolist()
         session.apply(Sample(_START_NS + index * 1_000_000, (fx, fy, moment)))
-        published = session.outputs.take()
+        published = session.outputs.pop()
         if outputs:
             recorder.publication(published)
     session.close()
@@ -78,7 +78,7 @@ def _wrenches(index: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def move(seconds: float, rows: bool) -> None:
-    """Advance a twin by the samples of the recording, with or without what is published of them."""
+    """Advance a twin by the samples of the recording, with or without its publications."""
     twin = Twin(load_scene(scene_path("paper")), excitation="sampled")
     index, memory = np.arange(round(1000 * seconds)), np.zeros(_BATCH, ROW)
     for begin in range(0, len(index), _BATCH):

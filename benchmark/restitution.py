@@ -30,7 +30,7 @@ SHOWN = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
 RATIOS = (0.0, 0.01, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0)
 #: Ramp lengths of the ramped law, over the depth v sqrt(m/K) of the undamped impact.
 RAMPS = (0.001, 0.01, 0.1, 0.3, 1.0, 3.0, 10.0)
-#: A law is called valid where it delivers what it was asked for within this share.
+#: A law is called valid where it delivers the restitution asked for within this share.
 VALID = 0.05
 
 MASS_KG, SPEED_M_S, STIFFNESS, EXPONENT = 2.0, 1.0, 1e9, 1.5
@@ -183,12 +183,12 @@ def write_csv(rows: Sequence[Row], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["law", "asked", "ramp", "delivered"])
-        # nine digits: what the solver holds on every machine
+        # nine digits, which the solver keeps on every machine
         writer.writerows([row.law, f"{row.asked:g}", f"{row.ramp:g}", f"{row.delivered:.9f}"] for row in rows)
 
 
 def write_page(rows: Sequence[Row], path: Path) -> None:
-    """Replace what stands between the marks of the page."""
+    """Replace the text between the marks of the page."""
     before, _, rest = path.read_text(encoding="utf-8").partition(BEGIN)
     _, _, after = rest.partition(END)
     parts = ["## Delivered", "", *page_table(rows), "", "## Validity", "", *laws_table(rows), ""]

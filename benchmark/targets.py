@@ -1,4 +1,4 @@
-"""What the solver is held to, and whether a run of the benchmark reaches it."""
+"""Targets of the solver, and whether a run of the benchmark reaches them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from workloads import HOUR_S
 
 @dataclass(frozen=True)
 class Verdict:
-    """One line: the work, what was measured, what was wanted, and whether it was reached."""
+    """One line: the work, the figure measured, the target, and whether it was reached."""
 
     work: str
     measured: str
@@ -60,7 +60,7 @@ RATIOS = (
 )
 ENSEMBLE_S, WITHIN, REAL_TIME, CORE_SHARE = 0.5, 10.0, 1000.0, 0.25
 BATCH_TIMES = 5.0
-#: What "near nothing" is taken to be: this share of an hour of the driven scene.
+#: Definition of "near nothing": this share of an hour of the driven scene.
 IDLE_SHARE = 0.01
 
 

@@ -36,7 +36,7 @@ def _decades(loosest: int, tightest: int, per_decade: int = 2) -> tuple[float, .
 
 
 TOLERANCES = _decades(1, 12)
-#: What --quick takes of them.
+#: The subset for --quick.
 QUICK_TOLERANCES = (1e-3, 1e-6, 1e-9, 1e-12)
 FIXED_STEPS = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5, 2e-5, 1e-5)
 LEAN_STEPS = (*FIXED_STEPS, 5e-6, 2e-6, 1e-6)
@@ -217,7 +217,7 @@ def multibody_cases(scene_name: str) -> Iterator[Case]:
 
 
 def unmodelled(scene_name: str) -> Iterator[Row]:
-    """Yield rows for what a peer cannot model."""
+    """Yield rows for cases that a peer cannot model."""
     if scene_name == "hc":
         yield Row(
             SECTION, "hc", "MuJoCo", "", DENSE, T_END, status="not run: no contact force with d^1.5 (1 + lambda d')"

@@ -1,4 +1,4 @@
-"""What work costs: stiff walls, long times, contact events, features."""
+"""Cost of work: stiff walls, long times, contact events, features."""
 
 from __future__ import annotations
 

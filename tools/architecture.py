@@ -15,6 +15,7 @@ COLUMN = 470
 SUBPACKAGES = (
     (("cli", "plow-twin"),),
     (("demo", "publisher, summary"), ("study", "calibration, sweep, analysis")),
+    (("telemetry", "results to a plant"),),
     (("dashboard", "the operator's screen"),),
     (("ros", "the node"),),
     (("live", "runtime, bridges"),),

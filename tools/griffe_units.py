@@ -1,4 +1,4 @@
-"""Gives the fields of scenes their meaning in the reference: the unit and text that stand with each in the source."""
+"""Gives the fields of scenes their meaning in the reference: unit and text of each from the source."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Write the tables of the pages that come from stored results or from the code: `python tools/pages.py`.
 
-A page says where a table belongs by `<!-- made: NAME -->` and `<!-- end -->`; what stands between is replaced by what
+A page marks the place of a table by `<!-- made: NAME -->` and `<!-- end -->`; the text between is replaced by what
 `TABLES[NAME]` returns.
 """
 
@@ -23,7 +23,7 @@ _BLOCK = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def renewed(text: str) -> str:
-    """Return a page with its tables made anew."""
+    """Return a page with its tables renewed."""
     return _BLOCK.sub(lambda block: f"{block[1]}\n{TABLES[block[2]]().strip()}\n\n{block[3]}", text)
 
 

@@ -1,4 +1,4 @@
-"""What the site has beside `docs/`: the README as its home, and a page for each example with its README and sources."""
+"""Pages of the site besides `docs/`: the README as its home, and a page for each example with README and sources."""
 
 from __future__ import annotations
 

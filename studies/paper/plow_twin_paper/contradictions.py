@@ -1,4 +1,4 @@
-"""Where the paper speaks against itself or leaves open what a reader needs, each with what this run says to it."""
+"""Contradictions and omissions of the paper, each with the evidence of this run."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from plow_twin_paper.values import FACE_T_END_S, MOMENTS, OMEGA_RAD_S, SENSE_NAM
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A place in the paper, what is said there, and what a number shows about it."""
+    """A place in the paper, its statement, and the number that bears on it."""
 
     source: str
     statement: str

@@ -1,4 +1,4 @@
-"""All figures of the report, each with what the paper shows there and what is drawn here."""
+"""All figures of the report, each with the content of the paper's figure and of this one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on disk, its heading, what the paper's figure shows by its text, and what this one shows."""
+    """A figure on disk, its heading, the content of the paper's figure by its text, and of this one."""
 
     path: Path
     heading: str
@@ -97,7 +97,7 @@ def _plans(runs: PaperRuns) -> list[tuple[str, str, str, str, Callable[[], Figur
 
 
 def _falls(runs: PaperRuns) -> str:
-    """Say how far each curve of Fig. 11 falls below what it reached before, between the marks too."""
+    """Describe how far each curve of Fig. 11 falls below its earlier maximum, between the marks too."""
     forces = runs.horizontal.largest_n
     falls = np.max(np.maximum.accumulate(forces, axis=0) - forces, axis=0)
     listed = ", ".join(f"{corner} {1e-3 * fall:.1f}" for corner, fall in zip(CORNERS, falls, strict=True))

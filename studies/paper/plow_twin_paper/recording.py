@@ -83,7 +83,7 @@ def _drive(
     writer: RunWriter,
     on_progress: Callable[[float], object],
 ) -> Array:
-    """Feed the scene's loads to a twin, write what it took and said, and return its poses, shape (n, 3)."""
+    """Feed the scene's loads to a twin, write its inputs and outputs, and return its poses, shape (n, 3)."""
     from plow_twin.record.outputs import publication_messages
 
     header, sequence = writer.header, -1
@@ -105,7 +105,7 @@ def _drive(
         if advance.status:
             raise SolverError(f"recorded run at t = {times[index]:.9g} s: {advance.status.text}")
         poses[index] = advance.q
-        published = session.outputs.take() if index % MESSAGE_EVERY == 0 else NOTHING
+        published = session.outputs.pop() if index % MESSAGE_EVERY == 0 else NOTHING
         for name, message in publication_messages(published, header.frame_id, header.child_frame_id).items():
             writer.write_output(header.topic(name), sequence, stamp_ns, stamp_ns, message)
         if index % 1000 == 0:

@@ -2,7 +2,7 @@
 
 A centre of mass off the cavity's centre couples translation and rotation in the mass matrix; the paper leaves that out
 and keeps a constant moment -m g arm (its section 2). The equivalent offset is `com_offset_m = (arm, 0)`. The paper does
-not say what point its inertia is about: both readings are run.
+not say about which point its inertia is meant: both readings are run.
 """
 
 from __future__ import annotations

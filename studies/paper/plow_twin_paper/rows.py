@@ -1,4 +1,4 @@
-"""What a row of the table published / reconstructed / difference / agrees is."""
+"""Rows of the table published / reconstructed / difference / agrees."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
-#: What stands behind a row beside the numbers of the scene.
+#: Data behind a row besides the numbers of the scene.
 FITTED: Final = "fitted to this"
 CHECK: Final = "not fitted to this"
 ASSUMED: Final = "not fitted to this; other clearance assumed 20 mm"
@@ -28,7 +28,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Row:
-    """One published statement beside what was computed.
+    """One published statement beside the computed value.
 
     Attributes
     ----------
@@ -65,5 +65,5 @@ class Row:
 
 
 def braces(corners: str) -> str:
-    """Write a set of corners as people do: {a,d}; none for the empty one."""
+    """Write a set of corners as {a,d}; `none` for the empty set."""
     return "{" + ",".join(corners) + "}" if corners else "none"

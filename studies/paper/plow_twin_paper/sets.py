@@ -55,7 +55,7 @@ def of_sense(sense: Sense) -> NDArray[np.bool_]:
 def holds(scene: Scene, result: Result, sense: Sense) -> list[Hold]:
     """Return the sets of one sense in order of time, without gaps, from 0 to the end of the run."""
     letters, chosen = letters_of_pairs(scene), of_sense(sense)
-    carries = result.force[0] > 0.0  # what penetrates at t = 0 is in contact without an event
+    carries = result.force[0] > 0.0  # a pair that penetrates at t = 0 is in contact without an event
     found: list[Hold] = []
     start, now = 0.0, _name(letters, carries & chosen)
     for event in result.events:

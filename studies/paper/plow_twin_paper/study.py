@@ -141,7 +141,7 @@ def _changes(runs: PaperRuns) -> list[Change]:
 
 
 def row_as_plain(row: Row) -> dict[str, Any]:
-    """Return a row as it stands in JSON and CSV; the difference is a share, what is published is `given`."""
+    """Return a row as it stands in JSON and CSV; the difference is a share, published values are `given`."""
     return asdict(row) | {
         "difference": row.difference,
         "verdict": row.verdict.value,

@@ -2,7 +2,7 @@
 
 Source: Mao, Zhang et al., "Dynamic characteristics of plough head under contact-impact with clearances", J. Vibration
 and Shock 34(19), 2015. Its curves are known through its text alone, so places are sections and figures. The criteria by
-which a run is said to agree stand at the end; they are ours.
+which a run counts as agreeing stand at the end; they are ours.
 """
 
 from __future__ import annotations
@@ -85,5 +85,5 @@ FORCE_TOLERANCE: Final = 0.05
 SHORTEST_HOLD_S: Final = 5e-3
 #: A step against a trend counts from this share of the curve's largest value on: what a printed curve shows.
 TREND_SLACK: Final = 0.005
-#: "rare" for what the paper does not mention: at most that share of the contact time.
+#: "rare", for sets that the paper does not mention: at most this share of the contact time.
 RARE_SHARE: Final = 0.10
