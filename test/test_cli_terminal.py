@@ -98,7 +98,7 @@ def test_numbers_that_are_estimated_or_compared_have_their_units_and_are_whole(
         *(Interval(0.72597344, 0.71644036, 0.73563338), small, small, small, small, small, small, small),
         groups={"horizontal_bottom": (small, State.NOT_OBSERVABLE)},
     )
-    estimate_verb._show(found, scene)
+    estimate_verb.show_estimate(found, scene)
     lines = printed()
     assert max(map(len, lines)) <= WIDTH and not any("…" in line for line in lines)
     for head in ("stiffness [MN/m^n]", "damping [s/m]", "horizontal, bottom [mm]"):

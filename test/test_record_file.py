@@ -50,6 +50,9 @@ from plow_twin.stream.journal import (
 )
 
 JOURNAL = {Sample: "samples", Digest: "digests"}
+# a journal keeps whole numbers of 64 bits
+whole = st.integers(-(2**63), 2**63 - 1)
+counts = st.integers(1, 2**63 - 1)
 stamps = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 entries = st.one_of(
@@ -57,20 +60,20 @@ entries = st.one_of(
     st.builds(Hold, stamps),
     st.builds(Travel, stamps, numbers),
     st.builds(Reset, stamps, st.text()),
-    st.builds(Parameter, st.text(), st.one_of(st.booleans(), st.integers(), numbers, st.text())),
+    st.builds(Parameter, st.text(), st.one_of(st.booleans(), whole, numbers, st.text())),
     st.builds(Snapshot, stamps, st.binary()),
     st.builds(Digest, stamps, st.text("0123456789abcdef", min_size=16, max_size=16)),
-    st.builds(Loss, st.integers(1)),
+    st.builds(Loss, counts),
     st.builds(
         Unused,
         st.text(),
         st.text(),
         st.text(),
-        st.integers(),
+        whole,
         st.lists(stamps).map(tuple),
         st.lists(st.lists(st.floats(allow_subnormal=True).map(lambda number: number or 0.0)).map(tuple)).map(tuple),
     ),
-    st.builds(Dropped, st.text(), st.integers(1)),
+    st.builds(Dropped, st.text(), counts),
 )
 
 

@@ -30,7 +30,7 @@ def record(folder: Path) -> None:
     for index in range(3000):
         load = np.sin(2e-3 * index) * np.array([40e3, 11e3, 30e3])
         session.apply(Sample(1_800_000_000_000_000_000 + index * 1_000_000, tuple(load)))
-        recorder.publication(session.outputs.take())
+        recorder.publication(session.outputs.pop())
     session.close()
     assert recorder.close().complete
 
