@@ -460,6 +460,7 @@ def test_no_line_is_drawn_over_a_part_that_is_not_there(
     assert cli(["view", str(run.folder), "--png", str(tmp_path / "run.png")]) == 3
     assert "lost missing_parts: 1" in capsys.readouterr().err
     for axis in figures[0].axes[2:]:
-        for line in axis.lines:
-            times = np.asarray(line.get_xdata(), float)
+        for times in (np.asarray(line.get_xdata(), float) for line in axis.lines):
+            if times.min() == times.max():
+                continue  # marks an instant
             assert np.isnan(times).sum() == 2 and np.nanmax(np.diff(times)) < 0.11
