@@ -4,7 +4,7 @@
     python benchmark/tuning_sensitivity.py --number HUBER
 
 Only numbers that an estimate reads are varied in it. The truths have four load periods and seeds on which nothing was
-set; `tools/pages.py` makes the table of `docs/estimation.md` from the result.
+set; `tools/pages.py` makes the table of `benchmark/results/tuning.md` from the result.
 """
 
 from __future__ import annotations

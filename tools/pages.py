@@ -17,7 +17,11 @@ sys.path.append(str(ROOT / "benchmark"))
 import figures  # noqa: E402
 import reference  # noqa: E402
 
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *(ROOT / "benchmark" / "results" / name for name in ("estimate.md", "tuning.md")),
+)
 TABLES: dict[str, Callable[[], str]] = {**figures.FIGURES, **reference.TABLES}
 _BLOCK = re.compile(r"(<!-- made: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
