@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -80,16 +81,25 @@ class Recording:
         Where it lies.
     header : RunHeader
         Settings of the run.
-    scene : Scene
-        The scene that was computed.
     """
 
     def __init__(self, path: Path) -> None:
         reader = RunReader(path)
         self.path = path
+        self._named = reader.path
         self.header: RunHeader = reader.header
-        self.scene: Scene = reader.header.scene(reader.path)
         self._losses: dict[str, int] | None = None
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The scene that was computed; the tables do not need it.
+
+        Raises
+        ------
+        RecordingError
+            It cannot be used here.
+        """
+        return self.header.scene(self.path)
 
     @property
     def names(self) -> tuple[str, ...]:
