@@ -1,7 +1,7 @@
 """The numbers of the estimator that were chosen rather than derived, each with what it was set on.
 
 They are read as `tuning.NAME` where they are used, so that `benchmark/tuning_sensitivity.py` can vary them;
-`benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds are those of `benchmark/estimate.py`.
+`benchmark/results/tuning.md` shows them with the sensitivity that it measured. Seeds: `benchmark/estimate.py`.
 A penetration is that under the reference force of 100 kN.
 """
 
