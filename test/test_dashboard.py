@@ -38,7 +38,7 @@ from plow_twin.record.replay import replay
 from plow_twin.scene_file import dump_scene, load_scene
 from plow_twin.solve.state import ROW, WITH_INTERVALS
 from plow_twin.stream.journal import Digest, Mark, Parameter
-from plow_twin.stream.outputs import NOTHING, Published
+from plow_twin.stream.outputs import CLEARANCE_NAMES, NOTHING, SLOW, Published
 
 TOKEN = "a token of the screen"
 FACTS: dict[str, Any] = {"scene": "paper", "pads": [], "thresholds": {}}
@@ -100,6 +100,37 @@ def test_the_intervals_of_a_twin_that_follows_are_shown_with_its_peaks() -> None
     feed.turn()
     with theirs:
         assert json.loads(theirs.recv(1 << 16))["motion"]["points"] == [7.0] * 8 + [20.0] * 8
+    link.close()
+
+
+def test_the_clearances_of_an_estimate_after_the_last_publication_are_shown_with_its_state() -> None:
+    link, theirs = pair()
+    feed = Feed(link, FACTS)
+
+    def publish(second: float, low: float) -> None:
+        slow = np.zeros(1, SLOW)
+        slow["clearance"][:, CLEARANCE_NAMES.index("horizontal/p05")] = low
+        feed.publication(Published(_published(second, 1.0).rows, slow))
+
+    numbers = {f"{axis}{point}": "0.0265" for axis in ("horizontal", "vertical") for point in ("", "/p05", "/p95")}
+    with theirs:
+        far = Link(theirs)
+
+        def shown() -> tuple[float, float]:
+            feed.turn()
+            clearance = (far.receive() or {})["motion"]["clearance"]
+            return clearance["horizontal/p05"], clearance["vertical/p05"]
+
+        publish(1.0, 0.0057)  # summed up with what follows: it came before the estimate
+        feed.part("estimate", (0, "", numbers))
+        feed.part("status", (0, "", {"horizontal": "estimated", "vertical": "not_observable"}))
+        feed.part("estimate", (0, "estimating", {"estimates": "1"}))
+        assert shown() == shown() == (0.0265, 0.0)
+        publish(2.0, 0.0264)
+        assert shown() == (0.0264, 0.0)
+        feed.part("estimate", (0, "", {}))  # withdrawn
+        feed.part("status", (0, "", {"horizontal": "withdrawn", "vertical": "withdrawn"}))
+        assert shown() == (0.0264, 0.0)
     link.close()
 
 

@@ -5,7 +5,7 @@ An update that is not taken is not queued: its peaks, and the newest of everythi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -31,6 +31,8 @@ _LONGEST: Final = 1000
 #: Most wishes of operators that are heard at once.
 _MOST_ASKED: Final = 8
 _NO_LOAD: Final = np.full(3, np.nan)
+#: States of a clearance that the measurements determine; the estimate itself is not loaded here.
+_KNOWN_STATES: Final = ("estimated", "rough")
 
 
 class Motion:
@@ -43,6 +45,9 @@ class Motion:
         self.penetration = np.full(PAIR_COUNT, np.nan)
         self.force = np.full(PAIR_COUNT, np.nan)
         self.clearance: Array | None = None
+        #: the newest estimate, until clearances are published after it, and the newest status
+        self.estimate: Mapping[str, str] = {}
+        self.status: Mapping[str, str] = {}
         self.load = _NO_LOAD
         self.held = False
         self.clear()
@@ -82,9 +87,25 @@ class Motion:
             self.add_points(_joined(rows, "peak_low"), _joined(rows, "peak_high"))
         self.held = bool(newest["held"])
         self.was_held |= bool(_joined(rows, "held").any())
-        self.clearance = next(
-            (published.slow["clearance"][-1] for published in reversed(waiting) if len(published.slow)), self.clearance
-        )
+        slow = next((published.slow for published in reversed(waiting) if len(published.slow)), None)
+        if slow is not None:
+            self.set_clearance(slow["clearance"][-1])
+
+    def set_clearance(self, values: Array) -> None:
+        """Take in the clearances of a publication [m], in the order of `CLEARANCE_NAMES`."""
+        self.clearance, self.estimate = values, {}
+
+    def _clearances(self, values: Array) -> dict[str, float | None]:
+        """Return clearances by name: those published, or those of an estimate that came after them.
+
+        Nothing may be published any more after an estimate: a file has ended, or the machine stands.
+        """
+        found = {name: number(value) for name, value in zip(CLEARANCE_NAMES, values.tolist(), strict=True)}
+        for axis in [axis for axis in ("horizontal", "vertical") if self.status.get(axis) in _KNOWN_STATES]:
+            for name in (axis, f"{axis}/p05", f"{axis}/p95"):
+                if name in self.estimate:
+                    found[name] = number(float(self.estimate[name]))
+        return found
 
     def update(self) -> dict[str, Any]:
         """Return all of it for the page."""
@@ -103,9 +124,7 @@ class Motion:
         if self.points is not None:
             found["points"] = numbers(self.points.ravel())
         if self.clearance is not None:
-            found["clearance"] = {
-                name: number(value) for name, value in zip(CLEARANCE_NAMES, self.clearance.tolist(), strict=True)
-            }
+            found["clearance"] = self._clearances(self.clearance)
         return found
 
 
@@ -169,6 +188,11 @@ class Feed:
     def part(self, name: str, part: Part) -> None:
         """Take in a status: the newest of each name counts."""
         level, message, values = part
+        if name == "estimate" and "estimates" not in values:  # no part of the diagnostics, which has that name too
+            self._sum_up()  # what was published before it
+            self.motion.estimate = values
+        elif name == "status":
+            self.motion.status = values
         self._parts[name] = level, message[:_LONGEST], {key: text[:_LONGEST] for key, text in values.items()}
 
     def event(self, kind: str, text: str, *, done: bool = True, stamp_ns: int | None = None) -> None:

@@ -165,7 +165,7 @@ class NodeWatch:
         self._motion.pose = pose_of(np.array([*message.position[:2], *message.orientation[2:]]))
 
     def _clearance(self, message: plain.JointState) -> None:
-        self._motion.clearance = message.position
+        self._motion.set_clearance(message.position)
 
     def _quality(self, message: plain.JointState) -> None:
         motion = self._motion

@@ -69,7 +69,6 @@ class RunFeed:
         self._counts["samples_used"] += len(stamps_ns)
         counted = {name: str(count) for name, count in self._counts.items()}
         self._feed.part("input", (0, "", {"source": self._source, **counted}))
-        self._say(batch)
         loads, held = Rows(stamps_ns, stamps_ns, wrench), np.array(held_ns, np.int64)
         arrays = [loads.stamp_ns, held, *(found.stamp_ns for found in rows.values())]
         for second in np.unique(np.concatenate(arrays) // NS_PER_S).tolist():
@@ -78,6 +77,7 @@ class RunFeed:
             self._feed.motion.was_held |= self._feed.motion.held
             while not (self._feed.send() or self._stopped()):
                 time.sleep(_WAIT_S)
+        self._say(batch)  # an estimate stands for the clearances before it
 
     def _second(self, rows: dict[str, Rows], loads: Rows) -> None:
         motion = self._feed.motion
@@ -96,7 +96,8 @@ class RunFeed:
             motion.penetration, _, motion.force = newest["contact_forces"].reshape(3, PAIR_COUNT)
         if "head_state" in newest:
             motion.pose = pose_of(newest["head_state"])
-        motion.clearance = newest.get("clearance", motion.clearance)
+        if "clearance" in newest:
+            motion.set_clearance(newest["clearance"])
 
     def _say(self, batch: Batch) -> None:
         for outputs in batch.outputs:
