@@ -89,9 +89,17 @@ def work() -> str:
 
 
 def missed() -> str:
-    """Return the targets of the solver that were not reached."""
-    rows = [verdict for verdict in targets.verdicts(solver_rows()) if not verdict.reached]
-    return table(["target not reached", "measured", "wanted"], [[row.work, _short(row), row.wanted] for row in rows])
+    """Return the targets of the solver that were not reached, those against one peer in a line."""
+    groups: dict[tuple[str, str], list[targets.Verdict]] = {}
+    for verdict in targets.verdicts(solver_rows()):
+        if not verdict.reached:
+            peer = verdict.work.partition(", against ")[2]
+            groups.setdefault((f"against {peer}" if peer else verdict.work, verdict.wanted), []).append(verdict)
+    lines = []
+    for (work, wanted), rows in groups.items():
+        shown = sorted(map(_short, rows), key=lambda text: float(text.rstrip("x")) if text.endswith("x") else 0.0)
+        lines.append([work, str(len(rows)), " to ".join(dict.fromkeys((shown[0], shown[-1]))), wanted])
+    return table(["target not reached", "cases", "measured", "wanted"], lines)
 
 
 def random_scenes() -> str:

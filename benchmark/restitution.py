@@ -1,7 +1,7 @@
 """Restitution asked of each contact law against the restitution it delivers in a free impact, by our own solver.
 
 `python benchmark/restitution.py` writes `benchmark/results/restitution.csv`, the picture `docs/images/restitution.png`
-and the measured part of `docs/restitution.md`.
+and the measured part of `benchmark/results/restitution.md`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from plow_twin.model.contact_laws import LAWS
 ROOT = Path(__file__).resolve().parent.parent
 TABLE = ROOT / "benchmark" / "results" / "restitution.csv"
 PICTURE = ROOT / "docs" / "images" / "restitution.png"
-PAGE = ROOT / "docs" / "restitution.md"
+PAGE = ROOT / "benchmark" / "results" / "restitution.md"
 BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 
 #: Restitutions asked for: every hundredth in the CSV, these in the page.
