@@ -458,6 +458,15 @@ def expected(spec: Field[Any]) -> str:
     return "true or false" if isinstance(spec.default, bool) else "a text"
 
 
+def _short_range(spec: Field[Any]) -> str:
+    if "choices" in spec.metadata:
+        return ", ".join(spec.metadata["choices"])
+    if "unit" not in spec.metadata:
+        return ""  # the default shows a text, true or false
+    unit = "" if spec.metadata["unit"] in ("1", "as in the scene") else f" {spec.metadata['unit']}"
+    return f"{spec.metadata['low']:g}..{spec.metadata['high']:g}{unit}"
+
+
 def _range(kind: str, spec: Field[Any]) -> str:
     return f"{kind} from {spec.metadata['low']:g} to {spec.metadata['high']:g} [{spec.metadata['unit']}]"
 
@@ -589,10 +598,10 @@ def yaml_text() -> str:
 
 def markdown_table() -> str:
     """Return the table of all parameters for the documentation."""
-    rows = ["| parameter | default | must be | takes effect | meaning |", "|---|---|---|---|---|"]
+    rows = ["| parameter | default | range | effect | meaning |", "|---|---|---|---|---|"]
     for spec in SPECS.values():
         default, effect = _yaml_value(spec.default), spec.metadata["effect"].name.lower()
-        rows.append(f"| `{spec.name}` | `{default}` | {expected(spec)} | {effect} | {spec.metadata['doc']} |")
+        rows.append(f"| `{spec.name}` | `{default}` | {_short_range(spec)} | {effect} | {spec.metadata['doc']} |")
     return "\n".join(rows) + "\n"
 
 
