@@ -46,7 +46,7 @@ def exact_damping_number(restitution: float) -> float:
         upper = math.nextafter(upper, 0.0)
     if residual(upper) > 0.0:
         return upper
-    from scipy.optimize import brentq  # a quarter of a second: only scenes with this law wait for it
+    from scipy.optimize import brentq  # the import takes a quarter of a second: only scenes with this law wait for it
 
     root: float = brentq(residual, lower, upper, xtol=1e-300, rtol=1e-15)
     return root
@@ -69,7 +69,7 @@ class ContactLaw:
     additive : bool
         The damping is C d' beside K d^n (Kelvin-Voigt), not a factor of K d^n.
     ramped : bool
-        C grows from nothing over the penetration `ramp_m`.
+        C grows from 0 over the penetration `ramp_m`.
 
     Raises
     ------

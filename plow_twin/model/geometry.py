@@ -77,7 +77,7 @@ def _of_places(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _of_arms(scene: Scene, rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows of an arm about G; that of a corner of the head does not depend on the head's place."""
+    """Return rows of an arm about G; the arm of a corner of the head does not depend on the head's place."""
     if scene.head.carries == "corners":
         rows[0] *= -1.0
         rows[2:] = 0.0
@@ -174,7 +174,7 @@ def body_states(states: NDArray[np.float64], offset: tuple[float, float]) -> NDA
 
 
 def tumbles(scene: Scene) -> bool:
-    """Tell whether the head may turn beyond 45 degrees: a square block without wear, whose corners are all alike."""
+    """Return whether the head may turn beyond 45 degrees: a square block without wear, whose corners are all alike."""
     alike = scene.frame.width_m == scene.frame.height_m and scene.wear is None
     return scene.head.carries == "corners" and alike
 
@@ -208,8 +208,8 @@ def states_of(scene: Scene, states: NDArray[np.float64]) -> NDArray[np.float64]:
 def length_scale(scene: Scene) -> float:
     """Return the length in m that a tolerance refers to: the smallest clearance that is not negligible.
 
-    A clearance that is zero, negative or below 1e-4 of the frame's diagonal does not count; without any the scale is
-    that fraction of the diagonal.
+    A clearance that is zero, negative or below 1e-4 of the frame's diagonal does not count; without any other the scale
+    is that fraction of the diagonal.
     """
     floor = 1e-4 * math.hypot(scene.frame.width_m, scene.frame.height_m)
     return min((c for c in (scene.clearance.horizontal_m, scene.clearance.vertical_m) if c > floor), default=floor)

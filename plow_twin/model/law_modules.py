@@ -14,7 +14,7 @@ _loaded: list[str] = []
 
 
 def load_laws(names: Iterable[str]) -> None:
-    """Import modules, whose calls of `add_law` define laws for this process; one that is loaded already is passed over.
+    """Import modules, whose calls of `add_law` define laws for this process; a loaded module is passed over.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Loads of a scene as the solver needs them: harmonics grouped by frequency, and one list of linear pieces.
+"""Loads of a scene for the solver: harmonics grouped by frequency, and one list of linear pieces.
 
 A load (Fx, Fy) at the constant arm (x, y) in world axes gives M = x Fy - y Fx about the cavity's centre, whatever the
 pose (paper, section 2). Gravity is not a load.

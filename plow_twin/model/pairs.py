@@ -27,7 +27,7 @@ CORNER_NAMES: Final[tuple[str, ...]] = ("top_left", "top_right", "bottom_right",
 
 #: Side of the frame on which each pair's corner lies, shape (8,): -1 left, +1 right.
 CORNER_X: Final[NDArray[np.float64]] = np.array([-1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
-#: Side of the frame on which each pair's corner lies, shape (8,): -1 bottom, +1 top.
+#: The same vertically: -1 bottom, +1 top.
 CORNER_Y: Final[NDArray[np.float64]] = np.array([1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0])
 #: Outward normal of each pair's wall in head axes, shape (8,) each.
 NORMAL_X: Final[NDArray[np.float64]] = np.array([0.0, -1.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0])

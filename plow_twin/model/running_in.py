@@ -5,9 +5,9 @@ With the coefficient k_s (1 + (r - 1) exp(-h / h0)) a pad whose wear depth would
     h = z + h0 ln(r - (r - 1) exp(-z / h0))        z = h + h0 ln((1 + (r - 1) exp(-h / h0)) / r)
 
 h0 ln r deeper in the end. At constant force z grows with the sliding distance s, z = k_s F s / A, and the coefficient
-comes to its steady value as exp(-s / s0) with s0 = h0 A / (k_s F): a transient that dies away exponentially with the
+reaches its steady value as exp(-s / s0) with s0 = h0 A / (k_s F): a transient that dies away exponentially with the
 distance (Queener, Smith and Mitchell, Wear 8 (1965) 391). As a function of the depth it needs no state of its own: it
-goes on from a saved depth, and begins anew with new pads.
+continues from a saved depth, and starts again with new pads.
 """
 
 from __future__ import annotations

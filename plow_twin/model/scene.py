@@ -30,7 +30,7 @@ class Mark(Enum):
     Attributes
     ----------
     GIVEN
-        Published, or stated by who made the machine.
+        Published, or stated by the maker of the machine.
     RECONSTRUCTED
         Fitted to something published or measured.
     ASSUMED
@@ -132,7 +132,7 @@ class Contact:
     """
 
     law: str = _choice("contact law", LAWS, "exact_restitution")
-    # must be given; a field after one with a default needs one too
+    # must be given; has a default only because it follows a field with one
     stiffness: float = _quantity("N/m^exponent", "K in F = K d^n (...)", math.nan, gt=0.0)
     exponent: float = _quantity("1", "n in F = K d^n (...)", 1.0, ge=1.0, le=4.0)
     damping: float | None = _quantity(
@@ -171,10 +171,10 @@ class Friction:
 
 @dataclass(frozen=True)
 class Support:
-    """What the frame stands on, with a mass of its own: springs and dampers to ground. Without it the frame is fixed.
+    """The frame as a body with mass on springs and dampers to ground. Without it the frame is fixed.
 
     The frame's displacement is counted from where its springs are slack, at rest there at the start; its weight is
-    carried there. q is the head's displacement as seen from the frame, as it is without a support.
+    carried there. q is the head's displacement from the frame, as without a support.
     """
 
     mass_kg: float = _quantity("kg", "mass of the frame and of the parts that move with it", gt=0.0)
@@ -303,7 +303,7 @@ class Scene:
     contact : Contact
     gravity : Gravity
     loads : tuple of Harmonic, Constant or Table
-        All that acts on the head but gravity and contact.
+        Loads on the head beside gravity and contact.
     initial : Initial
         State at t = 0.
     locked : tuple of str
@@ -449,7 +449,7 @@ def _check_choice(key: str, value: Any, spec: Field[Any]) -> Iterator[Problem]:
 
 
 def must_be_given(spec: Field[Any]) -> bool:
-    """Tell whether a field has no default that a scene could have."""
+    """Return whether a scene must give the field, because its default is no valid value."""
     if spec.default is MISSING:
         return spec.default_factory is MISSING
     return isinstance(spec.default, float) and math.isnan(spec.default)

@@ -1,4 +1,4 @@
-"""From a scene to what the kernels take: the one place where names and units of the scene meet the solver's arrays."""
+"""From a scene to the records of the kernels: only here do names and units of the scene meet the solver's arrays."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ from plow_twin.solve.state import (
 TOLERANCE_RANGE = (1e-13, 1e-1)
 #: Share of the tolerance that one step may spend: hundreds of steps and impacts that amplify must stay within it.
 STEP_SHARE = 3e-4
-#: And the most that one may, as a share of the length scale: loose tolerances are exceeded in fewer steps.
+#: Most that a step may spend, as a share of the length scale: a loose tolerance is exceeded in fewer steps.
 LARGEST_STEP_ERROR = 1e-6
-#: The same for exponents that are not integers: what follows the last term falls slower near a branch point.
+#: The same for exponents that are not integers: the remainder of a series falls slower near a branch point.
 STEP_SHARE_FRACTION = 1e-6
-#: Mode changes at one instant before the solver goes on past it.
+#: Mode changes at one instant after which the solver steps past it.
 MAX_EVENTS_AT_ONCE = 64
-#: Harmonics up to this share of what presses the head against its walls may let it rest (`method.small_harmonics`).
+#: Harmonics up to this share of the load that presses the head to its walls may let it rest (`method.small_harmonics`).
 _SMALL_HARMONICS = 1e-2
 
 _Found = TypeVar("_Found")
@@ -109,7 +109,7 @@ def compile_scene(scene: Scene, tol: float, *, sampled: bool = False) -> Compile
 
 
 def compile_scenes(scenes: Sequence[Scene], tol: float) -> tuple[NDArray[np.void], list[CompiledScene]]:
-    """Compile many scenes at one tolerance: what they have in common, as an object, is computed once.
+    """Compile many scenes at one tolerance; parts that are the same object in several scenes are computed once.
 
     Returns
     -------
@@ -146,13 +146,13 @@ def _check_tolerance(tol: float) -> None:
 
 
 class _Shared:
-    """What scenes have in common, computed once for each object that it is made of."""
+    """Results that scenes share, computed once for each set of objects that they depend on."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Any, ...], tuple[Any, Any]] = {}
 
     def of(self, compute: Callable[..., _Found], *sources: object) -> _Found:
-        """Return `compute` of the sources, computed before where it was."""
+        """Return `compute` of the sources; computed only once for the same objects."""
         key = (compute, *map(id, sources))
         if key not in self._known:
             self._known[key] = sources, compute(*sources)  # the sources stay, and keep their identity
@@ -259,7 +259,7 @@ def _scene_terms(
     creeps = present["wear"] or bool({"slip", "stick"} & present.keys())
     present["rest"] = not (creeps or present["support"])
     if present["harmonics"]:
-        # nothing but damping keeps a harmonic from swinging the head up
+        # without damping a harmonic can swing the head up
         damped = law.viscous is not None or law.hysteretic is not None
         present["rest"] &= damped and present["flight"] and _harmonics_are_small(scene, loads)
     return law._replace(**_flags(present))
@@ -276,7 +276,7 @@ def _wear_terms(wear: Wear | None) -> dict[str, bool]:
 
 
 def _harmonics_are_small(scene: Scene, loads: LoadSet) -> bool:
-    """Tell whether the harmonics are small beside what may press the head against its walls: steady loads, preload."""
+    """Return whether the harmonics are small beside the steady loads and preload that press the head to its walls."""
     mass, contact = scene.head.mass_kg, scene.contact
     arms = np.array([1.0, 1.0, 1.0 / geometry.half_diagonal(scene)])
     pressing = np.abs(loads.constant) @ arms + mass * abs(scene.gravity.acceleration_m_s2)
@@ -302,7 +302,7 @@ def _thresholds(admissible: float, order: int) -> Array:
 
 
 def order_for(admissible: float) -> int:
-    """Return the order for the error admissible in a step: what measured fastest on the bench scenes."""
+    """Return the order for the error admissible in a step: the fastest in measurements of the bench scenes."""
     return int(min(MAX_ORDER, max(8, round(6.0 - math.log10(admissible)))))
 
 
@@ -395,7 +395,7 @@ def _velocity_scale(scene: Scene, loads: LoadSet, length: float) -> float:
 def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     """Return the penetration from which the impulse to separation is below a share of the velocity tolerance.
 
-    integral F dt = K d^(n+1) / ((n+1) v) at the speed v. Separations may be a hundred times slower than that, and many.
+    integral F dt = K d^(n+1) / ((n+1) v) at the speed v. There may be many separations, a hundred times slower.
     """
     exponent = scene.contact.exponent
     share = 1e-5 if exponent == 1.5 or float(exponent).is_integer() else 1e-8
@@ -403,7 +403,7 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
     release = float((impulse * (exponent + 1.0) * speed / scene.contact.stiffness) ** (1.0 / (exponent + 1.0)))
     friction = scene.friction
     if friction is not None and friction.stick_stiffness_n_m is not None and friction.coefficient > 0.0:
-        # a corner that is released lets go of its wall: what its spring held by must not be seen either
+        # a released corner lets go of its wall, so the jump of its spring's force must be negligible too
         stretch = max(1e-3 * tol * length, 1e-15 * geometry.half_diagonal(scene))
         held = stretch * friction.stick_stiffness_n_m / friction.coefficient
         # a corner that crosses it in less than 1e-11 s has series whose terms are not finite
@@ -413,7 +413,7 @@ def _release(scene: Scene, tol: float, length: float, speed: float) -> float:
 
 
 def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | None:
-    """Return what implicit steps need, where a contact's damping can outweigh its spring."""
+    """Return nodes and scratch space of implicit steps, where a contact's damping can outweigh its spring."""
     contact = scene.contact
     mobility = 1.0 / scene.head.mass_kg + values["radius"] ** 2 / scene.head.inertia_kg_m2
     if scene.support is not None:
@@ -437,7 +437,7 @@ def _implicit(scene: Scene, terms: Terms, values: dict[str, Any]) -> Implicit | 
 
 
 def _rubbing(scene: Scene) -> dict[str, Any]:
-    """Return what wear depends on beside force and travel (`solve.rubbing`); for what is off nothing but zeros."""
+    """Return the numbers of sliding and running-in (`solve.rubbing`); zeros where they are off."""
     wear, there, found = scene.wear, _wear_terms(scene.wear), dict[str, Any]()
     if wear is not None and there.get("sliding"):
         found["slip_rows"] = geometry.slip_rows(scene)
@@ -448,7 +448,7 @@ def _rubbing(scene: Scene) -> dict[str, Any]:
 
 
 def _slip(scene: Scene) -> dict[str, Any]:
-    """Return what friction needs; without it nothing but a speed to divide by, for scenes that run together."""
+    """Return the numbers of friction; without friction only a speed to divide by, for scenes that run together."""
     friction = scene.friction
     if friction is None:
         return {"slip_speed": 1.0}

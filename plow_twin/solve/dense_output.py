@@ -1,4 +1,4 @@
-"""What a step under way tells at any of its times: state, pose, wear, penetrations and forces."""
+"""Values at any time of the step under way: state, pose, wear, penetrations and forces."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sigma_at(state, used):
         return state.sigma_end
     if state.beta == 0.0 or used == 0.0:  # alpha is 0 too where a step begins at a touch
         return used
-    # the root of alpha sigma + beta sigma^2 / 2 = used that suffers no cancellation
+    # the form of the root of alpha sigma + beta sigma^2 / 2 = used without cancellation
     return 2.0 * used / (state.alpha + math.sqrt(max(state.alpha**2 + 2.0 * state.beta * used, 0.0)))
 
 

@@ -25,7 +25,7 @@ from plow_twin.solve.state import ON, Harmonics, Segments
 
 
 class Acting(NamedTuple):
-    """What the equations of motion take beside the law: few types, so that scenes share what is compiled for them."""
+    """Arguments of the equations of motion beside the law: few types, so that scenes share compiled code."""
 
     harmonics: Harmonics | None
     segments: Segments | None
@@ -38,14 +38,14 @@ class Acting(NamedTuple):
 
 @kernel(inline="source")
 def acting(parts):
-    """Return what acts in a scene beside its law."""
+    """Return these arguments for a scene."""
     terms = parts.terms
     return Acting(parts.harmonics, parts.segments, terms.offset, terms.free, terms.slip, terms.stick, terms.support)
 
 
 @kernel()
 def push(p, slip, stick, state, frozen, pair, force, c, s, omega, x, y, vx, vy):
-    """Return what a pair that pushes with `force` does in body axes: its force, its moment, the power of its friction.
+    """Return the effect of a pair that pushes with `force`, in body axes: force, moment, power of its friction.
 
     The wall's tangent is its normal turned by +90 degrees; the penetration's rows for X and Y are minus the normal.
     """

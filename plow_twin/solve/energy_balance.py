@@ -1,6 +1,6 @@
-"""The energy balance of a run: is the change of energy and momentum what the forces did?
+"""The energy balance of a run: the change of energy and momentum against the work and impulse of the forces.
 
-Forces are evaluated anew as values, not taken from the series: loads at their time, contacts by `model.contact` and
+Forces are evaluated as values, independently of the series: loads at their time, contacts by `model.contact` and
 `model.friction`. Their power and impulse are integrated by Gauss-Legendre quadrature over each step of the series, by
 the trapezoidal rule over fixed steps. Kinetic energy and momentum come from the state alone.
 """
@@ -30,7 +30,7 @@ _PANEL_PHASE = 8.0
 # indices into the powers and impulses at one instant
 LOADS, NORMAL, FRICTION, SUPPORT, LOAD_X, LOAD_Y, LOAD_M, CONTACT_X, CONTACT_Y, CONTACT_M, SIZE = range(11)
 
-#: What is summed over a run.
+#: Sums over a run.
 SUMS = np.dtype(
     [
         ("work", "f8", (SIZE,)),  # integrals of the powers and forces
@@ -51,7 +51,7 @@ BALANCE = np.dtype(
         ("now", "f8", (SIZE,)),  # powers and forces at one instant
         ("before", "f8", (SIZE,)),  # the same a step before
         ("body", "f8", (STATE_SIZE,)),  # body coordinates at a node
-        ("ground", "f8", (STATE_SIZE,)),  # the same, not seen from a frame that gives way but absolute
+        ("ground", "f8", (STATE_SIZE,)),  # absolute body coordinates, where the frame gives way
         ("wear_depth", "f8", (PAIR_COUNT,)),  # wear depth at a node
         ("pairs", "f8", (3, PAIR_COUNT)),  # penetration, rate, force
         ("sums", SUMS),
@@ -61,7 +61,7 @@ BalanceSums: TypeAlias = np.record
 
 
 def new_balance() -> BalanceSums:
-    """Return a balance that has seen nothing."""
+    """Return an empty balance."""
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     balance = new_record(BALANCE)
     balance.nodes[:], balance.weights[:] = 0.5 * (nodes + 1.0), 0.5 * weights

@@ -1,4 +1,4 @@
-"""The first event of a step: guards that stay positive while a mode lasts, and where one of them first does not.
+"""The first event of a step. A guard is positive while a mode lasts; the event is where a guard first turns negative.
 
 Guards are polynomials of the step; `polynomial.first_root` finds where one turns negative.
 """
@@ -16,10 +16,10 @@ from plow_twin.solve.state import CLIPPED, CROSSING, OFF, ON, RATIO, RELEASED, S
 _AT_ONCE = 1e-12
 #: Share of the release penetration at which a pair that is on is released.
 _LET_GO = 0.25
-#: What the proofs of many guards at once allow for rounding: of what is summed, and beside the 1 of 1 + lambda d'.
+#: Allowance for rounding in the proofs of many guards at once: of the sums, and beside the 1 of 1 + lambda d'.
 _ROUNDED, _ROUNDING = 1.0 + 1e-9, 1e-9
 _ALL_PAIRS = 2**PAIR_COUNT - 1
-#: And below which a released pair rests on the wall.
+#: Share of the release penetration below which a released pair rests on the wall.
 _ON_THE_WALL = 1e-6
 
 
@@ -48,7 +48,7 @@ def _guards(p, state, w, order, penetrating, viscous, ramp) -> None:
             # released below a quarter of the penetration at which it acts again, so that no pair hovers between
             first -= min(_LET_GO * p.release, 0.5 * first)
         elif state.mode[pair] == RELEASED and first <= _ON_THE_WALL * p.release:
-            # one that rests on the wall is let go a little outside
+            # a pair that rests on the wall is let go a little outside
             first = max(guard[0, pair] + _LET_GO * p.release, 0.0)
         guard[0, pair] = first if p.enabled[pair] == 1 else 1.0
 
@@ -142,10 +142,10 @@ def _unsafe_pairs(w, order, h):
 
 @kernel(fast=True)
 def _nothing_ends(p, state, w, order, h, penetrating, hysteretic) -> bool:
-    """Tell whether each pair of an integer law without a ramp surely keeps its mode on [0, h].
+    """Return whether each pair of an integer law without a ramp surely keeps its mode on [0, h].
 
-    The first proof of `_unsafe_pairs` and that of `_stays` for the second guards, for all pairs side by side and with
-    room for rounding: where it holds these hold too.
+    Make the first proof of `_unsafe_pairs` and the proof of `_stays` for all pairs side by side, with
+    room for rounding: where they hold here they hold there too.
     """
     weights = w.per_pair
     for pair in range(PAIR_COUNT):
@@ -181,7 +181,7 @@ def _next_mode(p, mode, viscous, fraction, ramp):
 
 @kernel()
 def _stays(column, order, h) -> bool:
-    """Tell whether g_0 > sum max(-g_k, 0) h^k proves that a guard does not turn negative on [0, h]."""
+    """Return whether g_0 > sum max(-g_k, 0) h^k proves that a guard does not turn negative on [0, h]."""
     reach = 0.0
     for k in range(order, 0, -1):
         reach = (reach + max(-column[k], 0.0)) * h
@@ -200,7 +200,7 @@ def _sooner(state, w, order, best) -> float:
 
 @kernel()
 def _ends_with(column, order, at, within) -> bool:
-    """Tell whether a guard that is positive before `at` turns negative no more than `within` after it."""
+    """Return whether a guard that is positive before `at` turns negative at most `within` after it."""
     value, slope = column[order], 0.0
     for k in range(order - 1, -1, -1):
         slope = slope * at + value
@@ -224,7 +224,7 @@ def note_switches(
 ) -> None:
     """Write the mode of each pair that switches at the event to `w.switch`, -1 for the others.
 
-    What happens at one instant but for rounding happens together: a symmetric motion stays symmetric.
+    Changes that differ in time by rounding only happen together: a symmetric motion stays symmetric.
     """
     column, within = w.column[0], _AT_ONCE * at
     ending = _guards_end_with(w, order, at, within)
@@ -264,7 +264,7 @@ def first_event(p, state, w, order, sigma, penetrating, viscous, hysteretic, int
             for k in range(order + 1):
                 column[k], w.halves[0, k] = w.guard[k, pair], w.bernstein[k, pair]
             if _stays(column, order, best):
-                # an event found before is sooner
+                # the event found before is earlier
                 continue
             state.guard_roots += 1
             root = first_root_within(column, order, sigma, w)

@@ -1,6 +1,6 @@
 """Fixed-step methods without event location: RK4 as in the paper, and semi-implicit Euler.
 
-They evaluate the equations of motion (paper, eq. 5) as they stand, in world axes about the centre of mass: a check of
+They evaluate the equations of motion (paper, eq. 5) in world axes about the centre of mass: a check of
 steps and events as much as a method. Geometry and the value of the force are shared.
 """
 
@@ -132,7 +132,7 @@ def integrate_fixed(
 ) -> int:
     """Take `steps` steps of `dt` from step `done[0]` on; row i is written after step i stride. Returns a `Status`.
 
-    z (6,) or (12,) (`support.to_world_both`) keeps what is integrated from one call to the next: converted there and
+    z (6,) or (12,) (`support.to_world_both`) keeps the integrated numbers from call to call: converted there and
     back it would lose its last bits.
     """
     trial, k = np.empty(z.size), np.empty((4, z.size))

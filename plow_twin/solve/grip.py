@@ -5,8 +5,8 @@ A corner that sticks holds its wall by a spring and a damper from an anchor a al
     sticks    T = k (s - a) + c s'      while |T| <= mu_s N
     slips     T = +-mu N                while +-(k s' + c s'') >= mu N'
 
-s is the corner's place along the wall, N the normal force. The second condition says that the spring and the damper,
-taken along with the slip so that they carry mu N, would not carry less if they held now. T has no jump where mu_s = mu:
+s is the corner's place along the wall, N the normal force. The second condition: the spring and the damper,
+dragged along so that they carry mu N, would not carry less if the corner held now. T has no jump where mu_s = mu:
 the accelerations are the same on both sides, so pairs decide one by one. Sources: Cundall and Strack, Geotechnique 29
 (1979) 47; Luding, Granul. Matter 10 (2008) 235, sec. 3.2.
 """
@@ -20,9 +20,9 @@ from plow_twin.solve.contact_force import law_force
 from plow_twin.solve.kinematics import penetration_of, rate_of, row_rate, row_value
 from plow_twin.solve.state import CLIPPED, COS, OFF, OMEGA, ON, SIN, SLIPS_BACKWARD, SLIPS_FORWARD, STICKS, VX, VY, X, Y
 
-#: Below this share of its terms at the step's start, or of the largest over the step, a guard is zero but for rounding.
+#: A guard below this share of its terms at the step's start, or of the largest over the step, is zero up to rounding.
 _ROUNDING, _ROUNDING_OVER_STEP = 1e-10, 1e-13
-#: What rounding leaves of a corner's place along its wall, in shares of the frame, and of its rate.
+#: Rounding error of a corner's place along its wall, as a share of the frame, and of its rate.
 _FINEST = 4e-15
 
 
@@ -62,7 +62,7 @@ def _anchor(p, state, pair, force, place, rate) -> None:
 
 @kernel(inline="code")
 def _normal_force(p, state, pair, depth):
-    """Return N of a pair that pushes, as the series will have it, for a penetration that is negative by its error."""
+    """Return N of a pair that pushes, as in its series, also for a penetration that is negative by its error."""
     return max(law_force(p, state, pair, depth, rate_of(p, pair, state.y)), 0.0)
 
 
@@ -70,15 +70,15 @@ def _normal_force(p, state, pair, depth):
 def grasp(p, state, pair, old) -> None:
     """Let the corner of a pair that begins to push hold its wall by a slack spring, or slip where that is too much.
 
-    What its mode was, `old`, tells the force exactly: that of no depth at a touch, where Kelvin-Voigt has one at once,
-    and none where a clipped pair pushes again. Rounding would tell either of stick and slip.
+    The mode before, `old`, gives the force exactly: at a touch the force of depth 0, which Kelvin-Voigt's damper has,
+    and 0 where a clipped pair pushes again. With the rounded depth, rounding would decide between stick and slip.
     """
     place, rate = _along(p, pair, state.y)
     depth = 0.0 if old == OFF else penetration_of(p, state, pair, state.y)
     normal = 0.0 if old == CLIPPED else _normal_force(p, state, pair, depth)
     state.anchor[pair], state.grip[pair] = place, 0
     held = p.stick_damping * rate
-    # without a force yet it is their rates that decide: the guard of a slip looks at them
+    # without a force yet the rates of both decide, as in the guard of a slip
     if abs(held) > p.static_friction * normal or (normal <= 0.0 and rate != 0.0):
         state.grip[pair] = 1 if rate > 0.0 else -1
 
@@ -88,7 +88,7 @@ def switch_grip(p, state, pair, new) -> None:
     """Let a corner slip or stick."""
     if new == STICKS:
         place, rate = _along(p, pair, state.y)
-        # at a touch Kelvin-Voigt's force is there at once, whatever rounding says of the depth
+        # at a touch Kelvin-Voigt's force acts at once, whatever the rounded depth
         normal = _normal_force(p, state, pair, penetration_of(p, state, pair, state.y))
         _anchor(p, state, pair, state.grip[pair] * p.friction * normal, place, rate)
         state.grip[pair] = 0
@@ -115,7 +115,7 @@ def settle_grips(p, state, force) -> None:
 
 @kernel()
 def weigh_grips(p, state, w) -> None:
-    """Write what a corner's T is made of to `w.grip`: shares of its normal force, of its place and of its slip rate."""
+    """Write the parts of a corner's T to `w.grip`: factors of its normal force, of its place and of its slip rate."""
     for pair in range(PAIR_COUNT):
         acts = state.mode[pair] == ON
         sticks = acts and state.grip[pair] == 0
@@ -149,10 +149,10 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         sign = 1.0 if side == 0 else -1.0
         for k in range(order):
             g[k] = p.static_friction * force[k, pair] - sign * drag[k, pair]
-        # a pair that is on is not beyond its wall but by the error of the place at which it has touched
+        # a pair that is on is outside its wall at most by the error of the place of its touch
         g[0] = p.static_friction * max(force[0, pair], 0.0) - sign * drag[0, pair]
         size, noise = p.static_friction * abs(force[0, pair]) + abs(drag[0, pair]), 0.0
-        # it lets go by so much late, or rounding would have it let go again as soon as it holds
+        # it lets go so much later, or rounding would release it again as soon as it holds
         late = _FINEST * (p.stick_stiffness * p.leverage + p.stick_damping * p.threshold[0])
     else:
         for k in range(order - 1):
@@ -167,7 +167,7 @@ def grip_guard(p, state, w, order, pair, side) -> int:
         for k in range(1, order):
             power *= state.sigma_end
             noise = max(noise, _ROUNDING_OVER_STEP * abs(g[k]) * power)
-    # what it does next is then for its other terms to tell
+    # the other terms then decide
     if abs(g[0]) <= _ROUNDING * size + noise:
         g[0] = max(g[0], 0.0)
     g[0] += late

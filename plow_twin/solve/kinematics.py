@@ -1,6 +1,6 @@
 """Kinematics of the head: penetrations and their rates, and the ways between body and world axes.
 
-Everything that `model.geometry` gives as rows is linear in cosine, sine and place.
+All rows of `model.geometry` are linear in cosine, sine and place.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from plow_twin.kernel.compiler import kernel
 from plow_twin.kernel.simd import row
 from plow_twin.solve.state import COS, OMEGA, SIN, THETA, VX, VY, X, Y
 
-#: A quarter turn in rad: so far apart are the angles at which each corner of a block has the next one's name.
+#: A quarter turn in rad, after which each corner of a block takes the name of the next.
 QUARTER_TURN = 0.5 * math.pi
 
 
@@ -44,7 +44,7 @@ def spin_of_axes(p, omega):
 def named_angle(p, y, theta):
     """Return theta without the quarter turns after which the corners have the names that they have in y.
 
-    Cosine and sine in y are those of that angle. Nothing is taken away where the head carries walls.
+    Cosine and sine in y are those of that angle. Where the head carries walls it is theta itself.
     """
     if fixed_axes(p) is not None:
         turns = np.rint((y[THETA] - math.atan2(y[SIN], y[COS])) / QUARTER_TURN)
@@ -111,7 +111,7 @@ def to_world_axes(c, s, x, y):
 def to_body(p, named, z, y) -> None:
     """Write body coordinates from z = (x, y, theta, vx, vy, omega) of the centre of mass.
 
-    The corners have the names that they have in `named`, which are body coordinates too (`named_angle`).
+    The corners are named as in the body coordinates `named` (`named_angle`).
     """
     angle = named_angle(p, named, z[2])
     c, s = math.cos(angle), math.sin(angle)

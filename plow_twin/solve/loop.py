@@ -1,4 +1,4 @@
-"""The loop: steps one after the other, read out wherever output is wanted."""
+"""The loop: step after step, read out at each time of output."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _proceed(p, parts, state, w, totals, target, stop_time, budget) -> int:
         if code != _OK:
             return code
         low = sigma_at(state, state.elapsed)
-        # a step to a stop may seem to end a rounding error behind it: nothing of it is left over
+        # a step to a stop may end a rounding error behind it; no remainder is left
         stopped = state.ends_at_stop == 1 and target >= state.stop_time
         if target < t0 + state.step_size and not stopped:
             if totals is not None:
@@ -107,7 +107,7 @@ def _worn_now(state, w, wear, out) -> None:
 
 @kernel()
 def _clear(totals) -> None:
-    """Begin to count anew what an advance reports."""
+    """Set the counts of an advance to zero."""
     if totals is not None:
         set_row(totals.peak, 0, splat(0.0))
         set_row(totals.impulse, 0, splat(0.0))
@@ -118,7 +118,7 @@ def _clear(totals) -> None:
 
 @kernel()
 def _undo(support, state, w, target) -> None:
-    """Let the head stay as it was before an advance, whose record has been put back, while time goes on to `target`.
+    """Let time go on to `target` after a failed advance, with the head in the restored state from before it.
 
     A step under way ends at the time before the advance: its place and wear there are in `w.saved`.
     """
@@ -134,8 +134,8 @@ def _undo(support, state, w, target) -> None:
 def _advance(p, parts, states, index, saved, w, totals, target, stop_time, budget, bound, pace):
     """Proceed to `target`, or go on with it; return a `Status` and the steps taken.
 
-    When that fails, time goes on but the head stays as it was, and nothing is counted. `saved` is an array of one
-    record. With a bound a used-up budget is no failure: the rest of the way is taken coarsely.
+    Where it fails, time goes on, the head keeps its state, and nothing is counted. `saved` is an array of one
+    record. With a bound, a used-up budget is no failure: the rest is computed coarsely.
     """
     state = states[index]
     if pace.underway == 0:
@@ -221,7 +221,7 @@ def advance_rows(
         Load per mass and inertia: the last sample, then one at each time, joined by straight lines; each ends a step.
         None: the scene's own loads.
     rows : ndarray of `ROW`, shape (m, n), or None
-        Receives what is known at each time; None without totals.
+        Receives the motion and the totals at each time; None without totals.
     marks, snapshots
         Numbers of advances from 1 on, rising, shape (k,); after each of them the state is copied to `snapshots`, (k,).
     bound
@@ -232,7 +232,7 @@ def advance_rows(
     Returns
     -------
     bool
-        Whether all is done; else the caller looks at its limits and calls again with the same `pace`.
+        Whether all advances are done; else the caller checks its limits and calls again with the same `pace`.
     """
     parts, states = _unowned_loads(parts), unowned(states)
     w, count = work[0], times.size
@@ -268,7 +268,7 @@ def advance_rows(
 
 @kernel(entry=True)
 def interrupt_step(p, parts, state, w, totals) -> None:
-    """End the step under way at the present time: something changes from outside."""
+    """End the step under way at the present time, before a change from outside."""
     if state.step_size < 0.0:
         return
     state.sigma_end = sigma_at(state, state.elapsed)
@@ -291,7 +291,7 @@ def lay_out_again(p, parts, state, w) -> None:
         return
     used, implicit = state.elapsed, parts.implicit
     if implicit is not None:
-        # what laying it out has changed
+        # fields that laying it out has changed
         state.implicit_size, state.decay_times = state.implicit_size_before, state.decay_times_before
         state.refused = state.refused_before
     steps, evaluations, guard_roots = state.steps, state.evaluations, state.guard_roots

@@ -29,7 +29,7 @@ from plow_twin.solve.state import (
     Y,
 )
 
-#: Share of the release penetration, and of the speed that leads there, that counts as nothing.
+#: Share of the release penetration, and of the speed that leads there, that counts as zero.
 _SHALLOW = 1e-3
 #: Halvings of a bracket: to the last bit of a double.
 _BISECTIONS = 60
@@ -61,7 +61,7 @@ def _impact_speed(number, rate, energy) -> float:
     if number <= 0.0 or (energy <= 0.0 and rate == 0.0):
         return 0.0
     full = number - math.log1p(number)
-    # an impact of this speed turns back at the energy; what still moves inward needs a faster one
+    # an impact of this speed turns back at the energy; a pair that still moves inward needs a faster one
     low = math.sqrt(number * number * energy / full)
     high = max(low, abs(rate)) * (1.0 + number)
     low = max(low, rate, -number * rate)
@@ -78,14 +78,14 @@ def _impact_speed(number, rate, energy) -> float:
 
 @kernel()
 def _start_inside(p, state, pair, energy) -> None:
-    """Give a pair that starts inside its wall the damping of the impact that it is in the middle of.
+    """Give a pair that starts inside its wall the damping of the impact that has brought it there.
 
     `energy` is the elastic energy of all pairs, all of which may move the head.
     """
     if p.damping_number >= 0.0:
         y = state.y
         arm = row_value(p.arm_rows, pair, y[COS], y[SIN], y[X], y[Y])
-        # and of a frame that gives way, whose arm is that about its own centre
+        # and of a frame that gives way, with the arm about its own centre
         arm_of_frame = row_value(p.arm_rows, pair, y[COS], y[SIN], 0.0, 0.0)
         mobility = p.inverse_mass + p.free[2] * arm * arm * p.inverse_inertia
         mobility += p.frame_mobility[0] + arm_of_frame * arm_of_frame * p.frame_mobility[2]
@@ -157,7 +157,7 @@ def settle_many(params, states, members) -> None:
 
 @kernel(inline="source")
 def any_penetrates(state) -> bool:
-    """Tell whether any pair is inside its wall, with or without force."""
+    """Return whether any pair is inside its wall, with or without force."""
     inside = 0
     for pair in range(PAIR_COUNT):
         inside += 0 if state.mode[pair] == OFF else 1
@@ -166,7 +166,7 @@ def any_penetrates(state) -> bool:
 
 @kernel()
 def weigh_pairs(p, state, w, viscous, fraction, ramp, stick) -> bool:
-    """Write what each pair that acts contributes per order to `w.per_pair`; return whether any pair penetrates."""
+    """Write the factors of each acting pair per order to `w.per_pair`; return whether any pair penetrates."""
     mode, per_pair = state.mode, w.per_pair
     for pair in range(PAIR_COUNT):
         per_pair[BASE, pair] = 0.0
@@ -198,7 +198,7 @@ def slow_touch(p) -> float:
 
 @kernel(fast=True)
 def _all_shallow(p, state, y) -> bool:
-    """Tell whether the penetration of each pair, also of those that cannot touch, is less than half the cavity."""
+    """Return whether the penetration of each pair, also of those that cannot touch, is less than half the cavity."""
     penetration = row_values(p.penetration_rows, y[COS], y[SIN], y[X], y[Y])
     penetration = penetration + (row(p.penetration_rows, 4) - row(state.wear_depth, 0))
     return bool(below(penetration, splat(p.half_cavity)) == _ALL_PAIRS)
@@ -206,7 +206,7 @@ def _all_shallow(p, state, y) -> bool:
 
 @kernel()
 def read_range(p, state, y, out) -> None:
-    """Write what `within_range` looks at: the angle [rad], the largest penetration [m] of a pair, and its number."""
+    """Write the numbers that `within_range` checks: angle [rad], largest penetration [m], number of its pair."""
     out[0], out[1], out[2] = named_angle(p, y, y[THETA]), -np.inf, 0.0
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
@@ -217,7 +217,7 @@ def read_range(p, state, y, out) -> None:
 
 @kernel()
 def within_range(p, state, y) -> bool:
-    """Tell whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
+    """Return whether the model holds in body coordinates y: |theta| <= 45 degrees, no pair beyond half the cavity."""
     if _all_shallow(p, state, y):
         return abs(named_angle(p, y, y[THETA])) <= LARGEST_ANGLE
     deepest = 0.0

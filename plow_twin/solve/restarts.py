@@ -17,7 +17,7 @@ def run_restarts(p, parts, states, w, totals, log, edges, budgets, t, q, v) -> i
     """Run state m through the times t[edges[m]:edges[m + 1]]; fill the same rows of q and v.
 
     The states' place, rates and clock are set; which pairs touch is settled here. Returns the first `Status` that is
-    not OK, after which nothing more is run.
+    not OK, after which no further state is run.
     """
     first = np.zeros(1, np.int64)
     for m in range(states.size):

@@ -1,6 +1,6 @@
 """Many square blocks with rounded corners tossed on a table, each with numbers of its own: batches of short motions.
 
-The contact is that of `model.contact` and the spring friction of `solve.grip`, with two things that a scene has not: a
+The contact is that of `model.contact` and the spring friction of `solve.grip`, with two features that a scene lacks: a
 restitution and a friction that fall with the impact, and a radius of the corners. Flight has linear drag. Steps are
 fixed, a fraction of the contact time in contact, and as long as no corner can reach the table in flight.
 """
@@ -133,8 +133,8 @@ def toss_blocks(blocks, numbers, scatter, dt, rows) -> None:
     numbers : ndarray, shape (k,)
         Damping number D of restitutions from 0 to 1, evenly spaced.
     scatter : ndarray, shape (m, touches, 3)
-        What each touch has more of restitution, of the friction's logarithm, and by how much [m] its force acts beside
-        the lowest point; later touches have the last one's.
+        Each touch's addition to restitution and to the friction's logarithm, and by how much [m] its force acts beside
+        the lowest point; later touches take the last row.
     dt : float
     rows : ndarray, shape (m, n, 6)
         x, z, theta and their rates; the first row of each block is given.

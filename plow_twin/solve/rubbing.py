@@ -1,4 +1,4 @@
-"""What wears a pad beside its force and the travel along the face: sliding in the plane, and running-in.
+"""Effects on a pad's wear beside its force and the travel along the face: sliding in the plane, and running-in.
 
     dh/dt = (k_s v / A) F sqrt(1 + (s' / v)^2) (1 + a exp(-h / h0))
 

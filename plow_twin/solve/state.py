@@ -1,6 +1,6 @@
-"""What the compiled kernels pass around: constants of a scene, dynamic state, scratch space and what is counted.
+"""Records of the compiled kernels: constants of a scene, dynamic state, scratch space and totals.
 
-Parts that a scene does not have are `None`: the compiled signature then holds `none` in their place and the code that
+Parts that a scene lacks are `None`: the compiled signature then holds `none` in their place, and the code that
 would serve them is not compiled at all.
 """
 
@@ -33,9 +33,9 @@ ON: Final = 1
 CLIPPED: Final = 2
 #: Penetrating less than `Params.release`, where the force is negligible (exponents that are not integers).
 RELEASED: Final = 3
-#: Not a mode, but what an event can lead to: a pair crosses the end of its damping's ramp.
+#: Not a mode but the outcome of an event: a pair crosses the end of its damping's ramp.
 CROSSING: Final = 4
-#: Likewise: its corner slips along the wall, forward or backward, or sticks.
+#: Outcomes of an event too: the corner slips along the wall, forward or backward, or sticks.
 SLIPS_FORWARD: Final = 5
 SLIPS_BACKWARD: Final = 6
 STICKS: Final = 7
@@ -72,7 +72,7 @@ class Status(IntEnum):
 
     @property
     def text(self) -> str:
-        """Say it in a sentence."""
+        """Return the status as a sentence."""
         return _STATUS_TEXT[self]
 
 
@@ -117,9 +117,9 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("slip_rows", "f8", (4, PAIR_COUNT)),  # place along the wall, rows for c, s, X, Y
     ("slip_arm_rows", "f8", (4, PAIR_COUNT)),  # its arm about G
     ("wear_per_impulse", "f8", (PAIR_COUNT,)),  # depth of each pad per impulse, k_s v / A
-    ("speed_per_wear", "f8"),  # A / k_s, which makes v of that; 0 where sliding in the plane does not wear
+    ("speed_per_wear", "f8"),  # A / k_s: turns depth per impulse into v; 0 where sliding in the plane does not wear
     ("running_in", "f8"),  # share by which a new pad wears faster
-    ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which that falls with the depth
+    ("running_in_rate", "f8"),  # 1 / h0 in 1/m, the rate at which this share falls with the depth
     ("enabled", "i8", (PAIR_COUNT,)),  # 1 where the pair can touch
     ("inverse_mass", "f8"),
     ("inverse_inertia", "f8"),
@@ -130,7 +130,7 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("speed_floor", "f8"),  # smallest v0
     ("ramp", "f8"),  # penetration over which C grows, 0 without
     ("gravity", "f8"),
-    ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of all that does not change
+    ("constant", "f8", (3,)),  # Fx/m, Fy/m - g, M/I of the constant loads
     ("direction", "f8", (2, 2)),  # directions (x, y) of the harmonic forces S1, S2
     ("offset", "f8", (2,)),  # centre of mass from the cavity's centre
     ("free", "f8", (3,)),  # 1 free, 0 locked
@@ -157,10 +157,10 @@ _PARAM_FIELDS: Final[list[tuple[Any, ...]]] = [
 ]
 PARAMS: Final = _in_lines(_PARAM_FIELDS)
 
-#: Those of a scene whose head carries corners; 1 where the block may tumble. What is more comes first (`state_type`).
+#: The same for a head that carries corners; 1 where the block may tumble. The further field comes first (`state_type`).
 CORNER_PARAMS: Final = _in_lines([("tumbles", "f8"), *_PARAM_FIELDS])
 
-#: Everything that the future depends on, and the step under way. Times in s.
+#: The whole state of the motion, and the step under way. Times in s.
 _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("y", "f8", (STATE_SIZE,)),  # body coordinates at the step's start
     ("damping_factor", "f8", (PAIR_COUNT,)),  # lambda of each pair in s/m
@@ -176,7 +176,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("stop_time", "f8"),  # where a step must end: a sample, a knot of the load, the end of the run
     ("last_step_size", "f8"),
     ("touch_time", "f8"),  # of the last touch
-    ("time", "f8"),  # the present, bit for bit as it was asked for
+    ("time", "f8"),  # the present, bit for bit as the caller gave it
     ("implicit_size", "f8"),  # of the next implicit step
     ("decay_times", "f8"),  # that have passed in overdamped contact since a contact changed
     ("implicit_size_before", "f8"),  # both as they were before the step under way was laid out
@@ -202,7 +202,7 @@ _STATE_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("implicit_steps", "i8"),
 ]
 STATE: Final = _in_lines(_STATE_FIELDS)
-#: What the corners' grip remembers, for friction with stick.
+#: State of the corners' grip, for friction with stick.
 _GRIP_FIELDS: Final[list[tuple[Any, ...]]] = [
     ("anchor", "f8", (PAIR_COUNT,)),  # place along the wall in m where a sticking corner's spring is slack
     ("grip", "i8", (PAIR_COUNT,)),  # 0 sticks, 1 slips forward, -1 backward
@@ -259,7 +259,7 @@ WORK: Final = np.dtype(
     ]
 )
 
-#: What is summed over the motion since it was last cleared.
+#: Sums over the motion since they were last cleared.
 TOTALS: Final = np.dtype(
     [
         ("peak", "f8", (PAIR_COUNT,)),
@@ -275,7 +275,7 @@ TOTALS: Final = np.dtype(
 FOLLOWED: Final = 1
 WITH_INTERVALS: Final = 2
 
-#: The record that goes from the solver to the messages: the motion at a time, and what happened since the one before.
+#: The record that goes from the solver to the messages: the motion at a time, and the sums since the row before.
 ROW: Final = np.dtype(
     [
         ("t", "f8"),
@@ -288,19 +288,19 @@ ROW: Final = np.dtype(
         ("steps", "i8"),
         ("status", "i8"),
         ("error_estimate", "f8"),
-        # what follows is written where the row is published (`solve.totals.publish`): touches are then all so far,
-        # impulse and peak those since the publication before
+        # written where the row is published (`solve.totals.publish`): touches are then all so far, impulse and peak
+        # those since the publication before
         ("stamp_ns", "i8"),
         ("samples", "i8"),  # advances since then that ended at a sample
         ("measured_peak", "f8", (PAIR_COUNT,)),  # largest force in these
         ("held", "i8"),  # 1 where the motion at the stamp was computed without a sample
         ("corrected", "i8"),  # 1 where late samples have been worked in since then
-        ("marked", "i8"),  # 1 where one of the two is 1, here or in the publication before
+        ("marked", "i8"),  # 1 where `held` or `corrected` is 1, here or in the publication before
         ("orientation", "f8", (2,)),  # z and w of the head's quaternion
         ("twist", "f8", (3,)),  # rates along the head's own axes [m/s], about z [rad/s]
-        # what follows is written where the motion follows measurements: 5 % and 95 % points over twins drawn from what
-        # is known, peak and impulse since the publication before; clearances [m] with theirs
-        ("followed", "i8"),  # `FOLLOWED` where the clearances are there, `WITH_INTERVALS` where all is
+        # written where the motion follows measurements: 5 % and 95 % points over the drawn twins; peak and impulse
+        # since the publication before; clearances [m] with their points
+        ("followed", "i8"),  # `FOLLOWED` with clearances, `WITH_INTERVALS` with all fields
         *((f"{name}_{end}", "f8", (PAIR_COUNT,)) for name in ("force", "peak", "impulse") for end in ("low", "high")),
         ("known_clearance", "f8", (6,)),  # horizontal, its points, vertical, its points
     ]
@@ -351,7 +351,7 @@ class Terms(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """What a scene may lack: terms of the equations, loads whose number differs, nodes and space of implicit steps."""
+    """Parts that a scene may lack: terms of the equations, loads of any number, nodes and space of implicit steps."""
 
     terms: Terms
     harmonics: Harmonics | None
@@ -359,7 +359,7 @@ class Parts(NamedTuple):
     implicit: Implicit | None
 
 
-#: What bounds the work of an advance, and scratch space for its coarse end.
+#: Bounds of the work of an advance, and scratch space for its coarse end.
 BOUND: Final = np.dtype(
     [
         ("steps", "i8"),  # Runge-Kutta steps that are kept for the end
@@ -379,7 +379,7 @@ PACE: Final = np.dtype(
         ("slice", "i8"),  # steps of a slice
         ("left", "i8"),  # of it
         ("row", "i8"),  # the advance that comes next, members one after the other
-        ("underway", "i8"),  # 1 where that one has begun
+        ("underway", "i8"),  # 1 where it has begun
         ("mark", "i8"),  # the mark that comes next
         ("failed", "i8"),  # advances that failed
     ]
@@ -396,7 +396,7 @@ def state_type(terms: Terms) -> np.dtype[np.void]:
 
 @cache
 def _state_type(stick: bool, support: bool) -> np.dtype[np.void]:
-    # what is more comes first: numba takes a record with more at its end for one of the shorter type
+    # further fields come first: numba takes a record with further fields at its end for the shorter type
     more = (_FRAME_FIELDS if support else []) + (_GRIP_FIELDS if stick else [])
     return _in_lines([*more, *_STATE_FIELDS]) if more else STATE
 

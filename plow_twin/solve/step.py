@@ -1,4 +1,4 @@
-"""One step: series, step size, first event, what happened in it, and the switch at its end.
+"""A step: series, step size, first event, totals, and the switch of a mode at its end.
 
 A step never depends on where output is wanted. It ends at an event, at a knot of the load, or where its series stops
 being accurate.
@@ -29,7 +29,7 @@ from plow_twin.solve.tumbling import turn_at, turn_corners
 METHODS: Final[tuple[Method, ...]] = (flight, rest, implicit, taylor)
 #: Longest step in s; keeps every power of it finite.
 LONGEST_STEP = 100.0
-#: How far in sigma a step goes past an instant at which modes flip without end.
+#: How far in sigma a step goes past an instant at which modes would flip without end.
 PAST_AN_INSTANT = 1e-9
 #: Two times in s closer than this share of them are one instant: some roundings.
 ONE_INSTANT = 1e-15
@@ -89,7 +89,7 @@ def _end_at_event(p, state, w, span, penetrating, law, stick) -> None:
     sigma, order = state.sigma_end, state.order
     end, pair, target = first_event(p, state, w, order, sigma, penetrating, *law, stick)
     if pair >= 0 and state.events_at_once > p.max_events:
-        # modes flip at one instant: go on past it with the modes as they are
+        # modes flip at one instant: step past it with the present modes
         state.recoveries += 1
         end, pair = max(end, min(sigma, PAST_AN_INSTANT)), -1
     turn = turn_at(p, state, w, order, end)

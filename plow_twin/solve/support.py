@@ -3,8 +3,8 @@
     m_f u'' = -k_x u - c_x u' - sum F_x      (v likewise)      I_f phi'' = -k_phi phi - c_phi phi' - sum (p x F)
 
 u, v, phi is the frame's displacement in world axes, F the force of a pair on the head, p its place from the frame's
-centre. The head's equations stand as they are, in its absolute place; penetrations, arms and slips are those of its
-place as seen from the frame. That is what `State.y` keeps, so modes, events and outputs need not know of the frame.
+centre. The head's equations hold for its absolute place; penetrations, arms and slips are those of its
+place as seen from the frame. `State.y` keeps the latter, so modes, events and outputs do not depend on the frame.
 Both bodies are one system, solved together; the series of it is in `solve.method.series`.
 """
 
@@ -53,7 +53,7 @@ def from_ground(y, frame, out) -> None:
 
 @kernel()
 def to_world_both(p, y, frame, z) -> None:
-    """Write z = (x, y, theta, u, v, phi) and its rate, shape (12,), world axes, from what is seen from the frame."""
+    """Write z = (x, y, theta, u, v, phi) and its rate, shape (12,), world axes, from the state seen from the frame."""
     absolute, head = np.empty(8), np.empty(6)
     to_ground(y, frame, absolute)
     to_world(p, absolute, head)
@@ -86,7 +86,7 @@ def start_frame(state, w) -> None:
 
 @kernel(fast=True)
 def see_from_frame(w, order, sigma, y) -> None:
-    """Bring the head's absolute body coordinates at sigma of a step to what is seen from the frame.
+    """Turn the head's absolute body coordinates at sigma of a step into those seen from the frame.
 
     The frame's state there is written to `w.frame_now`.
     """

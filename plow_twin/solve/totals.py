@@ -1,4 +1,4 @@
-"""What is kept of a motion: peaks, impulses, times and sets of corners from the force polynomials, and its events."""
+"""Totals of a motion: peaks, impulses, times and sets of corners from the force polynomials, and its events."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plow_twin.solve.state import FIRST, ON, SECOND, SUM
 
 @kernel()
 def _seal(row_of, window) -> None:
-    """Let a row tell of its whole window, and begin the next one: touches go on counting."""
+    """Give a row the sums of its whole window, and begin the next window; touches go on counting."""
     for pair in range(PAIR_COUNT):
         row_of.makes[pair], row_of.impulse[pair] = window.makes[pair], window.impulse[pair]
         row_of.peak[pair], row_of.measured_peak[pair] = window.peak[pair], window.measured_peak[pair]
@@ -33,14 +33,14 @@ def _seal(row_of, window) -> None:
 
 @kernel(entry=True)
 def publish(rows, stamps, held, taken, windows, waits) -> int:
-    """Sum up advances, and let those taken tell of all since the publication before.
+    """Sum up advances; the rows taken for publication get the sums since the publication before.
 
-    A row taken that failed tells of the good ones before it; where there are none its stamp becomes 0.
+    A taken row that failed gets the sums of the good rows before it; without a good row its stamp becomes 0.
 
     Parameters
     ----------
     rows : ndarray of `ROW`, shape (n,)
-        One after the other; those that failed count for nothing.
+        In order; failed advances are left out.
     stamps : ndarray of int64, shape (n,)
         Their stamps [ns].
     held : int
@@ -48,14 +48,14 @@ def publish(rows, stamps, held, taken, windows, waits) -> int:
     taken : ndarray of int64, shape (m,)
         Rising numbers of the rows that are published.
     windows : ndarray of `ROW`, shape (1,)
-        Sums since the publication before, and the motion of the newest good advance where one waits.
+        Sums since the publication before, and the motion of the newest good advance that waits.
     waits : int
         1 where an advance waits to be published.
 
     Returns
     -------
     int
-        1 where one waits now.
+        1 where an advance waits now.
     """
     window, place, newest = windows[0], 0, -1
     for n in range(rows.size):
@@ -108,14 +108,14 @@ def _copy_motion(row_of, target) -> None:
 
 @kernel(entry=True)
 def publish_window(windows, rows) -> None:
-    """Write what waits in a window, (1,), to a row, (1,), and begin the next one."""
+    """Write a waiting window, (1,), to a row, (1,), and begin the next window."""
     rows[0] = windows[0]
     _seal(rows[0], windows[0])
 
 
 @kernel(entry=True)
 def summary(rows, n) -> tuple[int, int, int, int, float, float, float, bool]:
-    """Return of row `n` what every publication is asked for: one call instead of a look at each field.
+    """Return the facts of row `n` that every publication needs, in one call instead of a look at each field.
 
     Returns
     -------
@@ -156,7 +156,7 @@ def _sums(w, order, h) -> None:
 
 @kernel()
 def add_to_totals(state, w, low, high, totals) -> None:
-    """Add what happened between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
+    """Add the motion between two sigmas of the step to the totals: peaks, impulses, times, sets of corners."""
     mode = state.mode
     acting = 0
     for pair in range(PAIR_COUNT):

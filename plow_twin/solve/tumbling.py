@@ -1,8 +1,8 @@
-"""A block that tumbles: each quarter turn its corners take the names of the places to which they have come.
+"""A block that tumbles: after each quarter turn its corners are renamed by their new places.
 
-Up to 45 degrees the corner named bottom left is the lower left one. Beyond, another corner is, and what a pair has
-(mode, damping, anchor) passes to the pair of that name on the same wall. A square block looks the same then, so the
-geometry's rows stay; cosine and sine of the state begin anew 90 degrees before (`kinematics.named_angle`).
+Up to 45 degrees the corner named bottom left is the lower left corner. Beyond, another corner is, and the state of a
+pair (mode, damping, anchor) passes to the pair of that name on the same wall. A square block looks the same, so the
+geometry's rows stay; cosine and sine of the state start again 90 degrees before (`kinematics.named_angle`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import COS, OFF, OMEGA, ON, RELEASED, SIN, THETA
 from plow_twin.solve.totals import log_event
 
-#: Pairs of each wall: that of the corner which leads the wall in a counter-clockwise turn, that of the one behind it.
+#: Pairs of each wall: first of the corner that leads in a counter-clockwise turn, then of the corner behind it.
 _HANDED_OVER = tuple(
     (PAIR_NAMES.index(leading), PAIR_NAMES.index(following))
     for leading, following in (
@@ -66,7 +66,7 @@ def turn_corners(p, state, stick, totals, log) -> None:
 
 @kernel()
 def _hand_over(p, state, stick, totals, log, old, new) -> None:
-    """Pass what pair `old` has to pair `new` of the same wall; a pair that cannot touch takes over nothing."""
+    """Pass the state of pair `old` to pair `new` of the same wall; a pair that cannot touch takes over nothing."""
     mode = state.mode[old] if p.enabled[new] == 1 else OFF
     if log is not None:
         rate = penetration_and_rate(p, state, old)[1]

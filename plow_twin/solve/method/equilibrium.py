@@ -13,7 +13,7 @@ from plow_twin.solve.state import OFF, ON
 
 @kernel()
 def held(p, state, y, least) -> bool:
-    """Tell whether each pair is on or off, and neither close to changing that."""
+    """Return whether each pair is on or off, and far from a change."""
     for pair in range(PAIR_COUNT):
         if p.enabled[pair] == 1:
             penetration = penetration_of(p, state, pair, y)
@@ -47,7 +47,7 @@ def stiffness_at(p, acts, state, w, gyration) -> None:
 
 @kernel()
 def stiffer_than(h, least) -> bool:
-    """Tell whether the symmetric matrix h exceeds `least` times the unit matrix: all leading minors are positive."""
+    """Return whether the symmetric matrix h exceeds `least` times the unit matrix: all leading minors are positive."""
     a, b, c = h[0, 0] - least, h[1, 1] - least, h[2, 2] - least
     if not a > 0.0:
         return False

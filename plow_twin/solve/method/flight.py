@@ -45,7 +45,7 @@ def _smallest_gap(p, state) -> float:
 def _bounds(p, harmonics, t, z, w) -> None:
     """Write what bounds the motion along x, y and theta to `w.flight[1:]`, shape (4, 3).
 
-    Rows: speed now; speed without what swings; acceleration of the harmonics at most; how far their swing reaches.
+    Rows: speed now; speed without the harmonics' swing; largest acceleration of the harmonics; reach of their swing.
     """
     for j in range(3):
         drift, push, swing = z[3 + j], 0.0, 0.0

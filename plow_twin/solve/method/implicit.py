@@ -43,15 +43,15 @@ STAGES = 9
 #: A contact is overdamped where its dampers act so many times faster than its springs; the same ratio decides when a
 #: scene is compiled whether it can need implicit steps.
 OVERDAMPED_RATIO = 20.0
-#: How many explicit steps, bound by stability, an implicit one must be worth: it costs as much.
+#: Explicit steps, bound by stability, that an implicit step must replace: it costs as much.
 _WORTH = 30.0
 #: Share of the tolerance, in shares of a step of the series, that an implicit step may spend: it stands for many.
 _GAIN = 100.0
-#: What rounding leaves undetermined of a velocity, in shares of the largest: no step is refused for less.
+#: Rounding error of a velocity, as a share of the largest: no step is refused for less.
 _NOISE = 1e-12
-#: And of a guard of the corners' grip, in shares of its largest term.
+#: Rounding error of a guard of the corners' grip, as a share of its largest term.
 _GUARD_NOISE = 1e-6
-#: Attempts that fail stop doubling the wait for the next one here.
+#: Failed attempts after which the wait for the next attempt doubles no more.
 _MOST_REFUSED = 12
 
 
@@ -177,7 +177,7 @@ def stable_decay(order):
 
 @kernel(inline="source")
 def has_decayed(p, state) -> bool:
-    """Tell whether what a change of contact has set moving is gone, by the decay times that have passed since.
+    """Return whether the motion set off by a change of contact has decayed, by the decay times passed since.
 
     Each attempt that failed doubles the wait.
     """
@@ -200,7 +200,7 @@ def _jacobian(p, acts, state, t, z, implicit, base, out) -> None:
     rate, moved, n = implicit.rate[0], implicit.rate[1], base.size
     accelerate(p, acts, True, state, t, z, implicit.load, rate)
     for j in range(2 * n):
-        # where the law is linear any difference will do that rounding does not spoil
+        # where the law is linear, any difference large against rounding will do
         delta = 1e-8 / (p.radius if j % 3 == 2 else 1.0)
         saved = z[j]
         z[j] = saved + delta
@@ -374,7 +374,7 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
                 * p.velocity_tolerance
                 / p.position_tolerance
             )
-        # quadratic: one that rounding keeps from falling further is the last
+        # the convergence is quadratic: the last iterate is the first that does not fall further
         if change < 1e-14 * p.threshold[0] or (change < 0.1 * p.velocity_tolerance and change > 0.1 * before):
             _places(implicit, h)
             return True
@@ -386,7 +386,7 @@ def _solve(p, acts, support, state, t, h, implicit, wear, sliding, running_in) -
 def _interpolate(values, coefficients, h, out) -> None:
     """Write the series of the polynomials of a step of size h that take eight values at each node.
 
-    Of the differences to the last value: the coefficients are large, and cancel what is common only to rounding.
+    From the differences to the last value: the coefficients are large and would cancel a common value only to rounding.
     """
     scale, n = 1.0, len(coefficients)
     last = row(values, n - 1)
@@ -417,7 +417,7 @@ def _series_seen(support, h, w, implicit):
 
 @kernel()
 def _frame_terms(p, support, w, implicit, scale):
-    """Return what the frame adds to what is left out at the start and to the last term's size in `_write_series`."""
+    """Return the frame's parts of the velocity left out at the start and of the last term's size in `_write_series`."""
     off = size = 0.0
     if support is not None:
         s = implicit.nodes.size
@@ -433,8 +433,8 @@ def _frame_terms(p, support, w, implicit, scale):
 def _write_series(p, support, state, h, w, implicit, ramp, wear, stick) -> float:
     """Write the collocation polynomial of state, penetration, rate and force as series; return its last term's size.
 
-    Velocities and forces are those at the nodes, not at the start: what a damper has not yet stopped there, and stops
-    at once, would bend the polynomials between the nodes. The size is infinite where that is more than may be left out.
+    Velocities and forces are those at the nodes, not at the start: a velocity at the start that a damper stops
+    at once would bend the polynomials between the nodes. The size is infinite where it is too large to leave out.
     """
     s, body, pairs, scratch = implicit.nodes.size, implicit.body, implicit.pairs, w.left
     _bodies(p, support, state, implicit, 0)
@@ -497,7 +497,7 @@ def _write_grip(p, state, h, w, implicit, seen, series) -> None:
 
 @kernel()
 def _last_of_guards(p, state, w, h) -> float:
-    """Return the largest share of a last term in its guard of a corner's grip; they tell of forces however small."""
+    """Return the largest share of a last term in its guard of a corner's grip; it matters however small the force."""
     guard, share = w.column[0], 0.0
     for pair in range(PAIR_COUNT):
         for side in range(2):
@@ -517,8 +517,8 @@ def _last_of_guards(p, state, w, h) -> float:
 def _write_ramp(p, h, w, implicit) -> float:
     """Write the law's force as K times the elastic part, of which only d^1 has a series here, and C times the rest.
 
-    Return the last term's size, as a velocity per h^(STAGES - 1): that of a clipped pair moves nothing, but tells when
-    it pushes again.
+    Return the last term's size, as a velocity per h^(STAGES - 1). The series of a clipped pair moves nothing, but gives
+    the time when it pushes again.
     """
     s, largest = implicit.nodes.size, 0.0
     _interpolate(implicit.pairs[1], implicit.from_stages, h, w.damped)
@@ -555,7 +555,7 @@ def _lay_out(p, parts, implicit, ramp, rubbing, slip, stick, support, state, w, 
         return False
     state.implicit_size_before, state.decay_times_before = state.implicit_size, state.decay_times
     state.refused_before = state.refused
-    # without contact there may be the dampers of a support
+    # without contact the dampers of a support may still act
     damped = penetrating or support is not None
     w.decay[0] = decay_rate(p, state, slip, stick, support) if damped else 0.0
     if w.decay[0] <= 0.0 or state.touching != 0 or not has_decayed(p, state):
@@ -576,7 +576,7 @@ def at_most_stable(p, implicit, state, w, sigma):
 
 @kernel()
 def note_step(implicit, state, w, step_size, has_event) -> None:
-    """Note how a step that has been laid out bears on the next implicit one."""
+    """Note the consequences of a step laid out for the next implicit step."""
     if implicit is not None:
         note_decay(state, w.decay[0], step_size)
         if has_event:

@@ -1,6 +1,6 @@
-"""Rest: a head that its contacts hold still is not followed through what rounding leaves of its ringing.
+"""Rest: the vanishing vibration of a head that its contacts hold still is not followed.
 
-With constant loads and nothing else that drives it, the sum of kinetic and potential energy cannot grow. Where the
+With constant loads and no other drive, the sum of kinetic and potential energy cannot grow. Where the
 stiffness is positive definite it bounds for all time how far the head can get from its equilibrium. Once that is far
 below the tolerance the head is put there, and steps are as long as they may be. Harmonics may act that move the head no
 farther than that (`small_harmonics`).
@@ -24,9 +24,9 @@ from plow_twin.solve.state import OMEGA, ON, VX, VY
 _SHARE = 1e-3
 #: How much deeper than that a pair must be, or how much farther away.
 _MARGIN = 10.0
-#: And at least so deep in m, for the differences that give the stiffness.
+#: Least such depth in m, for the differences that give the stiffness.
 _DEEP = 1e-7
-#: Evaluations of the equations of motion that it takes to tell, at most.
+#: Most evaluations of the equations of motion that the check takes.
 AT_REST = 5 + EVALUATIONS
 
 
@@ -42,13 +42,13 @@ def _speed(p, y) -> float:
 
 @kernel(inline="source")
 def slow_enough(p, y) -> bool:
-    """Tell whether a head may be at rest by its speed."""
+    """Return whether the head is slow enough to be at rest."""
     return bool(_speed(p, y) <= 0.5 * _SHARE * p.velocity_tolerance)
 
 
 @kernel()
 def _still(p, acts, harmonics, state, w) -> bool:
-    """Tell whether the head stays within the share of the tolerances for all time; bring it to rest then."""
+    """Return whether the head stays within the share of the tolerances for all time; bring it to rest then."""
     y, z, rate = state.y, w.rest[0], w.rest[1]
     gyration, speed = _gyration(p), _speed(p, y)
     way, fast = _SHARE * p.position_tolerance, _SHARE * p.velocity_tolerance
@@ -71,7 +71,7 @@ def _still(p, acts, harmonics, state, w) -> bool:
 
 @kernel()
 def _still_as_before(p, acts, harmonics, state, w) -> bool:
-    """Tell whether nothing has changed since the head was found at rest: neither its place nor its load."""
+    """Return whether place and load are unchanged since the head was found at rest."""
     z, rate = w.rest[0], w.rest[1]
     to_world(p, state.y, z)
     accelerate(p, acts, True, state, state.step_start, z, w.rest[3, :3], rate)
@@ -103,7 +103,7 @@ def lay_out(p, parts, own, state, w, span, penetrating) -> bool:
 
 @kernel()
 def _settle(p, acts, harmonics, state, w) -> bool:
-    """Bring the head to rest where it is found at rest; tell whether it is."""
+    """Bring the head to rest if it is found at rest; return whether it is."""
     if not (state.at_rest == 1 and _still_as_before(p, acts, harmonics, state, w)):
         if not _still(p, acts, harmonics, state, w):
             return False

@@ -38,7 +38,7 @@ from plow_twin.solve.support import (
 
 #: A term has vanished where it is below this share of what the last order may have.
 _VANISHED = 0.4
-#: Factors of omega (S1 in lanes 4 and 7) in the rates of the state's components, and of the rates that are components.
+#: Factors in the rates of the state's components: of omega (S1 in lanes 4 and 7), and of rates that are components.
 _turned = permutation(Y, X, VY, VX, COS, SIN, COS, SIN)
 _rates_of = permutation(VX, VY, VX, VY, OMEGA, COS, SIN, OMEGA)
 
@@ -91,7 +91,7 @@ def _multiply_older(a, b, k):
 def _join(a, b, k, a_k, b_k):
     """Return order k of the eight products of the columns of a and b; a_k and b_k are their rows k.
 
-    What has just been written is taken as a value: read back, it would be waited for.
+    The newest rows are passed as values: reading them back would wait for their store.
     """
     if k == 0:
         return a_k * b_k
@@ -181,7 +181,7 @@ def _push(p, state, w, k, penetration, rate, viscous, hysteretic, integer, fract
 
 @kernel(fast=True)
 def _hold(p, w, k, fx, fy):
-    """Return order k of the force per mass in head axes without what acts along a locked world axis."""
+    """Return order k of the force per mass in head axes, without its part along a locked world axis."""
     if fixed_axes(p) is not None:
         return p.free[0] * fx, p.free[1] * fy
     w.world[0, k], w.world[1, k] = fx, fy
@@ -263,7 +263,7 @@ def _applied(p, along_x, along_y, torque):
 
 @kernel(fast=True)
 def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
-    """Return order k of what the friction forces give (`_applied`, `model.friction`).
+    """Return order k of the accelerations by friction (`_applied`, `model.friction`).
 
     With r = s' / v_s and tau = tanh(r):  k tau_k = sum_j j r_j (1 - tau^2)_{k-j}.
     """
@@ -291,7 +291,7 @@ def _drag(p, w, k, c, s, x, y, dc, ds, dx, dy):
 
 @kernel(fast=True)
 def _hold_on(p, state, w, k, c, s, x, y, dc, ds, dx, dy):
-    """Return order k of what friction with stick gives (`_applied`, `solve.grip`)."""
+    """Return order k of the accelerations by friction with stick (`_applied`, `solve.grip`)."""
     drag, arm = w.slip[4], w.slip[5]
     rate = row_values(p.slip_rows, dc, ds, dx, dy)
     set_row(w.slip[0], k, rate)
@@ -326,7 +326,7 @@ def _slide(p, w, k, dc, ds, dx, dy) -> None:
 
 @kernel(fast=True)
 def _run_in(p, state, w, rubbed, k) -> None:
-    """Write order k of `rubbed` times what running-in makes of the coefficient, 1 + a e, to `w.rub[5]`.
+    """Write order k of `rubbed` times the factor of running-in, 1 + a e, to `w.rub[5]`.
 
     With e = exp(-h / h0):  k e_k = -(1 / h0) sum_j j h_j e_{k-j}.
     """
@@ -345,7 +345,7 @@ def _run_in(p, state, w, rubbed, k) -> None:
 def _grow(p, w, rubbed, k, alpha, beta) -> None:
     """Write order k + 1 of the growth of each pad's penetration:  dh/dt = k_s F v / A (Archard).
 
-    `rubbed` is the series of F, or of F times what makes the pad wear faster.
+    `rubbed` is the series of F, or of F times the factors of sliding and running-in.
     """
     growth = row(rubbed, k) * alpha
     if k > 0:
@@ -355,7 +355,7 @@ def _grow(p, w, rubbed, k, alpha, beta) -> None:
 
 @kernel(fast=True, inline="code")
 def _wear(p, state, w, k, alpha, beta, dc, ds, dx, dy, sliding, running_in) -> None:
-    """Write order k + 1 of the growth of the pads' penetrations from the force and what makes them wear faster."""
+    """Write order k + 1 of the growth of the pads' penetrations from force, sliding and running-in."""
     if sliding is not None:
         _slide(p, w, k, dc, ds, dx, dy)
         if running_in is not None:
@@ -421,10 +421,10 @@ def _seen_rates(w, k, there, turned, om, turning):
 
 @kernel(fast=True)
 def _push_frame(p, w, k, there, c, s, x, y, dc, ds, pushed):
-    """Return order k of the rates of the frame: its springs and dampers, and what pushes the head the other way.
+    """Return order k of the rates of the frame under its springs and dampers and the reaction of the contacts.
 
-    `pushed` is what the pairs give the head (`_applied`); their moment about the frame's centre is that about the
-    head's and the head's place (x, y) times their force.
+    `pushed` is the pairs' accelerations of the head (`_applied`); their moment about the frame's centre is their moment
+    about the head's and the head's place (x, y) times their force.
     """
     fx, fy = lane(pushed, VX) / p.inverse_mass, lane(pushed, VY) / p.inverse_mass
     left, right = pack(c, s, s, c, x, y, 0.0, 0.0), pack(fx, fy, fx, fy, fy, fx, 0.0, 0.0)
@@ -475,7 +475,7 @@ def expand(
 ):
     """Write the series of state, penetration, rate and force up to order `limit` to `w`; return the order used.
 
-    Without `penetrating` no pair is deeper than zero and nothing of the contact is computed. Orders whose terms vanish
+    Without `penetrating` no pair is inside its wall and the contacts are not computed. Orders whose terms vanish
     at `sigma_limit`, the longest sigma of interest, are not computed.
     """
     alpha, beta = state.alpha, state.beta
@@ -491,7 +491,7 @@ def expand(
         set_row(w.series, k, here)
         x, yy, vx, vy = lane(here, X), lane(here, Y), lane(here, VX), lane(here, VY)
         om, c, s = lane(here, OMEGA), lane(here, COS), lane(here, SIN)
-        # as seen from the frame, which is what the pairs depend on
+        # as seen from the frame: the pairs depend on this
         seen_c, seen_s, seen_x, seen_y = c, s, x, yy
         if support is not None:
             set_row(w.frame, k, there)

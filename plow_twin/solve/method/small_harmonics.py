@@ -1,4 +1,4 @@
-"""Rest under harmonics: whether what they do to a head that its contacts hold stays below the tolerance for good.
+"""Rest under harmonics: whether their motion of a head that its contacts hold stays below the tolerance for all time.
 
 About its equilibrium such a head obeys  e'' + C e' + K e = r,  with e its distance from the linear answer to the
 harmonics (the angle counts as a place, times the radius of gyration) and r what the linear equations leave out. The
@@ -29,13 +29,13 @@ from plow_twin.solve.state import ON, X, Y
 
 #: Halvings after which an eigenvalue counts as zero.
 _HALVINGS = 40
-#: Evaluations of the equations of motion that it takes to tell.
+#: Evaluations of the equations of motion that the check takes.
 EVALUATIONS = 4
 
 
 @kernel()
 def without_harmonics(p, harmonics, t, rate, spare) -> None:
-    """Take what the harmonics give at t from the accelerations rate[3:]; `spare`, shape (3,), is written over."""
+    """Subtract the harmonics at t from the accelerations rate[3:]; `spare`, shape (3,), is written over."""
     if harmonics is not None:
         spare[0] = spare[1] = spare[2] = 0.0
         add_harmonics(p, harmonics, t, spare)
@@ -107,7 +107,7 @@ def _answer(p, one, w, gyration):
     along_t = third * x + (b * g - a * h) * y + (a * e - b * d) * t
     size = math.sqrt(abs(along_x) ** 2 + abs(along_y) ** 2 + abs(along_t) ** 2)
     size /= abs(a * first + b * second + c * third)
-    # x K x is at most what the harmonic and the inertia do on the way
+    # x K x is at most the work of the harmonic and the inertia on the way
     load = math.sqrt(abs(x) ** 2 + abs(y) ** 2 + abs(t) ** 2)
     return size, math.sqrt(load * size) + om * size
 
@@ -132,7 +132,7 @@ def _left_out(p, state, w, reach, rate, gyration) -> float:
 
 @kernel()
 def stays_at_rest(p, acts, harmonics, state, w, distance, way, fast, gyration) -> bool:
-    """Tell whether the head stays within `way` of its equilibrium, and slower than `fast`, for all time.
+    """Return whether the head stays within `way` of its equilibrium, and slower than `fast`, for all time.
 
     `distance` is sqrt(W) of the head now, were there no harmonics; `w.hessian` has its stiffness.
     """

@@ -1,4 +1,4 @@
-"""How far a step reaches: where the series stops being accurate, and what shortens steps without showing in them."""
+"""How far a step reaches: where its series stops being accurate, and shorter where the series cannot show it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from plow_twin.solve.method.series import expand, expand_harmonics, one_by_one
 from plow_twin.solve.modes import penetration_and_rate
 from plow_twin.solve.state import CLIPPED, ON
 
-#: A pair that would part within so many steps like the last is looked at, by a series of this order.
+#: Steps like the last within which a parting pair is looked for, and the order of its series.
 _PARTING_REACH, PARTING_ORDER = 1.3, 6
-#: The same with friction with stick, where the force that is left has its own measure and steps are shorter.
+#: The same with friction that sticks, where the remaining force has a measure of its own and steps are shorter.
 _PARTING_REACH_STICK = 8.0
-#: Newton's steps to its root, and the relative change after which it is found: the next step mends the rest.
+#: Newton steps to its root, and the relative change at which they end: the next step corrects the rest.
 _NEWTON_STEPS, _ROOT_FOUND = 6, 1e-9
-#: A term beyond this is not finite, or will not be when it is multiplied.
+#: A term beyond this is not finite, or its products would not be.
 _FINITE = 1e300
-#: How often a step is made shorter, for what is largest over it gets smaller too, and the change that is none.
+#: How often a step is shortened, because the largest term over it shrinks too, and the change that counts as zero.
 _SHORTER, _SHORT_ENOUGH = 20, 0.9
 
 
@@ -52,8 +52,8 @@ def accurate_step(p, w, order, sigma_limit):
 def before_sticking(p, state, w, order, sigma) -> float:
     """Return the part of `sigma` over which the series of tanh r converges well enough.
 
-    Far from sticking tanh r is constant to the last bit: no coefficient tells that its poles at r = +-i pi/2 come near.
-    With |r - r_0| at most theta times their distance what the series leaves out is below theta^order.
+    Far from sticking tanh r is constant to the last bit: no coefficient shows that its poles at r = +-i pi/2 come near.
+    With |r - r_0| at most theta times their distance, the remainder of the series is below theta^order.
     """
     theta = (p.threshold[p.order] / p.threshold[0]) ** (1.0 / order)
     within = sigma
@@ -74,8 +74,8 @@ def before_sticking(p, state, w, order, sigma) -> float:
 def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
     """Return the part of `sigma` over which the ramped force of clipped pairs is accurate: it moves nothing yet.
 
-    Only its guard looks at it, so nothing else shortens a step for it. The same root test as for what moves, of the
-    velocity that it would give; the share of C that acts is a cubic, whose series ends long after the penetration's,
+    Only a guard depends on this force, so no other check shortens a step for it. The same root test as for the motion,
+    of the velocity that it would give; the acting share of C is a cubic, whose series ends after the penetration's,
     and a force d^n has its branch point where the pair parts. The motion's own terms may have ended early: the test is
     of as many orders as there are.
     """
@@ -95,8 +95,8 @@ def before_pushing_again(p, state, w, order, sigma, integer, fraction) -> float:
 def before_gripping(p, state, w, order, sigma) -> float:
     """Return the part of `sigma` over which the guards of the corners' grip are accurate.
 
-    A force far too small to move the head still tells whether its corner holds: the same root test, relative to what
-    is largest in the guard.
+    A force far too small to move the head still decides whether its corner holds: the same root test, relative to the
+    largest term of the guard.
     """
     guard = w.column[0]
     share = math.log(p.threshold[p.order] / p.threshold[0]) / order
@@ -131,9 +131,9 @@ def _relatively_accurate(g, order, lacuna, share, sigma) -> float:
 
 @kernel()
 def time_to_separation(p, parts, state, w, span, harmonics, stick):
-    """Return the time until the first pair parts, where that is what shortens steps; else 0.
+    """Return the time until the first pair parts, where the parting shortens steps; else 0.
 
-    The root of a short series is enough: what it misses is left to the next step.
+    The root of a short series is enough: the next step corrects its error.
     """
     near, reach = False, _PARTING_REACH
     if stick is not None:

@@ -15,7 +15,7 @@ from plow_twin.solve.method.step_size import (
     time_to_separation,
 )
 
-#: A touch no farther back than so many steps like the last still shapes the series.
+#: Steps like the last for which a touch still shapes the series.
 _TOUCH_REACH = 2.5
 
 
@@ -68,7 +68,7 @@ def _choose_map(p, parts, fraction, stick, state, w, span, penetrating):
         return span, True
     parting = time_to_separation(p, parts, state, w, span, parts.harmonics, stick)
     if parting > 0.0:
-        # one that ends like d^1.5 is analytic in the root of the time left
+        # a force that ends like d^1.5 is analytic in the root of the time left
         root = math.sqrt(parting)
         state.alpha, state.beta = 2.0 * root, -2.0
         return (root if parting <= span else root - math.sqrt(parting - span)), parting > span
